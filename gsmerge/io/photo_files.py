@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, check_file, check_pixels, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.memory import free_pages, make_array
@@ -32,6 +32,9 @@ _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
 _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
+_PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
+_DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
@@ -97,7 +100,9 @@ def keep_photos(photos: Photos) -> Photos:
 def decode_image(path: Path, size: Size) -> np.ndarray:
     """Decode an image file of known size to ``[h,w,3]`` uint8 sRGB; SceneError if it cannot be read."""
     with read_errors(path):
-        return _decode(path, np.fromfile(path, np.uint8), size)
+        data = np.fromfile(path, np.uint8)
+    _check_scans(ReadBudget(path, len(data)), [data], size)
+    return _decode(path, data, size)
 
 
 def as_floats(images: Photos) -> np.ndarray:
@@ -218,22 +223,29 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
     return width, height
 
 
-def decode_embedded(path: Path, names: Sequence[str], files: Sequence[np.ndarray], limit: int) -> np.ndarray:
-    """Decode images that the file ``path`` holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
+def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray:
+    """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
-    SceneError if one cannot be decoded, two differ in size, or they have more than ``limit`` bytes when decoded.
+    SceneError if one cannot be decoded, two differ in size, or they take more memory or time than the file's budget.
     """
+    path = Path(budget.path)
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
     width, height = sizes[0]
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
-    if 3 * width * height * len(files) > limit:
-        problem = f"expected images of at most {limit >> 20} MiB, found {len(files)} of {width} x {height}"
-        raise SceneError(path, problem)
+    num_bytes = (3 * len(files) + _DECODING_BYTES) * width * height
+    budget.check_memory(num_bytes, f"{len(files)} photos of {width} x {height}")
+    _check_scans(budget, files, sizes[0])
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out
+
+
+def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) -> None:
+    """Raise SceneError if JPEG files have more scans, each a walk over all pixels, than there is time for."""
+    num_scans = sum(data.tobytes().count(_SCAN) for data in files if data[:2].tobytes() == _JPEG)
+    budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
 
 
 def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:

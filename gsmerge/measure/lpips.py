@@ -6,7 +6,6 @@ is imported, and of what its pickles may hold only dictionaries and arrays of fl
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
@@ -18,6 +17,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.io.bounds import read_budget
+from gsmerge.io.pickles import Names, StandIn, read_pickle
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
@@ -31,8 +32,6 @@ SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 MAX_CACHED, MAX_CACHED_PIXELS = 4, 300_000  # references whose features are cached, and the largest of them
 BAND = 1024  # pixels whose surroundings are tabled at once, about
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
-# What reading a damaged pickle, or one with other content, can raise.
-PICKLE_ERRORS = (pickle.UnpicklingError, ArithmeticError, AttributeError, EOFError, LookupError, TypeError, ValueError)
 
 
 @dataclass(frozen=True)
@@ -216,12 +215,11 @@ def _find_weights(net: str) -> Path | None:
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[Layer, ...]:
     """Load the layers of ``net`` from its file; a SceneError if that is no pickle of the expected float arrays."""
-    with path.open("rb") as stream:
-        try:
-            return _layers(_ArrayUnpickler(stream).load(), _architecture(net))
-        except PICKLE_ERRORS as e:
-            problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
-            raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
+    try:
+        return _layers(read_pickle(path.read_bytes(), read_budget(path), _NAMES), _architecture(net))
+    except (LookupError, TypeError, ValueError) as e:  # LookupError, TypeError: other content
+        problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
+        raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
 
 
 def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer, ...]:
@@ -246,43 +244,37 @@ def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
     return stored.values.copy()  # for the values lie in the bytes of the pickle
 
 
-class _StoredArray:
+class _StoredArray(StandIn):
     """Stands for a numpy array in a pickle: takes its state, bytes and a shape, and nothing else."""
 
-    def __init__(self, *_: object) -> None:
-        self.values = np.zeros(0, np.float32)
+    values: np.ndarray = np.zeros(0, np.float32)
 
-    def __setstate__(self, state: tuple[int, tuple[int, ...], object, bool, bytes]) -> None:
-        _, shape, dtype, columns_first, values = state
-        if not isinstance(dtype, _StoredDtype):
-            raise pickle.UnpicklingError("an array without a type")
-        self.values = np.frombuffer(values, np.dtype("<f4")).reshape(shape, order="F" if columns_first else "C")
+    def set_state(self, state: object) -> None:
+        """Take the values of an array of float32."""
+        match state:
+            case (_, tuple(shape), _StoredDtype(), bool(columns_first), bytes(values)):
+                self.values = np.frombuffer(values, "<f4").reshape(shape, order="F" if columns_first else "C")
+            case _:
+                raise ValueError("expected an array of float32, got another")
 
 
-class _StoredDtype:
+class _StoredDtype(StandIn):
     """Stands for a numpy dtype in a pickle; only little-endian float32 passes."""
 
-    def __init__(self, code: str, *_: object) -> None:
-        self.code = code
+    def __init__(self, arguments: tuple[object, ...]) -> None:
+        self.code = arguments[0]
 
-    def __setstate__(self, state: tuple[object, ...]) -> None:
-        if self.code != "f4" or state[1] != "<":
-            raise pickle.UnpicklingError(f"expected arrays of float32, got {state[1]}{self.code}")
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """An unpickler that knows only the two stand-ins above: a pickle can call nothing else."""
-
-    def find_class(self, module: str, name: str) -> type[_StoredArray] | type[_StoredDtype]:
-        """Return the stand-in for a name of numpy's."""
-        if (module, name) not in _STAND_INS:
-            raise pickle.UnpicklingError(f"refused to load {module}.{name}")
-        return _STAND_INS[module, name]
+    def set_state(self, state: object) -> None:
+        """Check the type and the order of its bytes."""
+        match self.code, state:
+            case "f4", (_, "<", *_):
+                return
+        raise ValueError("expected arrays of float32, got others")
 
 
-_STAND_INS: dict[tuple[str, str], type[_StoredArray] | type[_StoredDtype]] = {
-    ("numpy", "ndarray"): _StoredArray,
+_NAMES: Names = {
+    ("numpy", "ndarray"): None,
     ("numpy", "dtype"): _StoredDtype,
-    ("numpy.core.multiarray", "_reconstruct"): _StoredArray,  # numpy 1
-    ("numpy._core.multiarray", "_reconstruct"): _StoredArray,  # numpy 2
+    ("numpy.core.multiarray", "_reconstruct"): lambda _: _StoredArray(),  # numpy 1
+    ("numpy._core.multiarray", "_reconstruct"): lambda _: _StoredArray(),  # numpy 2
 }

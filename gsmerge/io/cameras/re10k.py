@@ -7,33 +7,31 @@ views (torch's ``serialization.py``, since version 1.6).
 
 from __future__ import annotations
 
-import pickle
 import struct
 import zipfile
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from math import prod
-from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_VIEWS, check_file
+from gsmerge.io.bounds import MAX_VIEWS, ReadBudget, read_budget, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.photo_files import decode_embedded, photo_size
+from gsmerge.io.pickles import Names, read_pickle
+from gsmerge.types import StrPath
 
 SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
-_MAX_PHOTOS = 1 << 30  # bytes of the decoded photos
-MAX_PICKLE = 16 << 20  # bytes of a file's structure; its numbers lie elsewhere
-MAX_INDEX = 1 << 48  # of a number in a storage
+_MAX_INDEX = 1 << 48  # of a number in a storage
+_MAX_AXES = 64  # of an array of NumPy's
 _DTYPES = {
     "FloatStorage": "<f4", "DoubleStorage": "<f8", "HalfStorage": "<f2", "ByteStorage": "u1", "CharStorage": "i1",
     "ShortStorage": "<i2", "IntStorage": "<i4", "LongStorage": "<i8", "BoolStorage": "?",
+    "BFloat16Storage": None, "ComplexFloatStorage": None, "ComplexDoubleStorage": None,
 }  # fmt: skip
 _LOCAL_HEADER = struct.Struct("<4s22xHH")  # mark, and the bytes of the name and of what follows it
 
@@ -45,17 +43,20 @@ def read_re10k(source: CameraSource) -> StoredCameras:
     size, two zeros and a world-to-camera 3x4 (OpenCV axes); ``images`` are v JPEG files as tensors of bytes.
     SceneError if it cannot be read, has no scene of that key, or an array has another shape.
     """
-    path, scene = source.path, source.scene
-    entries = _load(path)
+    path, scene, budget = source.path, source.scene, read_budget(source.path)
+    entries = _load(budget)
     named = [entry for entry in entries if isinstance(entry.get("key"), str) and entry["key"] == scene]
     if 1 not in (len(entries), len(named)):
-        keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
+        keys = ", ".join(key[:40] for entry in entries[:3] if isinstance(key := entry.get("key"), str))
         problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
         raise SceneError(path, problem, "name the .ply as its scene is named")
-    entry = entries[0] if len(entries) == 1 else named[0]
-    rows = _rows(path, entry.get("cameras"))
+    return _read_scene(budget, entries[0] if len(entries) == 1 else named[0])
+
+
+def _read_scene(budget: ReadBudget, entry: Mapping[str, Any]) -> StoredCameras:
+    rows = _rows(budget.path, entry.get("cameras"))
     names = [f"view {i}" for i in range(len(rows))]
-    photos = _photos(path, entry.get("images"), names)
+    photos = _photos(budget, entry.get("images"), names)
     size = photo_size(photos) or (0, 0)
     views = [
         View(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size) for name, row in zip(names, rows, strict=True)
@@ -63,49 +64,66 @@ def read_re10k(source: CameraSource) -> StoredCameras:
     return StoredCameras(views, photos)
 
 
-def _load(path: Path) -> list[Mapping[str, Any]]:
-    check_file(path)
-    data = read_torch_file(path)
+def _load(budget: ReadBudget) -> list[Mapping[str, Any]]:
+    data = read_torch_file(budget)
     entries = data if isinstance(data, list) else [data]
     if not entries or not all(isinstance(entry, Mapping) and "cameras" in entry for entry in entries):
-        raise SceneError(path, "expected a list of scenes with 'key', 'cameras' and 'images', found something else")
+        problem = "expected a list of scenes with 'key', 'cameras' and 'images', found something else"
+        raise SceneError(budget.path, problem)
     return entries
 
 
-def _rows(path: Path, cameras: Any) -> np.ndarray:
+def _rows(path: StrPath, cameras: Any) -> np.ndarray:
     if not isinstance(cameras, StoredTensor) or cameras.shape[1:] != (_COLUMNS,):
         shape = list(cameras.shape) if isinstance(cameras, StoredTensor) else type(cameras).__name__
         raise SceneError(path, f"expected cameras [v,{_COLUMNS}], found {shape}")
     if not 0 < cameras.shape[0] <= MAX_VIEWS:
         raise SceneError(path, f"expected 1 to {MAX_VIEWS} cameras, found {cameras.shape[0]}")
-    if cameras.dtype is None or cameras.dtype.kind != "f":
-        raise SceneError(path, f"expected cameras of numbers, found {cameras.dtype or 'another type'}")
+    if cameras.storage.dtype is None or cameras.storage.dtype.kind != "f":
+        raise SceneError(path, f"expected cameras of numbers, found {cameras.storage.dtype or 'another type'}")
     return cameras.read().astype(np.float64)
 
 
-def _photos(path: Path, images: Any, names: list[str]) -> np.ndarray | None:
+def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | None:
     """Decode the photos ``[v,h,w,3]`` uint8; None where the chunk has none."""
     listed = isinstance(images, list | tuple)
     if images is None or (listed and not images):
         return None
     if not listed or len(images) != len(names):
         count = len(images) if listed else type(images).__name__
-        raise SceneError(path, f"expected {len(names)} images, one per camera, found {count}")
-    limit = path.stat().st_size
+        raise SceneError(budget.path, f"expected {len(names)} images, one per camera, found {count}")
     for image in images:
-        plain = isinstance(image, StoredTensor) and image.dtype == np.uint8
-        if not plain or image.strides != (1,) or image.size > limit:
-            raise SceneError(path, "expected images as tensors [bytes] of uint8, found others")
-    return decode_embedded(path, names, [image.read() for image in images], _MAX_PHOTOS)
+        if not isinstance(image, StoredTensor) or image.storage.dtype != np.uint8 or image.strides != (1,):
+            raise SceneError(budget.path, "expected images as tensors [bytes] of uint8, found others")
+    return decode_embedded(budget, names, [image.read() for image in images])
+
+
+class _Storage(NamedTuple):
+    member: zipfile.ZipInfo  # with its bytes
+    dtype: np.dtype[Any] | None  # None: of a type that is not read
+
+
+@dataclass
+class _TorchFile:
+    """A file whose tensors are read, all of which together have at most its bytes."""
+
+    budget: ReadBudget
+    num_bytes: int = 0  # read so far
+
+    def count(self, num_bytes: int) -> None:
+        """Count bytes that are read next; SceneError if they are more than the file has."""
+        self.num_bytes += num_bytes
+        if self.num_bytes > self.budget.file_bytes:
+            problem = f"expected tensors of at most the file's {self.budget.file_bytes:,} bytes in all, found more"
+            raise SceneError(self.budget.path, problem, "save each once")
 
 
 @dataclass(frozen=True)
 class StoredTensor:
     """A tensor in a file whose values are read on request."""
 
-    path: Path
-    member: zipfile.ZipInfo  # with the bytes of its storage
-    dtype: np.dtype[Any] | None  # None: of a type that is not read
+    file: _TorchFile
+    storage: _Storage
     offset: int  # of its first number in the storage
     shape: tuple[int, ...]
     strides: tuple[int, ...]  # in numbers
@@ -116,95 +134,97 @@ class StoredTensor:
         return prod(self.shape)
 
     def read(self) -> np.ndarray:
-        """Read the values; SceneError if the file does not hold them."""
-        if self.dtype is None:
-            raise SceneError(self.path, "expected plain numbers, found another type")
-        lengths = zip(self.shape, self.strides, strict=True)
-        span = 1 + sum((n - 1) * stride for n, stride in lengths) if self.size else 0
-        width = self.dtype.itemsize
-        content = self._bytes(width * self.offset, width * span)
-        if len(content) < width * span:
-            raise SceneError(self.path, "expected a chunk written by torch.save, found a damaged one")
-        steps = [width * stride for stride in self.strides]
-        return np.ndarray(self.shape, self.dtype, content, 0, steps).copy()
+        """Read the values; SceneError if the file does not hold each of them."""
+        path, dtype = self.file.budget.path, self.storage.dtype
+        if dtype is None:
+            raise SceneError(path, "expected plain numbers, found another type")
+        span = min(self.size, 1)
+        for stride, length in sorted(zip(self.strides, self.shape, strict=True)):
+            if length > 1 and stride < span:
+                problem = "expected a tensor that stores each value, found an expanded or overlapping one"
+                raise SceneError(path, problem, "save a contiguous copy")
+            span += (length - 1) * stride if self.size else 0
+        self.file.count(dtype.itemsize * self.size)
+        content = self._bytes(dtype.itemsize * self.offset, dtype.itemsize * span)
+        if len(content) < dtype.itemsize * span:
+            raise SceneError(path, "expected a chunk written by torch.save, found a damaged one")
+        steps = [dtype.itemsize * stride for stride in self.strides]
+        return np.ndarray(self.shape, dtype, content, 0, steps).copy()
 
     def _bytes(self, start: int, count: int) -> bytes:
         """Read bytes of the storage, fewer where the file ends before."""
-        with self.path.open("rb") as file:
-            file.seek(self.member.header_offset)
+        path = self.file.budget.path
+        with read_errors(path), open(path, "rb") as file:
+            file.seek(self.storage.member.header_offset)
             head = file.read(_LOCAL_HEADER.size)
-            if len(head) < _LOCAL_HEADER.size or start + count > self.member.file_size:
+            if len(head) < _LOCAL_HEADER.size or start + count > self.storage.member.file_size:
                 return b""
             mark, name, more = _LOCAL_HEADER.unpack(head)
             file.seek(name + more + start, 1)
             return file.read(count) if mark == b"PK\3\4" else b""
 
 
-def read_torch_file(path: Path) -> Any:
+def read_torch_file(budget: ReadBudget) -> Any:
     """Read the structure of a file of ``torch.save``, with a :class:`StoredTensor` for a tensor.
 
-    SceneError if it is another file, a damaged one, or holds more than plain containers and
-    tensors.
+    SceneError if it is another file, a damaged one, holds more than plain containers and tensors, or takes more than
+    its budget.
     """
-    problem = "expected a chunk written by torch.save, found"
-    if not zipfile.is_zipfile(path):
-        raise SceneError(path, f"{problem} something else")
+    path, problem = budget.path, "expected a chunk written by torch.save, found"
     try:
-        with zipfile.ZipFile(path) as archive:
-            members = {member.filename: member for member in archive.infolist()}
-            if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
+        with read_errors(path), zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if any(member.compress_type != zipfile.ZIP_STORED for member in members):
                 raise SceneError(path, f"{problem} packed members")
-            (name,) = (name for name in members if name.split("/")[1:] == ["data.pkl"])
-            if members[name].file_size > MAX_PICKLE:
-                raise SceneError(path, f"{problem} more than {MAX_PICKLE >> 20} MiB of structure")
-            content = archive.read(name)
-        folder = name.removesuffix("data.pkl")
-        return _Structure(path, folder, members, content).load()
-    except (SceneError, MemoryError):
-        raise
-    except Exception as error:  # whatever a damaged archive makes the libraries raise
-        problem = f"{problem} a damaged one, or objects, which are not read"
+            _check_places(budget, members)
+            (structure,) = (member for member in members if member.filename.split("/")[1:] == ["data.pkl"])
+            content = archive.read(structure)
+        folder = f"{structure.filename.removesuffix('.pkl')}/"
+        storages = {member.filename.removeprefix(folder): member for member in members}
+        return read_pickle(content, budget, _names(budget), lambda pid: _find_storage(storages, pid))
+    except zipfile.BadZipFile as error:
+        raise SceneError(path, f"{problem} something else, or a damaged one") from error
+    except (ValueError, RuntimeError, ArithmeticError, EOFError, struct.error) as error:  # of zipfile and read_pickle
+        problem = f"{problem} a damaged one, or objects, which are not read ({str(error)[:100]})"
         raise SceneError(path, problem) from error
 
 
-class _Structure(pickle._Unpickler):
-    """An unpickler that knows tensors and ordered dictionaries alone.
+def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
+    """Raise ValueError if a member lies outside of the file: what it says of itself is allocated to read it."""
+    for member in members:
+        places = member.header_offset, member.file_size, member.compress_size
+        if not 0 <= min(places) <= max(places) <= budget.file_bytes:
+            raise ValueError("expected members in the file, found others")
 
-    It is the one written in Python: that in C takes as much memory as a file asks for. Nor does a
-    file set the fields of what was made.
-    """
 
-    dispatch: ClassVar[dict[int, Callable[[pickle.Unpickler], None]]] = {
-        code: step for code, step in pickle._Unpickler.dispatch.items() if code != pickle.BUILD[0]
+def _names(budget: ReadBudget) -> Names:
+    """Return what the globals of torch's pickles stand for: those of storages for the type of their numbers."""
+    file = _TorchFile(budget)
+    return {
+        ("collections", "OrderedDict"): _make_dictionary,
+        ("torch._utils", "_rebuild_tensor_v2"): lambda arguments: _make_tensor(file, arguments),
+        ("torch._utils", "_rebuild_parameter"): lambda arguments: arguments[0],
+        **{("torch", name): dtype and np.dtype(dtype) for name, dtype in _DTYPES.items()},
     }
 
-    def __init__(self, path: Path, folder: str, members: dict[str, zipfile.ZipInfo], content: bytes) -> None:
-        super().__init__(BytesIO(content))
-        self._path, self._folder, self._members = path, folder, members
 
-    def find_class(self, module: str, name: str) -> Any:
-        """Return what stands for a name: of a storage the type of its numbers."""
-        objects = {
-            ("collections", "OrderedDict"): OrderedDict,
-            ("torch._utils", "_rebuild_tensor_v2"): self._make_tensor,
-            ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
-        }
-        if module == "torch" and name.endswith("Storage"):
-            return np.dtype(_DTYPES[name]) if name in _DTYPES else None
-        if (module, name) not in objects:
-            raise pickle.UnpicklingError(f"refused to load {module}.{name}")
-        return objects[module, name]
+def _make_dictionary(arguments: tuple[object, ...]) -> dict[str, object]:
+    if arguments:
+        raise ValueError("expected an empty dictionary, found one with arguments")
+    return {}
 
-    def persistent_load(self, pid: Any) -> Any:
-        """Find the numbers of a storage."""
-        _, dtype, key, *_ = pid
-        return self._members[f"{self._folder}data/{key}"], dtype
 
-    def _make_tensor(self, storage: Any, offset: int, shape: Any, strides: Any, *_: object) -> Any:
-        member, dtype = storage
-        numbers = (offset, *shape, *strides)
-        if not all(type(number) is int and 0 <= number < MAX_INDEX for number in numbers):
-            raise pickle.UnpicklingError("a tensor of an impossible shape")
-        if len(shape) != len(strides) or not isinstance(member, zipfile.ZipInfo):
-            raise pickle.UnpicklingError("a tensor of another form")
-        return StoredTensor(self._path, member, dtype, offset, tuple(shape), tuple(strides))
+def _find_storage(storages: Mapping[str, zipfile.ZipInfo], pid: object) -> _Storage:
+    match pid:
+        case ("storage", None | np.dtype() as dtype, str(key), _, _) if key in storages:
+            return _Storage(storages[key], dtype)
+    raise ValueError("expected a storage of the file, found none")
+
+
+def _make_tensor(file: _TorchFile, arguments: object) -> StoredTensor:
+    match arguments:
+        case (_Storage() as storage, int(offset), tuple(shape), tuple(strides), _, _):
+            numbers = (offset, *shape, *strides) if len(shape) == len(strides) <= _MAX_AXES else ()
+            if set(map(type, numbers)) == {int} and 0 <= min(numbers) <= max(numbers) < _MAX_INDEX:
+                return StoredTensor(file, storage, offset, shape, strides)
+    raise ValueError("expected a tensor, found one of another form")

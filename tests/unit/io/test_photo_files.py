@@ -17,7 +17,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import photo_files as photos
 from gsmerge.io import read_images
 from gsmerge.io.image_names import match_images, natural_key
-from gsmerge.io.photo_files import image_size
+from gsmerge.io.photo_files import decode_image, image_size
 from gsmerge.runtime.threads import use_threads
 
 
@@ -255,3 +255,13 @@ def test_kinds_of_png_are_decoded_as_ever(tmp_path: Path, kind: str) -> None:
         data = cv2.imencode(".png", pictures[kind])[1].tobytes()
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(read(path, data), expected[..., ::-1])
+
+
+def test_photos_have_as_many_scans_as_their_bytes_allow(tmp_path: Path) -> None:
+    path, size = tmp_path / "a.jpg", (2048, 2048)
+    data = cv2.imencode(".jpg", np.zeros(size, np.uint8), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    path.write_bytes(data)
+    assert not decode_image(path, size).any()
+    path.write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * 5000 + data[-2:])
+    with refuses(SceneError, path, "5,006 scans"):
+        decode_image(path, size)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import itertools
 import os
 import pickle
@@ -16,6 +15,8 @@ from numpy.typing import NDArray
 from torch.nn.functional import max_pool2d, pad, relu, unfold
 
 from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.io.bounds import read_budget
+from gsmerge.io.pickles import read_pickle
 from gsmerge.measure import lpips as perceptual
 from gsmerge.measure.lpips import lpips, lpips_available
 
@@ -274,12 +275,20 @@ def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
     assert not trap.exists()
 
 
-def test_numpy_itself_is_not_called() -> None:
+def test_numpy_itself_is_not_called(package: Path) -> None:
     """Even names that are let through stand for something harmless: no array is made but from float32 bytes."""
-    content = pickle.dumps(_Calls(np.ndarray, (1 << 50,)), 4)
-    stored = perceptual._ArrayUnpickler(io.BytesIO(content)).load()
-    assert not isinstance(stored, np.ndarray)
-    assert stored.values.size == 0
+    reconstruct = np.empty(0).__reduce__()[0]
+    unset = {"kernel": _Calls(reconstruct, np.ndarray, (1 << 50,), b"b"), "bias": 0}
+    for layer, found in ((_Calls(np.ndarray, (1 << 50,)), "function"), (unset, "shape")):
+        path = write_package(package, "alex", {"AlexNet_0": {"Conv_0": layer}})
+        with refuses(SceneError, path, "(alex)", found):
+            lpips(FIRST, SECOND, "alex")
+
+
+def test_small_files_take_no_memory(package: Path) -> None:
+    path = write_package(package, "alex", b"\x80\x05\x96" + (6 << 30).to_bytes(8, "little") + b".")
+    with refuses(SceneError, path, "(alex)", "instruction"):
+        lpips(FIRST, SECOND, "alex")
 
 
 @pytest.mark.parametrize(
@@ -323,8 +332,8 @@ def true_tree(net: str) -> dict[str, Any]:
     def plain(node: Any) -> Any:
         return {k: plain(v) for k, v in node.items()} if isinstance(node, dict) else node.values
 
-    with perceptual.require_lpips(net).open("rb") as stream:
-        tree: dict[str, Any] = plain(perceptual._ArrayUnpickler(stream).load())
+    path = perceptual.require_lpips(net)
+    tree: dict[str, Any] = plain(read_pickle(path.read_bytes(), read_budget(path), perceptual._NAMES))
     return tree
 
 

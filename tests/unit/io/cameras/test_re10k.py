@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from exports import export_rows, save_export, smooth_scene, turned
 from messages import refuses
@@ -121,4 +124,31 @@ def test_tensors_that_want_gradients(tmp_path: Path) -> None:
     given = entry(SMOOTH, "a")
     expected = read_cameras(save(tmp_path, given)).viewmats
     actual = read_cameras(save(tmp_path, given | {"cameras": rows_of(SMOOTH).requires_grad_()}))
+    assert np.array_equal(actual.viewmats, expected)
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_other_values_beside_change_nothing(tmp_path: Path, protocol: int) -> None:
+    types = (torch.float64, torch.float16, torch.bfloat16, torch.complex64, torch.uint8, torch.int8, torch.int16,
+             torch.int32, torch.int64, torch.bool)  # fmt: skip
+    others = {
+        "plain": [None, True, -1, 70_000, 2**40, 1.5, (), (1, 2, 3, 4), {"a": {}}, OrderedDict(b=1)],
+        "tensors": [torch.zeros(2, 3, dtype=dtype) for dtype in types],
+        "model": OrderedDict(weight=torch.nn.Parameter(torch.zeros(3))),
+        "same": [rows_of(SMOOTH)] * 300,
+    }
+    expected = read_cameras(save(tmp_path, entry(SMOOTH, "a"))).viewmats
+    path, scene = tmp_path / "other.torch", others | entry(SMOOTH, "a")
+    torch.save([scene | {"images": tuple(scene["images"])}], path, pickle_protocol=protocol)
+    assert np.array_equal(read_cameras(path).viewmats, expected)
+
+
+@pytest.mark.parametrize(
+    "store",
+    [lambda rows: rows.T.contiguous().T, lambda rows: torch.cat([rows, rows], 1)[:, :18], torch.Tensor.double],
+    ids=["by columns", "part of a tensor", "float64"],
+)
+def test_tensors_of_any_order(tmp_path: Path, store: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    expected = read_cameras(save(tmp_path, entry(SMOOTH, "a"))).viewmats
+    actual = read_cameras(save(tmp_path, entry(SMOOTH, "a") | {"cameras": store(rows_of(SMOOTH))}))
     assert np.array_equal(actual.viewmats, expected)
