@@ -20,7 +20,6 @@ Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +54,7 @@ class ViewPlan:
     viewmat: Array  # [4,4] float64, world to camera
     width: int  # pixels
     height: int  # pixels
+    top: int = 0  # row of the view at which a band of it begins, `height` rows that blending alone draws
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
@@ -195,8 +195,9 @@ def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads:
 def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
     if viewmat.shape != (4, 4) or K.shape != (3, 3):
         raise ValueError(f"expected a [4,4] view matrix and [3,3] K, got {list(viewmat.shape)} and {list(K.shape)}")
-    if not (0 < width <= MAX_SIZE and 0 < height <= MAX_SIZE):
-        raise ValueError(f"expected an image size from 1 to {MAX_SIZE} pixels per side, got {width} x {height}")
+    if not (0 < width <= projection.MAX_SIZE and 0 < height <= projection.MAX_SIZE):
+        most = projection.MAX_SIZE
+        raise ValueError(f"expected an image size from 1 to {most} pixels per side, got {width} x {height}")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
@@ -221,6 +222,7 @@ def plan_view(
     opacities: Array | None = None,
     keep: Array | None = None,
     tiles: Array | None = None,
+    band: tuple[int, int] | None = None,
 ) -> ViewPlan:
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
@@ -229,6 +231,7 @@ def plan_view(
     ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
     2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
     left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
+    Of a ``band`` only these lines of tiles, first and last + 1, are planned, as a picture of their own.
     The size of the plan goes with what is visible, not with n. Raises ValueError if a size or a
     number is out of range.
     """
@@ -246,13 +249,20 @@ def plan_view(
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
+    first, last = band or (0, tile_height)
+    if band is not None:
+        lines = np.arange(tile_height)[:, None]
+        tiles = ((first <= lines) & (lines < last)).repeat(tile_width, 1)
     wanted = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, wanted, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
+        if band is not None:
+            boxes[:, 2:] = boxes[:, 2:].clip(first, last)
         order = depth_order(depths.view(np.uint32))
         flatten_ids, isect_offsets = _bin(order, boxes, tile_height, tile_width, threads)
-    eye = camera_centres(local).astype(np.float32)
+    eye, top = camera_centres(local).astype(np.float32), first * projection.TILE
     return ViewPlan(
-        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width, height
+        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
+        min(height, last * projection.TILE) - top, top,
     )  # fmt: skip
