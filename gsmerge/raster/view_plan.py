@@ -12,13 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
-from gsmerge.kernels.raster.binning import count_tiles, deal_tiles, depth_order
+from gsmerge.kernels.raster.binning import count_tiles, deal_open_tiles, deal_tiles, depth_order
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
+MANY = 1 << 24  # intersections of a view, and for each Gaussian, from which on it is worth
+MANY_EACH = 16  # looking whether most of them are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 
 
@@ -174,12 +176,16 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
     return conics, depths, boxes
 
 
-def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads: int) -> tuple[Array, Array]:
+def _bin(
+    order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
+) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
     boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
+    if counts.sum() > max(MANY, MANY_EACH * len(order)):
+        return _bin_open(order, boxes, conics, tile_height, tile_width, threads)
     isect_offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
     cursors = isect_offsets[:-1] + np.cumsum(counts, 0) - counts
     flatten_ids = np.empty(isect_offsets[-1], np.int32)
@@ -189,6 +195,27 @@ def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads:
         deal_tiles(order[part], boxes[part], tile_width, piece[1], flatten_ids)
 
     parallel_map(deal, zip(spans, cursors, strict=True))
+    return flatten_ids, isect_offsets
+
+
+def _bin_open(
+    order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
+) -> tuple[Array, Array]:
+    """Return the lists of :func:`_bin`, each as far as something can be seen of it, so that they stay short."""
+    num = min(tile_height, 4 * threads)
+    spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
+
+    def deal(cursors: Array, flatten_ids: Array) -> None:
+        left = np.ones(len(cursors), np.float32)
+        parallel_map(
+            lambda lines: deal_open_tiles(order, boxes, conics, tile_width, *lines, left, cursors, flatten_ids), spans
+        )
+
+    counts = np.zeros(tile_height * tile_width, np.int64)
+    deal(counts, np.empty(0, np.int32))
+    isect_offsets = np.concatenate([[0], np.cumsum(counts)])
+    flatten_ids = np.empty(isect_offsets[-1], np.int32)
+    deal(isect_offsets[:-1].copy(), flatten_ids)
     return flatten_ids, isect_offsets
 
 
@@ -260,7 +287,7 @@ def plan_view(
         if band is not None:
             boxes[:, 2:] = boxes[:, 2:].clip(first, last)
         order = depth_order(depths.view(np.uint32))
-        flatten_ids, isect_offsets = _bin(order, boxes, tile_height, tile_width, threads)
+        flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)
     eye, top = camera_centres(local).astype(np.float32), first * projection.TILE
     return ViewPlan(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,

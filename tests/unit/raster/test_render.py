@@ -216,3 +216,24 @@ def test_bands_of_a_large_picture_are_those_of_the_whole(band: int, monkeypatch:
     np.testing.assert_array_equal(drawn, 2 * render(gaussians, cameras, 0.3).images)
     tall = max(1, band // (41 * 16)) * 16
     assert shapes == [*[tall] * (61 // tall), 61 % tall] * 2
+
+
+def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So Gaussians that cover every pixel, and cannot be seen, take no memory; what is drawn stays."""
+    huge = balls(*((0.01 * i, 0, 4 + 0.01 * i, 30 + i, 0.02 + 0.004 * i, 0.5) for i in range(200)))
+    gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)
+
+    def draw() -> tuple[list[np.ndarray], list[list[int]]]:
+        plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
+        lists = np.split(plan.ids[plan.flatten_ids], plan.isect_offsets[1:-1])
+        return [*composite(plan), *contributions(plan)], [part.tolist() for part in lists]
+
+    whole, all_lists = draw()
+    monkeypatch.setattr("gsmerge.raster.view_plan.MANY", 0)
+    monkeypatch.setattr("gsmerge.raster.view_plan.MANY_EACH", 0)
+    drawn, lists = draw()
+    assert sum(map(len, lists)) < 0.6 * sum(map(len, all_lists))
+    for part, every in zip(lists, all_lists, strict=True):
+        assert part == every[: len(part)]
+    for values, expected in zip(drawn, whole, strict=True):
+        np.testing.assert_array_equal(values, expected)
