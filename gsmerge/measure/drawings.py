@@ -19,6 +19,8 @@ from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
+    FOLDER,
+    MAX_VIDEO_PIXELS,
     Picture,
     contact_sheet,
     draw_borders,
@@ -161,8 +163,16 @@ def plan_frames(options: DrawOptions) -> Drawing:
     facts = {"views": ids, "notes": framed.notes, "scenes": framed.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
     if is_video(options.output):
+        _check_frame(options.output, len(labels) * cameras.width, cameras.height)
         return Drawing([options.output], facts | {"fps": options.fps or FPS}, draw)
     return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
+
+
+def _check_frame(output: Path, width: int, height: int) -> None:
+    """Raise SceneError if the frames of a video would take too much memory to encode."""
+    if width * height > MAX_VIDEO_PIXELS:
+        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels a frame of a video, found {width} x {height}"
+        raise SceneError(output, problem, FOLDER)
 
 
 def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[int]]:

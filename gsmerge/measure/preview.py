@@ -33,7 +33,9 @@ ENCODERS = {
     ".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")),
     ".webm": (("VP80", "VP8"), ("VP90", "VP9")),
 }
-FOLDER = "name a folder instead, for one picture a frame, or install opencv-contrib-python-headless"
+MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
+OPENCV = "opencv-contrib-python-headless"
+FOLDER = "name a folder instead, for one picture a frame"
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -202,8 +204,9 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple
             writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if writer.isOpened():
             return writer, name
+    os.stat(str(temporary))  # where its folder has vanished meanwhile, this says so
     names = " and ".join(name for _, name in encoders)
-    raise SceneError(path, f"this OpenCV cannot write it: it has none of the encoders {names}", FOLDER)
+    raise SceneError(path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}")
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
@@ -215,6 +218,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
             readable += 1
         reader.release()
     if readable != count:
+        os.stat(str(temporary))  # as above
         problem = f"could not be written whole: {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 
