@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from hostile import CASES, MARKER, Case
 from messages import ERROR, names
+from tiny_scene import edited_json
 
 from .conftest import Run, listing
 
@@ -110,7 +111,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, ru
     assert names(outcome.err, *case.says), outcome.err
 
 
-@pytest.mark.parametrize("name", list(CASES)[::12])
+@pytest.mark.parametrize("name", [*list(CASES)[::12], "ply: 300000 rows of one place"])
 def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
     with limits():
@@ -128,6 +129,18 @@ def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
     assert "gsmerge: warning" not in outcome.err
     actual = run("inspect", scene / "small.ply", "--json").out
     assert json.loads(actual)["num_nonfinite"] == 0
+
+
+def test_a_frame_of_67_million_pixels_is_drawn_in_bands(scene: Path, run: Run) -> None:
+    with edited_json(scene / "transforms.json") as data:
+        focal, data["w"], data["h"] = 8190 / data["w"], 8190, 8190
+        data |= {name: focal * data[name] for name in ("fl_x", "fl_y")} | {"cx": 4095, "cy": 4095}
+        data["frames"] = data["frames"][:1]
+    (scene / "transforms.json").rename(scene.parent / "path.json")
+    shutil.rmtree(scene / "images")
+    with limits():
+        run("render", scene, "--path", scene.parent / "path.json", "-o", scene / "out", code=0)
+    assert [path.name for path in (scene / "out").iterdir()] == ["frame_00000.png"]
 
 
 def test_limits_hold() -> None:
