@@ -20,7 +20,7 @@ LINES = (
     "end_header",
 )
 ROW = 4 * len(COLUMNS)
-MANY = 300_000
+MANY = 600_000
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 RANGES = (
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
