@@ -237,7 +237,10 @@ def _is_reversed(shown: Shown) -> bool:
 
 
 def _is_reversed_alone(shown: Shown, view: int) -> bool:
-    """Return whether a photo is, where red less blue also falls as that of its Gaussians rises: no tone does that."""
+    """Return whether one photo is, whose red less blue also falls where that of its Gaussians rises.
+
+    No tone makes it do so.
+    """
     part = replace(shown, **{name: getattr(shown, name)[[view]] for name in ("photos", "pictures", "weights")})
     if not _is_reversed(part):
         return False

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.views import pick_views

@@ -204,9 +204,11 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple
             writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if writer.isOpened():
             return writer, name
-    os.stat(str(temporary))  # where its folder has vanished meanwhile, this says so
+    os.stat(str(temporary))  # fails, and says why, where the folder has vanished meanwhile
     names = " and ".join(name for _, name in encoders)
-    raise SceneError(path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}")
+    raise SceneError(
+        path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}"
+    )
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
@@ -218,7 +220,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
             readable += 1
         reader.release()
     if readable != count:
-        os.stat(str(temporary))  # as above
+        os.stat(str(temporary))  # as in _open_writer
         problem = f"could not be written whole: {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 

@@ -19,8 +19,7 @@ from gsmerge.types import Gaussians
 Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
-MANY = 1 << 24  # intersections of a view, and for each Gaussian, from which on it is worth
-MANY_EACH = 16  # looking whether most of them are hidden
+MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,9 +10,6 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
-
-if TYPE_CHECKING:
-    pass
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -58,7 +54,7 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
         return np.zeros(len(rows), bool)
     from scipy.spatial import cKDTree  # loads slowly, and is seldom needed
 
-    spread = spread_rows(means, NEIGHBORS + 1)  # the tree has no depth among points of one place
+    spread = spread_rows(means, NEIGHBORS + 1)  # equal points share a leaf, which every search goes through
     tree = cKDTree(means[spread], balanced_tree=False, compact_nodes=False)
     with use_threads() as threads:
         distances, ids = tree.query(means[rows], k=NEIGHBORS + 1, workers=threads)

@@ -98,9 +98,7 @@ def test_a_damaged_library_names_the_command_that_builds_it(monkeypatch: pytest.
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ELF files")
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.999])
-def test_a_library_that_is_cut_off_is_not_loaded(
-    share: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_library_that_is_cut_off_is_not_loaded(share: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Loading it may end the process by SIGBUS."""
     for target in find_platform().targets:
         name = find_platform().library_name(target)

@@ -2,7 +2,7 @@
 #pragma once
 #include "native.h"
 
-enum { TRIES = 32 };  // values looked at, of each in the run, before it is sorted: no order makes it quadratic
+enum { TRIES = 32 };  // passes over as many values as the run has before the rest is sorted: no order is quadratic
 
 // Lets the value at a place of a heap sink below those that are larger.
 static inline void sink(const double *values, int64_t stride, int64_t *heap, int64_t place,

@@ -113,7 +113,8 @@ API int32_t deal_open_tiles(const int32_t *order, const int16_t *boxes, const fl
       for (int64_t x = x0; x < x1; x++) {
         int64_t tile = y * tile_width + x;
         if (left[tile] < CLOSED) continue;
-        uint64_t slot = (uint64_t)cursors[tile]++;
+        uint64_t slot = (uint64_t)cursors[tile];
+        cursors[tile] = (int64_t)(slot + 1);
         if (intersections > 0 && slot >= (uint64_t)intersections) return OUTSIDE;
         if (intersections > 0) flatten_ids[slot] = order[i];
         left[tile] *= 1.f - least_share(conics + CONIC * (int64_t)order[i], (float)(x * TILE), (float)(y * TILE));
