@@ -29,11 +29,11 @@ class BuildNative(Command):
 
     def run(self):
         folder = native_build.FOLDER if self.editable_mode else Path(self.build_lib, "gsmerge", "kernels")
-        for path in folder.glob("kernels-*"):  # of an earlier build, maybe for another platform
-            path.unlink()
         wheel = self.distribution.command_obj.get("bdist_wheel")
-        for path in native_build.build(folder, platform=wheel.plat_name if wheel else None):
-            self.announce(f"built {path}", level=2)
+        built = native_build.build(folder, platform=wheel.plat_name if wheel else None)
+        for path in set(folder.glob("kernels-*")) - set(built):  # of an earlier build for another platform
+            path.unlink()
+        self.announce(f"built {', '.join(map(str, built))}", level=2)
 
     def get_source_files(self):
         return [str(path.relative_to(ROOT)) for path in native_build.source_files()]

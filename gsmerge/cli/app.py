@@ -196,6 +196,15 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def _check_working_directory() -> None:
+    """Raise SceneError if there is no working directory: libraries fail in ways of their own without it."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        reason = f"the working directory cannot be used ({error.strerror})"
+        raise SceneError(os.curdir, reason, "change it") from error
+
+
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
@@ -218,11 +227,7 @@ def run(args: Sequence[str] | None = None) -> int:
 
     try:
         with plain_warnings(), _orderly_stop(signals):
-            try:
-                os.getcwd()
-            except OSError as error:  # libraries fail in ways of their own without a folder
-                reason = f"the working directory cannot be used ({error.strerror})"
-                raise SceneError(os.curdir, reason, "change it") from error
+            _check_working_directory()
             app = make_app(words[0] if is_command else None)
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # whoever read our output has seen enough
@@ -245,6 +250,10 @@ def run(args: Sequence[str] | None = None) -> int:
             return fail(DAMAGED_OPENCV, 1)
         if is_torch_missing(error):
             return fail(NO_TORCH, UsageError.exit_code)
+        try:
+            _check_working_directory()  # it may have vanished meanwhile
+        except SceneError as vanished:
+            return fail(str(vanished), vanished.exit_code)
         first = f"{type(error).__name__}: {error}".splitlines()[0]
         return fail(f"unexpected error: {first}; run again with --debug", 1)
 

@@ -105,6 +105,12 @@ def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
         note("red and blue are in the wrong order in the photos (BGR): they change places")
         changes = [replace(change, reversed=True) for change in changes]
         small = _change_small(shown, changes)
+    odd = [view for view in views if _is_reversed_alone(small, view)]
+    if odd:
+        names = list_names(scene.names, odd)
+        note(f"red and blue are in another order in {len(odd)} of {len(scene)} photos: they change places: {names}")
+        changes = [replace(change, reversed=change.reversed != (view in odd)) for view, change in enumerate(changes)]
+        small = _change_small(shown, changes)
     flat = parallel_map(lambda view: _flat_regions(small, view), views)
     curves = _find_tones(small, flat)
     drawing: np.ndarray | None = None
@@ -228,6 +234,19 @@ def _is_reversed(shown: Shown) -> bool:
     counts = shown.clear
     rgb, bgr = (_difference(photos, shown.pictures, counts) for photos in (shown.photos, shown.photos[..., ::-1]))
     return bgr < SWAPPED * rgb and rgb - bgr > MIN_SWAP
+
+
+def _is_reversed_alone(shown: Shown, view: int) -> bool:
+    """Return whether one photo is, whose red less blue also falls where that of its Gaussians rises.
+
+    No tone makes it do so.
+    """
+    part = replace(shown, **{name: getattr(shown, name)[[view]] for name in ("photos", "pictures", "weights")})
+    if not _is_reversed(part):
+        return False
+    pair = ((images[..., 0] - images[..., 2])[part.clear] for images in (part.photos, part.pictures))
+    photo, picture = (values - np.median(values) for values in pair)
+    return bool((photo * picture).sum() < 0)
 
 
 def _find_tones(shown: Shown, flat: Sequence[np.ndarray]) -> list[np.ndarray | None]:

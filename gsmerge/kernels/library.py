@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import struct
 from functools import lru_cache
 from pathlib import Path
 
@@ -44,12 +45,22 @@ def _open(target: Target) -> ctypes.CDLL:
     folder = Path(os.environ.get("GSMERGE_NATIVE") or FOLDER)
     path = folder / find_platform().library_name(target)
     try:
+        _check_end(path)
         library = ctypes.CDLL(str(path))
-    except OSError as error:
+        built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
+    except (OSError, ValueError) as error:  # the latter where it is none of ours
         problem = "cannot be loaded" if path.exists() else "is missing"
         reason = f" ({error})" if path.exists() else ""
         raise UsageError(f"{path}: the native library {problem}{reason}; {REMEDY}") from None
-    built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
-    if hash_sources() not in ("", built.decode()):
+    if hash_sources().encode() not in (b"", built):
         raise UsageError(f"{path}: the native library is older than its sources; {REMEDY}")
     return library
+
+
+def _check_end(path: Path) -> None:
+    """Raise OSError for an ELF file that ends before its table of sections, the last part: loading it may kill us."""
+    with path.open("rb") as file:
+        head = file.read(64).ljust(64, b"\0")
+    table, size, count = struct.unpack_from("<40xQ10xHH", head)
+    if head.startswith(b"\x7fELF") and not 0 < table <= path.stat().st_size - size * count:
+        raise OSError("it is cut off")

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.views import pick_views
@@ -19,6 +17,8 @@ from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
+    FOLDER,
+    MAX_VIDEO_PIXELS,
     Picture,
     contact_sheet,
     draw_borders,
@@ -98,11 +98,13 @@ class Framed:
 
     def draw(
         self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
-    ) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield the pictures ``[h,w,3]`` of all scenes for each camera; memory holds one view per thread."""
+    ) -> Iterator[tuple[Picture, ...]]:
+        """Yield the 8-bit pictures of all scenes for each camera; memory holds one view per thread."""
         grey, antialiased = options.background, options.antialiased
         drawn = (
-            render_in_turn(gaussians, cameras, grey, at_once=threads, antialiased=antialiased, near=near)
+            render_in_turn(
+                gaussians, cameras, grey, at_once=threads, antialiased=antialiased, near=near, convert=to_picture
+            )
             for _, gaussians in self.scenes
         )
         return zip(*drawn, strict=True)
@@ -143,7 +145,7 @@ def plan_pictures(options: DrawOptions) -> Drawing:
     return Drawing(
         [options.output / f"{stems[i]}.png" for i in ids],
         {**size, "num_gaussians": len(framed.scenes[0][1]), "views": ids, "notes": framed.notes},
-        lambda threads: (to_picture(image) for (image,) in framed.draw(views, options, threads)),
+        lambda threads: (picture for (picture,) in framed.draw(views, options, threads)),
     )
 
 
@@ -153,14 +155,22 @@ def plan_frames(options: DrawOptions) -> Drawing:
     labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in framed.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
-        for images in framed.draw(cameras, options, threads, near):
-            yield contact_sheet([list(zip(labels, images, strict=True))]) if len(images) > 1 else to_picture(images[0])
+        for drawn in framed.draw(cameras, options, threads, near):
+            yield contact_sheet([list(zip(labels, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
 
     facts = {"views": ids, "notes": framed.notes, "scenes": framed.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
     if is_video(options.output):
+        _check_frame(options.output, len(labels) * cameras.width, cameras.height)
         return Drawing([options.output], facts | {"fps": options.fps or FPS}, draw)
     return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
+
+
+def _check_frame(output: Path, width: int, height: int) -> None:
+    """Raise SceneError if the frames of a video would take too much memory to encode."""
+    if width * height > MAX_VIDEO_PIXELS:
+        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels a frame of a video, found {width} x {height}"
+        raise SceneError(output, problem, FOLDER)
 
 
 def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[int]]:

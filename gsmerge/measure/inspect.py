@@ -54,6 +54,7 @@ def inspect(
     images: StrPath | None = None,
     masks: StrPath | None = None,
     opacity: OpacityChoice = "auto",
+    threads: int | None = None,
     **hints: Any,
 ) -> dict[str, Any]:
     """Describe a scene, and measure whether it has one Gaussian per pixel.
@@ -64,6 +65,7 @@ def inspect(
         images: A folder or an ``.npz``.
         masks: A folder of images named as the photos, dark where a photo does not count.
         opacity: As of :func:`gsmerge.io.read_ply`.
+        threads: How many, on which nothing depends; None: all processors.
         hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
 
@@ -90,7 +92,7 @@ def inspect(
     """
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
-    with use_threads():
+    with use_threads(threads):
         ply = read_rows(files, opacity=opacity, hints=read_hints)
         document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
         document["notes"] = [*document["notes"], *degree_notes(ply.info)]

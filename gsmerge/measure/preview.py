@@ -33,7 +33,9 @@ ENCODERS = {
     ".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")),
     ".webm": (("VP80", "VP8"), ("VP90", "VP9")),
 }
-FOLDER = "name a folder instead, for one picture a frame, or install opencv-contrib-python-headless"
+MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
+OPENCV = "opencv-contrib-python-headless"
+FOLDER = "name a folder instead, for one picture a frame"
 
 
 def to_picture(image: np.ndarray) -> Picture:
@@ -66,38 +68,38 @@ def view_pictures(
     *,
     max_views: int = 4,
     **drawing: Any,
-) -> list[list[tuple[str, np.ndarray]]]:
+) -> list[list[tuple[str, Picture]]]:
     """Render each scene in at most ``max_views`` views, in rows that begin with the photo if there is one.
 
-    Every render ``[h,w,3]`` comes with a line of text: its name, its number of Gaussians, and its PSNR against the
+    Every picture comes with a line of text: its name, its number of Gaussians, and its PSNR against the
     photo ``[c,h,w,3]``, or without photos against the first scene. ``drawing`` is passed on to :func:`gsmerge.render`.
     """
     ids = pick_views(len(cameras), max_views)
     renders = [render(gaussians, cameras[ids], **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
     for row, view in enumerate(ids):
-        pictures = [] if photos is None else [(f"photo, view {view}", photos[view])]
+        pictures = [] if photos is None else [(f"photo, view {view}", to_picture(photos[view]))]
         for i, (name, gaussians) in enumerate(scenes):
             against = photos[view] if photos is not None else renders[0][row] if i else None
             quality = "" if against is None else f", {psnr(renders[i][row], against):.1f} dB"
-            pictures.append((f"{name}: {len(gaussians):,}{quality}", renders[i][row]))
+            pictures.append((f"{name}: {len(gaussians):,}{quality}", to_picture(renders[i][row])))
         views.append(pictures)
     return views
 
 
 def outside_pictures(
     scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
-) -> list[tuple[str, np.ndarray]]:
+) -> list[tuple[str, Picture]]:
     """Render each scene from outside the capture, as one row like those of :func:`view_pictures`.
 
-    Every render ``[h,w,3]`` comes with its name. With ``photos`` a white picture comes first, in the photos' column.
+    Every picture comes with its name. With ``photos`` a white picture comes first, in the photos' column.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
-    renders = [(f"{name}: {OUTSIDE}", render(scene, camera, **drawing).images[0].clip(0, 1)) for name, scene in scenes]
-    return [(f"{OUTSIDE}: no photo", np.ones_like(renders[0][1]))] * photos + renders
+    renders = [(f"{name}: {OUTSIDE}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes]
+    return [(f"{OUTSIDE}: no photo", np.full_like(renders[0][1], 255))] * photos + renders
 
 
-def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_width: int = 320) -> Picture:
+def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
     """Arrange pictures in a sheet: one labelled row per view.
 
     Small pictures are enlarged by a whole factor so that a tile has at least ``min_width`` columns.
@@ -105,7 +107,7 @@ def contact_sheet(views: Sequence[Sequence[tuple[str, np.ndarray]]], *, min_widt
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
     for pictures in views:
-        tiles = [(text, np.repeat(np.repeat(to_picture(image), factor, 0), factor, 1)) for text, image in pictures]
+        tiles = [(text, np.repeat(np.repeat(picture, factor, 0), factor, 1)) for text, picture in pictures]
         rows.append(_join([label(picture, text) for text, picture in tiles], axis=1))
     return _join(rows, axis=0)
 
@@ -202,8 +204,11 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple
             writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
         if writer.isOpened():
             return writer, name
+    os.stat(str(temporary))  # fails, and says why, where the folder has vanished meanwhile
     names = " and ".join(name for _, name in encoders)
-    raise SceneError(path, f"this OpenCV cannot write it: it has none of the encoders {names}", FOLDER)
+    raise SceneError(
+        path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}"
+    )
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
@@ -215,6 +220,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
             readable += 1
         reader.release()
     if readable != count:
+        os.stat(str(temporary))  # as in _open_writer
         problem = f"could not be written whole: {readable} of {count} frames can be read"
         raise SceneError(path, problem, "free some space, or write elsewhere")
 

@@ -41,7 +41,7 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     transmittance = np.empty((plan.height, plan.width), np.float32)
 
     def tiles(span: tuple[int, int]) -> None:
-        kernels.blend(*plan.lists, colors, *span, background, image, transmittance)
+        kernels.blend(*plan.lists, colors, *span, plan.top, background, image, transmittance)
 
     with use_threads() as threads:
         parallel_map(tiles, tile_ranges(plan, threads))

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.raster.composite import Rendering, background_color, contributions, draw_views, prepare_views
+from gsmerge.kernels.raster.project import TILE
+from gsmerge.raster.composite import (
+    Rendering,
+    background_color,
+    blend,
+    contributions,
+    draw_views,
+    prepare_views,
+    view_colors,
+)
 from gsmerge.raster.photos import NEAR
 from gsmerge.raster.view_plan import ViewPlan, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
@@ -18,6 +27,7 @@ if TYPE_CHECKING:
     import torch
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
+BAND_PIXELS = 1 << 22  # of a picture that are in memory as floating-point numbers; larger ones are drawn in bands
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
 
@@ -106,22 +116,33 @@ def render_in_turn(
     at_once: int,
     antialiased: bool = False,
     near: float = 0.01,
+    convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, with at most ``at_once`` in memory."""
+    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed by ``convert``, pixel by pixel.
+
+    At most ``at_once`` are in memory; large ones are drawn, and converted, in bands.
+    """
     under = background_color(background)
     plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
+    lines, tall = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
+    if lines > tall:
+        bands = [(first, min(first + tall, lines)) for first in range(0, lines, tall)]
+        for view in range(len(cameras)):
+            plans = (plan_one(view, band) for band in bands)
+            yield np.concatenate([convert(blend(plan, view_colors(plan), under)[0]) for plan in plans])
+        return
     for first in range(0, len(cameras), at_once):
         count = min(at_once, len(cameras) - first)
         shape = count, cameras.height, cameras.width
-        yield from draw_views(plan_one, shape, under, with_depths=False, first=first).images
+        yield from map(convert, draw_views(plan_one, shape, under, with_depths=False, first=first).images)
 
 
-def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[[int], ViewPlan]:
-    """Prepare the Gaussians for cameras, and return what plans the drawing of each view by its number."""
+def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[..., ViewPlan]:
+    """Prepare the Gaussians for cameras, and return what plans the drawing of each view by its number, or a band."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
-    def plan_one(view: int) -> ViewPlan:
-        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
+    def plan_one(view: int, band: tuple[int, int] | None = None) -> ViewPlan:
+        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, band=band, **options)
 
     return plan_one
 

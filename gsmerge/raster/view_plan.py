@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from gsmerge.geometry import camera_centres
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
-from gsmerge.kernels.raster.binning import count_tiles, deal_tiles, depth_order
+from gsmerge.kernels.raster.binning import count_tiles, deal_open_tiles, deal_tiles, depth_order
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians
 
 Array = NDArray[Any]
 
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
+MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-MAX_SIZE = 32767 * projection.TILE  # pixels per side: tile columns and rows are kept in 16 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,7 @@ class ViewPlan:
     viewmat: Array  # [4,4] float64, world to camera
     width: int  # pixels
     height: int  # pixels
+    top: int = 0  # row of the view at which a band of it begins, `height` rows that blending alone draws
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
@@ -174,12 +175,16 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
     return conics, depths, boxes
 
 
-def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads: int) -> tuple[Array, Array]:
+def _bin(
+    order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
+) -> tuple[Array, Array]:
     """Return the tile lists and their starts."""
     # One gather in advance, 8 bytes a box: in the loops below every miss would be paid in full.
     boxes = boxes.view(np.uint64)[order, 0].view(np.int16).reshape(-1, 4)
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], tile_height, tile_width), spans))
+    if counts.sum() > max(MANY, MANY_EACH * len(order)):
+        return _bin_open(order, boxes, conics, tile_height, tile_width, threads)
     isect_offsets = np.concatenate([[0], np.cumsum(counts.sum(0))])
     cursors = isect_offsets[:-1] + np.cumsum(counts, 0) - counts
     flatten_ids = np.empty(isect_offsets[-1], np.int32)
@@ -192,11 +197,33 @@ def _bin(order: Array, boxes: Array, tile_height: int, tile_width: int, threads:
     return flatten_ids, isect_offsets
 
 
+def _bin_open(
+    order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
+) -> tuple[Array, Array]:
+    """Return the lists of :func:`_bin`, each as far as something can be seen of it, so that they stay short."""
+    num = min(tile_height, 4 * threads)
+    spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
+
+    def deal(cursors: Array, flatten_ids: Array) -> None:
+        left = np.ones(len(cursors), np.float32)
+        parallel_map(
+            lambda lines: deal_open_tiles(order, boxes, conics, tile_width, *lines, left, cursors, flatten_ids), spans
+        )
+
+    counts = np.zeros(tile_height * tile_width, np.int64)
+    deal(counts, np.empty(0, np.int32))
+    isect_offsets = np.concatenate([[0], np.cumsum(counts)])
+    flatten_ids = np.empty(isect_offsets[-1], np.int32)
+    deal(isect_offsets[:-1].copy(), flatten_ids)
+    return flatten_ids, isect_offsets
+
+
 def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
     if viewmat.shape != (4, 4) or K.shape != (3, 3):
         raise ValueError(f"expected a [4,4] view matrix and [3,3] K, got {list(viewmat.shape)} and {list(K.shape)}")
-    if not (0 < width <= MAX_SIZE and 0 < height <= MAX_SIZE):
-        raise ValueError(f"expected an image size from 1 to {MAX_SIZE} pixels per side, got {width} x {height}")
+    if not (0 < width <= projection.MAX_SIZE and 0 < height <= projection.MAX_SIZE):
+        most = projection.MAX_SIZE
+        raise ValueError(f"expected an image size from 1 to {most} pixels per side, got {width} x {height}")
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
@@ -221,6 +248,7 @@ def plan_view(
     opacities: Array | None = None,
     keep: Array | None = None,
     tiles: Array | None = None,
+    band: tuple[int, int] | None = None,
 ) -> ViewPlan:
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
@@ -229,6 +257,7 @@ def plan_view(
     ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
     2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
     left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
+    Of a ``band`` only these lines of tiles, first and last + 1, are planned, as a picture of their own.
     The size of the plan goes with what is visible, not with n. Raises ValueError if a size or a
     number is out of range.
     """
@@ -246,13 +275,20 @@ def plan_view(
     camera = _camera(local, K, width, height, eps2d, antialiased)
     camera[projection.NEAR], camera[projection.FAR] = near, far
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
+    first, last = band or (0, tile_height)
+    if band is not None:
+        lines = np.arange(tile_height)[:, None]
+        tiles = ((first <= lines) & (lines < last)).repeat(tile_width, 1)
     wanted = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, wanted, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
+        if band is not None:
+            boxes[:, 2:] = boxes[:, 2:].clip(first, last)
         order = depth_order(depths.view(np.uint32))
-        flatten_ids, isect_offsets = _bin(order, boxes, tile_height, tile_width, threads)
-    eye = camera_centres(local).astype(np.float32)
+        flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)
+    eye, top = camera_centres(local).astype(np.float32), first * projection.TILE
     return ViewPlan(
-        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width, height
+        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
+        min(height, last * projection.TILE) - top, top,
     )  # fmt: skip

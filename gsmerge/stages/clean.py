@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
-
-if TYPE_CHECKING:
-    pass
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -57,12 +54,26 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
         return np.zeros(len(rows), bool)
     from scipy.spatial import cKDTree  # loads slowly, and is seldom needed
 
-    tree = cKDTree(means, balanced_tree=False, compact_nodes=False)
-    distances, ids = tree.query(means[rows], k=NEIGHBORS + 1, workers=-1)
-    distances, ids = distances[:, 1:], ids[:, 1:]  # the first is the Gaussian itself
+    spread = spread_rows(means, NEIGHBORS + 1)  # equal points share a leaf, which every search goes through
+    tree = cKDTree(means[spread], balanced_tree=False, compact_nodes=False)
+    with use_threads() as threads:
+        distances, ids = tree.query(means[rows], k=NEIGHBORS + 1, workers=threads)
+    distances, ids = distances[:, 1:], spread[ids[:, 1:]]  # the first is the Gaussian itself
     touched = (distances <= TOUCH * (sizes[rows][:, None] + sizes[ids])).any(1)
     apart = distances[:, 0] > APART * np.median(distances[:, 0])
     return np.asarray(~touched & apart) | beyond_scene(means[rows], means) | curtains(gaussians, rows)
+
+
+def spread_rows(points: np.ndarray, most: int) -> np.ndarray:
+    """Return the rising rows of points ``[n,3]``, of equal points only the first ``most``."""
+    rows = np.arange(len(points))
+    keys = np.sort(points[:, 0] + 2**0.5 * points[:, 1] + 3**0.5 * points[:, 2])  # equal for equal points
+    if not (keys[most:] == keys[:-most]).any():
+        return rows
+    order = np.lexsort(points.T)
+    starts = np.flatnonzero((np.diff(points[order], axis=0, prepend=np.nan) != 0).any(1))
+    ranks = rows - np.repeat(starts, np.diff(starts, append=len(rows)))
+    return np.sort(order[ranks < most])
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:

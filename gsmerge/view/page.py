@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.measure.preview import to_picture
+from gsmerge.measure.preview import Picture
 from gsmerge.measure.scores import filled_tables, page_notes, page_title
 from gsmerge.report import human_bytes
 from gsmerge.view.data import PageView, ViewData, encode_still
@@ -74,12 +74,12 @@ def view_page(data: ViewData) -> str:
     )
 
 
-def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[str, np.ndarray]]]) -> str:
+def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[str, Picture]]]) -> str:
     """Make the HTML page of an evaluation: headline, pictures with a swipe, tables.
 
     Args:
         document: As of :func:`gsmerge.measure.scores.evaluation_document`.
-        pictures: For each view the text and the picture ``[h,w,3]`` of each scene, sRGB in [0, 1].
+        pictures: For each view the text and the picture of each scene.
     """
     results = document["results"]
     title = headline = page_title(document)
@@ -96,9 +96,7 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
             ("File", human_bytes(before["bytes"]), human_bytes(after["bytes"])),
             ("Render time", f"{milliseconds[0]:.1f}", f"{milliseconds[1]:.1f} ms"),
         ]
-    views = [
-        [(text, data_uri(encode_still(to_picture(image)), "image/webp")) for text, image in row] for row in pictures
-    ]
+    views = [[(text, data_uri(encode_still(picture), "image/webp")) for text, picture in row] for row in pictures]
     return render_template(
         "report.html", policy=PICTURES, title=title, views=views, headline=headline, tiles=tiles,
         tables=list(filled_tables(document)), notes=page_notes(document),

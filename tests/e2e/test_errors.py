@@ -7,6 +7,7 @@ import errno
 import itertools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from messages import ERROR, noted
+from messages import ERROR, noted, says
 
 import gsmerge
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
@@ -279,6 +280,17 @@ def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Pa
     if line:
         assert done.stderr.startswith(ERROR)
         assert done.stderr.count("\n") == 1
+
+
+def test_a_working_directory_that_vanishes_meanwhile(
+    made_scene: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    monkeypatch.setattr("gsmerge.cli.render_command.say_notes", lambda *_, **__: shutil.rmtree(tmp_path / "gone"))
+    outcome = run("render", made_scene, "-o", "a.png", code=3)
+    monkeypatch.chdir(tmp_path)
+    assert says(outcome.err.splitlines()[-1], f"{ERROR}.", "working directory"), outcome.err
 
 
 def test_names_that_the_terminal_cannot_show(scene_copy: Path, root: Path) -> None:

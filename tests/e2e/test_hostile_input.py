@@ -13,9 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from hostile import CASES, MARKER, Case
 from messages import ERROR, names
+from tiny_scene import edited_json
 
 from .conftest import Run, listing
 
@@ -110,7 +112,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, ru
     assert names(outcome.err, *case.says), outcome.err
 
 
-@pytest.mark.parametrize("name", list(CASES)[::12])
+@pytest.mark.parametrize("name", [*list(CASES)[::12], "ply: 600000 rows of one place"])
 def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
     with limits():
@@ -128,6 +130,18 @@ def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
     assert "gsmerge: warning" not in outcome.err
     actual = run("inspect", scene / "small.ply", "--json").out
     assert json.loads(actual)["num_nonfinite"] == 0
+
+
+@pytest.mark.slow
+def test_a_frame_of_67_million_pixels_is_drawn_in_bands(scene: Path, run: Run) -> None:
+    path = Path(shutil.copy(scene / "transforms.json", scene.parent / "path.json"))
+    with edited_json(path) as data:
+        focal, data["w"], data["h"] = 8190 / data["w"], 8190, 8190
+        data |= {name: focal * data[name] for name in ("fl_x", "fl_y")} | {"cx": 4095, "cy": 4095}
+        data["frames"] = data["frames"][:1]
+    with limits():
+        run("render", scene, "--path", path, "-o", scene / "out", code=0)
+    assert cv2.imread(str(scene / "out" / "frame_00000.png"), cv2.IMREAD_REDUCED_GRAYSCALE_8).shape == (1023, 1023)
 
 
 def test_limits_hold() -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bare_files import write_without_grid
-from messages import names, says
+from messages import ERROR, names, says
 from tiny_scene import edited_json
 
 import gsmerge
@@ -103,6 +103,16 @@ def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_p
     made = run("render", bare, "--path", "orbit", "--frames", 2, "-o", tmp_path / "x.mp4", code=0)
     assert "no cameras: " in made.err  # about the views that are placed
     assert len(read(tmp_path / "x.mp4")) == 2
+
+
+def test_frames_too_large_for_a_video_go_to_a_folder(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    shutil.copy(made_scene / "transforms.json", tmp_path / "path.json")
+    with edited_json(tmp_path / "path.json") as data:
+        data["w"], data["h"] = 4096, 4096
+    call = ("render", made_scene, "--path", tmp_path / "path.json", "--dry-run")
+    outcome = run(*call, "-o", tmp_path / "a.mp4", code=3)
+    assert says(outcome.err.removeprefix(ERROR), tmp_path / "a.mp4", "8,388,608", "4096 x 4096", "folder")
+    run(*call, "-o", tmp_path / "out", code=0)
 
 
 def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path, run: Run) -> None:

@@ -20,6 +20,7 @@ LINES = (
     "end_header",
 )
 ROW = 4 * len(COLUMNS)
+MANY = 600_000
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 RANGES = (
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
@@ -340,5 +341,14 @@ def _huge() -> dict[str, Case]:
     }
 
 
-GROUPS = (_truncations, _counts, _headers, _values, _texts, _parts, _packed, _huge)
+def _repeated() -> dict[str, Case]:
+    def repeat(folder: Path) -> None:
+        lines, body = parts(folder)
+        row = body[:ROW] if len(body) == COUNT * ROW else bytes(len(body) // COUNT)
+        put(folder, [line.replace(str(COUNT), str(MANY)) for line in lines], row * MANY)
+
+    return {f"{MANY} rows of one place": Case(repeat, EITHER)}
+
+
+GROUPS = (_truncations, _counts, _headers, _values, _texts, _parts, _packed, _huge, _repeated)
 CASES = {f"ply: {name}": case for group in GROUPS for name, case in group().items()}

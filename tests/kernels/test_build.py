@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from messages import refuses
+from scripts import load_script
 
 from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
@@ -61,3 +62,27 @@ def test_without_a_compiler_the_package_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(module.sys.modules, "ziglang", None)
     with refuses(OSError, "", "ziglang", "none"):
         compiler()
+
+
+def test_a_failed_build_keeps_the_libraries_of_an_earlier_one(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As pip builds for an editable installation, which would have none otherwise."""
+    monkeypatch.setattr(pytest.importorskip("setuptools"), "setup", lambda **_: None)
+    script = load_script(root / "setup.py")
+    command = script.BuildNative(script.NativeDistribution())
+    command.editable_mode = True
+    monkeypatch.setattr(script.native_build, "FOLDER", tmp_path)
+    earlier, new = tmp_path / "kernels-v3.so", tmp_path / "kernels-v4.so"
+    earlier.touch()
+
+    def fail(*_: object, **__: object) -> list[Path]:
+        raise OSError("no compiler")
+
+    monkeypatch.setattr(script.native_build, "build", fail)
+    with pytest.raises(OSError, match="no compiler"):
+        command.run()
+    assert list(tmp_path.iterdir()) == [earlier]
+    monkeypatch.setattr(script.native_build, "build", lambda *_, **__: (new.touch(), [new])[1])
+    command.run()
+    assert list(tmp_path.iterdir()) == [new]

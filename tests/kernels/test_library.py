@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from messages import ERROR, refuses
+from numpy.random import mtrand
 
 from gsmerge.errors import UsageError
 from gsmerge.kernels import library as module
@@ -92,6 +93,28 @@ def test_a_damaged_library_names_the_command_that_builds_it(monkeypatch: pytest.
         (tmp_path / find_platform().library_name(target)).write_bytes(b"no library")
     monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
     with pytest.raises(UsageError, match=r"kernels-.*loaded"):
+        load_library()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ELF files")
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.999])
+def test_a_library_that_is_cut_off_is_not_loaded(share: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Loading it may end the process by SIGBUS."""
+    for target in find_platform().targets:
+        name = find_platform().library_name(target)
+        whole = (FOLDER / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: int(share * len(whole))])
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    with pytest.raises(UsageError, match=r"kernels-.* cannot be loaded \(it is cut off\); run python tasks.py native"):
+        load_library()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a library that is there")
+def test_the_library_of_somebody_else(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for target in find_platform().targets:
+        shutil.copy(mtrand.__file__, tmp_path / find_platform().library_name(target))
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    with pytest.raises(UsageError, match=r"kernels-.*loaded \(.*sources_hash\); run python tasks.py native"):
         load_library()
 
 

@@ -12,8 +12,10 @@ from messages import names, noted
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.prepare import PrepareOptions, prepare
+from gsmerge.facts.views import subset
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.online.extend import extend
+from gsmerge.runtime.record import record_run
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]
@@ -110,6 +112,30 @@ def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Chan
     assert novel_psnr(mended.gaussians) > novel_psnr(right.gaussians) - 1
     assert "photos_changed" in mended.report.choices
     assert "photos_changed" not in right.report.choices
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+@pytest.mark.parametrize("odd", [[1], [0, 2]], ids=str)
+def test_some_photos_in_another_order_of_channels(room: Scene, odd: list[int], aligned: bool) -> None:
+    """A curve for each channel would bend them into something between."""
+    three = subset(room, range(3))
+    images = three.images.copy()
+    images[odd] = images[odd, ..., ::-1]
+    scene = replace(three, images=images, pixel_ids=three.pixel_ids if aligned else None)
+    with record_run() as record:
+        mended = prepare(scene).scene.images
+    np.testing.assert_array_equal(mended, three.images)
+    assert record.choices["photos_changed"] == [room.names[view] for view in odd]
+    assert noted(record.notes, "red", "blue", room.names[1])
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+def test_a_photo_of_another_white_balance_keeps_its_channels(room: Scene, aligned: bool) -> None:
+    images = room.images.copy()
+    images[1] = (images[1] * np.float32([0.5, 1, 1.6])).clip(0, 1)
+    with record_run() as record:
+        prepare(replace(room, images=images, pixel_ids=room.pixel_ids if aligned else None))
+    assert not noted(record.notes, "red", "blue")
 
 
 def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> None:

@@ -2,13 +2,43 @@
 #pragma once
 #include "native.h"
 
+enum { TRIES = 32 };  // passes over as many values as the run has before the rest is sorted: no order is quadratic
+
+// Lets the value at a place of a heap sink below those that are larger.
+static inline void sink(const double *values, int64_t stride, int64_t *heap, int64_t place,
+                        int64_t count) {
+  int64_t moved = heap[place];
+  double value = values[stride * moved];
+  for (int64_t child; (child = 2 * place + 1) < count; place = child) {
+    if (child + 1 < count && values[stride * heap[child]] < values[stride * heap[child + 1]])
+      child++;
+    if (!(value < values[stride * heap[child]])) break;
+    heap[place] = heap[child];
+  }
+  heap[place] = moved;
+}
+
+static inline void sort_heap(const double *values, int64_t stride, int64_t *heap, int64_t count) {
+  for (int64_t i = count / 2; i-- > 0;) sink(values, stride, heap, i, count);
+  while (--count > 0) {
+    int64_t largest = heap[0];
+    heap[0] = heap[count];
+    heap[count] = largest;
+    sink(values, stride, heap, 0, count);
+  }
+}
+
 // Reorders order[low] to order[high - 1] so that values[stride * order[place]] is the one that
 // sorting would put there: none before it is above it, none after it below. NaN compares to nothing
 // and may end up anywhere.
 static inline void partition_run(const double *values, int64_t stride, int64_t *order, int64_t low,
                                  int64_t high, int64_t place) {
-  int64_t last = high - 1;
+  int64_t last = high - 1, most = TRIES * (high - low);
   while (low < last) {
+    if ((most -= last - low) < 0) {
+      sort_heap(values, stride, order + low, last - low + 1);
+      return;
+    }
     double pivot = values[stride * order[(low + last) / 2]];
     int64_t i = low, j = last;
     while (i <= j) {

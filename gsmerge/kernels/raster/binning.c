@@ -1,5 +1,9 @@
 // Depth order and tile lists.
-#include "native.h"
+#include "exp_log.h"
+#include "walk.h"
+
+static const float CLOSED = 5e-5f;  // transmittance below which every pixel of a tile has stopped, with room for rounding
+static const float ROUNDING = 0.01f;  // of exponents
 
 enum { DIGIT = 11, PASSES = 3 };  // bits sorted per pass at most: 2048 counters and their streams stay in the first caches
 
@@ -80,6 +84,42 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
       tile += wrap ? tile_width - width + 1 : 1;
       column = wrap ? 0 : column;
     }
+  }
+  return 0;
+}
+
+// Part of the light that a Gaussian takes of every pixel of the tile at (left, top), at least. Exponents are concave, so
+// they are least in a corner.
+static inline float least_share(const float *conic, float left, float top) {
+  float least = 0.f;
+  for (int corner = 0; corner < 4; corner++) {
+    float x = left + 0.5f + (corner & 1 ? TILE - 1 : 0) - conic[0], y = top + 0.5f + (corner & 2 ? TILE - 1 : 0) - conic[1];
+    float across = conic[2] * (x - conic[3] * y), p = conic[5] - conic[4] * y * y - across * across - ROUNDING;
+    if (!(p >= LN_CUT)) return 0.f;
+    least = minf(least, p);
+  }
+  return minf(exp4(least), MAX_ALPHA);
+}
+
+API int32_t deal_open_tiles(const int32_t *order, const int16_t *boxes, const float *conics, int64_t tile_width,
+                            int64_t first, int64_t last, float *left, int64_t *cursors, int32_t *flatten_ids, int64_t m,
+                            int64_t tiles, int64_t intersections) {
+  if (first < 0 || first > last || tile_width < 1 || last > tiles / tile_width) return OUTSIDE;
+  int64_t open = (last - first) * tile_width;
+  for (int64_t i = 0; i < m && open > 0; i++) {
+    int64_t x0 = boxes[4 * i], x1 = boxes[4 * i + 1], y0 = maxi(first, boxes[4 * i + 2]), y1 = mini(last, boxes[4 * i + 3]);
+    if (x0 < 0 || x1 > tile_width || (uint64_t)(int64_t)order[i] >= (uint64_t)m) return OUTSIDE;
+    for (int64_t y = y0; y < y1; y++)
+      for (int64_t x = x0; x < x1; x++) {
+        int64_t tile = y * tile_width + x;
+        if (left[tile] < CLOSED) continue;
+        uint64_t slot = (uint64_t)cursors[tile];
+        cursors[tile] = (int64_t)(slot + 1);
+        if (intersections > 0 && slot >= (uint64_t)intersections) return OUTSIDE;
+        if (intersections > 0) flatten_ids[slot] = order[i];
+        left[tile] *= 1.f - least_share(conics + CONIC * (int64_t)order[i], (float)(x * TILE), (float)(y * TILE));
+        open -= left[tile] < CLOSED;
+      }
   }
   return 0;
 }

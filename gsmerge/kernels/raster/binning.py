@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.signature import STATUS, i2, i4, i8, native, u4, u8
+from gsmerge.kernels.raster.project import CONIC
+from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u4, u8
 
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))
@@ -51,4 +52,26 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
         tile_width: Tiles per row.
         cursors: ``[tiles]`` int64 where each list goes on, advanced.
         flatten_ids: ``[intersections]`` int32, written.
+    """
+
+
+@native(
+    STATUS, order=i4("m"), boxes=i2("m", 4), conics=f4("m", CONIC), tile_width=i8(), first=i8(), last=i8(),
+    left=f4("tiles", out=True), cursors=i8("tiles", out=True), flatten_ids=i4("intersections", out=True),
+)  # fmt: skip
+def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
+    """Do the work of :func:`deal_tiles` for some lines of tiles, without what is behind Gaussians that hide a tile.
+
+    Such a list ends with the Gaussian after which every pixel has stopped, so no walk misses the others.
+
+    Args:
+        order: ``[m]`` int32 Gaussians in depth order.
+        boxes: ``[m,4]`` int16 their boxes, in the same order.
+        conics: ``[m,CONIC]`` float32 of the Gaussians.
+        tile_width: Tiles per row.
+        first: First line of tiles.
+        last: The line after the last one.
+        left: ``[tiles]`` float32 light that may still pass each tile, 1 before; lowered.
+        cursors: ``[tiles]`` int64 where each list goes on, advanced.
+        flatten_ids: ``[intersections]`` int32, written; empty: the cursors alone are advanced.
     """

@@ -43,7 +43,7 @@ static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_
 
 API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
                   const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
-                  int64_t first, int64_t last, const float *restrict background, float *restrict image,
+                  int64_t first, int64_t last, int64_t top, const float *restrict background, float *restrict image,
                   float *restrict transmittance, int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
   Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
   if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
@@ -51,7 +51,8 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
   Batch batch;
   clear_batch(&batch);
   for (int64_t tile = first; tile < last; tile++) {
-    Tile t = open_tile(state, 4, tile, tile_width, h, w);
+    Tile t = open_tile(state, 4, tile, tile_width, top + h, w);
+    if (t.top < top) continue;
     int64_t end = isect_offsets[tile + 1];
     for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
       int64_t stop = mini(end, start + BATCH);
@@ -63,7 +64,7 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
     }
     for (int y = 0; y < t.num_y; y++)
       for (int x = 0; x < t.num_x; x++) {
-        int64_t pixel = (t.top + y) * w + t.left + x;
+        int64_t pixel = (t.top - top + y) * w + t.left + x;
         const float *lane = state + y * TILE + x;
         float rest = absf4(lane[0]);
         for (int c = 0; c < 3; c++) image[3 * pixel + c] = lane[(c + 1) * PLANE] + rest * background[c];

@@ -7,7 +7,7 @@ threads, and no result depends on them. The formula is in ``gsmerge/kernels/rast
 
 from __future__ import annotations
 
-from gsmerge.kernels.raster.project import CONIC, SUMS
+from gsmerge.kernels.raster.project import CONIC, MAX_SIZE, SUMS
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
@@ -24,11 +24,14 @@ TILES = {"first": i8(), "last": i8()}
 
 
 @native(
-    STATUS, **LISTS, colors=f4("m", 3), **TILES, background=f4(3), image=f4("h", "w", 3, out=True),
-    transmittance=f4("h", "w", out=True),
+    STATUS, **LISTS, colors=f4("m", 3), **TILES, top=i8(least=0, below=MAX_SIZE), background=f4(3),
+    image=f4("h", "w", 3, out=True), transmittance=f4("h", "w", out=True),
 )  # fmt: skip
-def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, background, image, transmittance):
-    """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``."""
+def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
+    """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
+
+    These hold the view's rows from ``top`` on; tiles that do not begin in them are left out.
+    """
 
 
 @native(STATUS, **LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))

@@ -18,6 +18,7 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
+MAX_SIZE = 32767 * TILE  # pixels per side of a view: tile columns and rows are kept in 16 bits
 CONIC = 8  # numbers per conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
 SUMS = 9  # per Gaussian: those of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy from the mean
 LN_CUT = np.float32(np.log(1 / 255))  # ln of the smallest weight that is drawn

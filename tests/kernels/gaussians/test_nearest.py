@@ -93,6 +93,19 @@ def test_one_place_is_as_sorted(num: int, kinds: int) -> None:
         assert (reordered[place:] >= reordered[place]).all()
 
 
+def test_an_order_against_the_pivots_is_sorted_instead() -> None:
+    """Every pivot is the smallest value that is left, so that halving would take a pass for each value."""
+    num = 4096
+    values, slots = np.empty(num), list(range(num))
+    for low in range(num):
+        middle = (low + num - 1) // 2
+        values[slots[middle]] = low
+        slots[low], slots[middle] = slots[middle], slots[low]
+    order = np.arange(num)
+    partition(values, order, 0, num, num // 2)
+    np.testing.assert_array_equal(values[order], np.arange(num))
+
+
 def test_only_a_run_is_reordered() -> None:
     """Through an order that holds some of the values; the values stay as they are."""
     rng = np.random.default_rng(0)

@@ -53,3 +53,25 @@ def test_tile_lists(tile_height: int, tile_width: int) -> None:
     flatten_ids, starts = np.full(counts.sum(), -1, np.int32), np.cumsum(counts) - counts
     binning.deal_tiles(order, boxes[order], tile_width, starts.copy(), flatten_ids)
     assert flatten_ids.tolist() == [k for tile in expected for k in tile]
+
+
+def test_tile_lists_end_where_nothing_behind_is_seen() -> None:
+    conics = np.tile(np.array([8, 8, 1e-6, 0, 1e-9, np.log(0.9), 0, 40], np.float32), (9, 1))
+    conics[2] = [8, 8, 9, 0, 9, 0, 0, 40]  # covers no tile
+    order, boxes = np.arange(9, dtype=np.int32), np.tile(np.array([0, 2, 0, 3], np.int16), (9, 1))
+    boxes[:, 1] = [1, 2, 2, 2, 2, 2, 2, 2, 1]
+
+    def deal(first: int, last: int, cursors: np.ndarray, flatten_ids: np.ndarray) -> list[int]:
+        lines = 2, first, last, np.ones(6, np.float32)
+        binning.deal_open_tiles(order, boxes, conics, *lines, cursors, flatten_ids)
+        return cursors.tolist()
+
+    assert deal(0, 3, np.zeros(6, np.int64), np.empty(0, np.int32)) == [6, 6] * 3
+    flatten_ids = np.zeros(36, np.int32)
+    assert deal(1, 3, np.arange(0, 36, 6), flatten_ids) == [0, 6, 18, 24, 30, 36]
+    assert flatten_ids.reshape(6, 6)[2:].tolist() == [[0, 1, 2, 3, 4, 5], [1, 2, 3, 4, 5, 6]] * 2
+    for wrong in ((0, 4), (-1, 2), (2, 1)):
+        with pytest.raises(ValueError, match="indices"):
+            deal(*wrong, np.zeros(6, np.int64), flatten_ids)
+    with pytest.raises(ValueError, match="indices"):
+        deal(0, 3, np.full(6, 33), flatten_ids)

@@ -41,7 +41,7 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
     walked = list(given.values())
     slots = np.empty((len(walked[1]), SUMS), np.float32)
     return [
-        lambda: blend(*walked, colors, first, last, np.zeros(3, np.float32), image, left),
+        lambda: blend(*walked, colors, first, last, 0, np.zeros(3, np.float32), image, left),
         lambda: weighted_sums(*walked, first, last, image, np.empty((len(walked[1]), 4), np.float32)),
         lambda: survey(*walked, colors, image, np.zeros((M, 2), np.float32)),
         lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),

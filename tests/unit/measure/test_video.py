@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,6 +63,22 @@ def test_without_an_encoder_nothing_is_left(
         preview.write_video(tmp_path / "a.mp4", frames(3), 30)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("before", [0, 2])
+def test_a_folder_that_vanishes_is_not_blamed_on_opencv(before: int, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+
+    def vanishing() -> Iterator[Picture]:
+        for done, picture in enumerate(frames(4)):
+            if done == before:
+                shutil.rmtree(folder)
+            yield picture
+
+    with refuses(SceneError, "a.mp4", "No such file or directory"):
+        preview.write_video(folder / "a.mp4", vanishing(), 24)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm"])

@@ -189,13 +189,51 @@ def test_messages() -> None:
     ])  # fmt: skip
 
 
+def many_balls() -> Gaussians:
+    rng = np.random.default_rng(4)
+    places = [rng.uniform(-1, 1, (300, 2)), rng.uniform(1, 4, (300, 1)), rng.uniform(0.01, 0.9, (300, 3))]
+    return balls(*map(tuple, np.concatenate(places, 1)))
+
+
 @pytest.mark.parametrize("at_once", [1, 2, 3, 8])
 def test_many_views_are_drawn_in_turn_as_they_are_together(at_once: int) -> None:
-    rng = np.random.default_rng(4)
-    rows = np.concatenate(
-        [rng.uniform(-1, 1, (300, 2)), rng.uniform(1, 4, (300, 1)), rng.uniform(0.01, 0.9, (300, 3))], 1
-    )
-    gaussians, cameras = balls(*map(tuple, rows)), camera(41, 31, 5)
+    gaussians, cameras = many_balls(), camera(41, 31, 5)
     cameras.viewmats[:, 0, 3] = np.linspace(-0.3, 0.37, 5)
     images = list(render_in_turn(gaussians, cameras, 0.3, at_once=at_once, antialiased=True))
     np.testing.assert_array_equal(images, render(gaussians, cameras, 0.3, antialiased=True).images)
+
+
+@pytest.mark.parametrize("band", [1, 41 * 16, 41 * 40])
+def test_bands_of_a_large_picture_are_those_of_the_whole(band: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsmerge.raster.images.BAND_PIXELS", band)
+    gaussians, cameras, shapes = many_balls(), camera(41, 61, 2), []
+
+    def convert(part: np.ndarray) -> np.ndarray:
+        shapes.append(part.shape[0])
+        return part * 2
+
+    drawn = list(render_in_turn(gaussians, cameras, 0.3, at_once=2, convert=convert))
+    np.testing.assert_array_equal(drawn, 2 * render(gaussians, cameras, 0.3).images)
+    tall = max(1, band // (41 * 16)) * 16
+    assert shapes == [*[tall] * (61 // tall), 61 % tall] * 2
+
+
+def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So Gaussians that cover every pixel, and cannot be seen, take no memory; what is drawn stays."""
+    huge = balls(*((0.01 * i, 0, 4 + 0.01 * i, 30 + i, 0.02 + 0.004 * i, 0.5) for i in range(200)))
+    gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)
+
+    def draw() -> tuple[list[np.ndarray], list[list[int]]]:
+        plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
+        lists = np.split(plan.ids[plan.flatten_ids], plan.isect_offsets[1:-1])
+        return [*composite(plan), *contributions(plan)], [part.tolist() for part in lists]
+
+    whole, all_lists = draw()
+    monkeypatch.setattr("gsmerge.raster.view_plan.MANY", 0)
+    monkeypatch.setattr("gsmerge.raster.view_plan.MANY_EACH", 0)
+    drawn, lists = draw()
+    assert sum(map(len, lists)) < 0.6 * sum(map(len, all_lists))
+    for part, every in zip(lists, all_lists, strict=True):
+        assert part == every[: len(part)]
+    for values, expected in zip(drawn, whole, strict=True):
+        np.testing.assert_array_equal(values, expected)
