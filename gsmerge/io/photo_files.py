@@ -57,6 +57,10 @@ class PhotoReader:
             raise IndexError(photo)
         return self.read(photo)
 
+    def select(self, ids: Sequence[int]) -> PhotoReader:
+        """Return the reader of some photos, in that order."""
+        return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
+
 
 Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB
 
@@ -223,10 +227,11 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
     return width, height
 
 
-def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray:
+def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
     """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
-    SceneError if one cannot be decoded, two differ in size, or they take more memory or time than the file's budget.
+    Many large ones are decoded at each use. SceneError if one cannot be decoded, two differ in size, or they take more
+    memory or time than the file's budget.
     """
     path = Path(budget.path)
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
@@ -234,9 +239,12 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
-    num_bytes = (3 * len(files) + _DECODING_BYTES) * width * height
-    budget.check_memory(num_bytes, f"{len(files)} photos of {width} x {height}")
+    at_once = len(files) if 3 * len(files) * width * height <= _AT_ONCE else 1
+    num_bytes = (3 * at_once + _DECODING_BYTES) * width * height
+    budget.check_memory(num_bytes, f"{at_once} photos of {width} x {height}")
     _check_scans(budget, files, sizes[0])
+    if at_once < len(files):
+        return PhotoReader(len(files), sizes[0], lambda photo: _decode(path, files[photo], sizes[0]))
     out = np.empty((len(files), height, width, 3), np.uint8)
     parallel_map(lambda i: np.copyto(out[i], _decode(path, files[i], sizes[i])), range(len(files)))
     return out

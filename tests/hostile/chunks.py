@@ -224,7 +224,7 @@ def _shapes() -> dict[str, Case]:
     cases |= {word: Case(saved(lambda *_, value=value: value), says=listed) for word, value in lists.items()}
     cases["one scene and a part of one"] = Case(saved(lambda entry, _: [entry, {"key": "b"}]), says=listed)
     cases["images that are one tensor"] = Case(saved(one_photo), says=("tensors", "once"))
-    cases["images of 150 MB in few bytes"] = Case(saved(wide_photos), says=("memory", "3 photos"))
+    cases["images of 150 MB in few bytes"] = Case(saved(wide_photos), says=("memory", "1 photos"))
     cases["images of 40,000 scans"] = Case(saved(many_scans), says=("steps", "scans"))
     cases["a key of many lists"] = Case(saved(printed_for_ever), says=("key", "2"))
     cases["a key that is no text"] = Case(saved(lambda entry, _: [{**entry, "key": "\ud800"}, {**entry, "key": "b"}]))

@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import (
+    PhotoReader,
     Photos,
     PhotoTransform,
     Size,
@@ -78,7 +79,9 @@ class CameraFile:
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
-    images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
+    images: np.ndarray | PhotoReader | None = (
+        None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
+    )
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
     # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
@@ -111,7 +114,7 @@ def make_camera_file(
     source: str,
     convention: Convention,
     views: Sequence[View],
-    images: np.ndarray | None = None,
+    images: np.ndarray | PhotoReader | None = None,
     order: str = "auto",
 ) -> CameraFile:
     """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
@@ -242,7 +245,8 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
-    images = None if cameras.images is None else cameras.images[ids]
+    images = cameras.images.select(ids) if isinstance(cameras.images, PhotoReader) else cameras.images
+    images = images[ids] if isinstance(images, np.ndarray) else images
     names = tuple(cameras.names[i] for i in ids)
     return replace(cameras, **arrays, names=names, images=images, lenses=lenses if any(lenses) else ())
 

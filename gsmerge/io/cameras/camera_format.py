@@ -14,6 +14,7 @@ from plyfile import PlyData
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, View, make_camera_file
 from gsmerge.io.formats.ply import open_ply
+from gsmerge.io.photo_files import PhotoReader
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class StoredCameras(NamedTuple):
     """Cameras as a file stores them, before conversion."""
 
     views: list[View]
-    images: np.ndarray | None = None  # ``[c,h,w,3]`` uint8 sRGB
+    images: np.ndarray | PhotoReader | None = None  # ``[c,h,w,3]`` uint8 sRGB
     order: str = "auto"  # of the Gaussians' rows
     convention: Convention | None = None  # where the numbers show another one than the format's
 
