@@ -11,7 +11,15 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file, read_lines
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, View, check_count, make_pinhole
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    W2C_OPENCV,
+    CameraFile,
+    View,
+    check_count,
+    make_pinhole,
+)
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
