@@ -29,6 +29,7 @@ MAX_PIXELS = 1 << 26  # of one image
 
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # of 20 microseconds: 5 s, and 2 s for each MB
+_PARTS_PER_STEP = 4000  # parts of a TOML key, squared
 # Bytes of Python's objects for each of these characters in JSON, the most that CPython 3.10 to 3.14 takes
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 
@@ -152,9 +153,13 @@ def read_table(path: Path) -> dict[str, Any]:
     is_json = path.suffix.lower() == ".json"
     if not is_json and sys.version_info < (3, 11):
         raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
-    text = read_text(path, MAX_SETTINGS_BYTES)
+    text, budget = read_text(path, MAX_SETTINGS_BYTES), read_budget(path)
+    if not is_json:  # whose reader compares each part of a dotted key with all before it
+        parts = sum(line.count(".") ** 2 for line in text.splitlines())
+        budget.check_steps(parts // _PARTS_PER_STEP, "steps for dotted keys")
     try:
-        table = parse_json(text, read_budget(path)) if is_json else import_module("tomllib").loads(text)
+        table = parse_json(text, budget) if is_json else import_module("tomllib").loads(text)
+        repr(table)  # fails for whole numbers of more digits than JSON may have
     except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
     if not isinstance(table, dict):

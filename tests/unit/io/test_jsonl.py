@@ -10,11 +10,11 @@ import pytest
 from messages import refuses
 
 from gsmerge.errors import SceneError
-from gsmerge.runtime.jsonl import append_line, each_line
+from gsmerge.io.jsonl import append_line, each_line
 
 APPEND = """
 import pathlib, sys
-from gsmerge.runtime.jsonl import append_line
+from gsmerge.io.jsonl import append_line
 for number in range(25):
     append_line(pathlib.Path(sys.argv[1]), {"name": sys.argv[2], "number": number, "padding": "x" * 5000})
 """
@@ -56,7 +56,7 @@ def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> N
     code = f"""
 import resource, pathlib
 from gsmerge.errors import SceneError
-from gsmerge.runtime.jsonl import append_line
+from gsmerge.io.jsonl import append_line
 resource.setrlimit(resource.RLIMIT_FSIZE, ({len(whole) + 20}, {len(whole) + 20}))
 try:
     append_line(pathlib.Path({str(path)!r}), {{"text": "x" * 100}})
