@@ -309,19 +309,19 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
     The decoder prints lines of its own about damage, in colour profiles and texts as well.
     """
-    view, start = np.ascontiguousarray(data).data, len(_PNG)
-    parts: list[bytes | memoryview] = [_PNG]
+    view, start, pixels = np.ascontiguousarray(data).data, len(_PNG), bytearray(_PNG)
     while start + 12 <= len(view):
         length, kind = struct.unpack_from(">I4s", view, start)
         end = start + 12 + length
         if kind == b"IEND":
-            return np.frombuffer(b"".join([*parts, _PNG_END]), np.uint8)
+            pixels += _PNG_END
+            return np.frombuffer(pixels, np.uint8)
         if end > len(view) or (kind[:1].isupper() and kind not in _PNG_CHUNKS):
             return None
         if kind in _PNG_CHUNKS:
             if zlib.crc32(view[start + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
                 return None
-            parts.append(view[start:end])
+            pixels += view[start:end]
         start = end
     return None
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from gsmerge.io.cameras.camera_file import (
 )
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.image_names import find_image, natural_key
-from gsmerge.io.photo_files import image_size
+from gsmerge.io.photo_files import Size, image_size
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras
@@ -89,11 +90,11 @@ def transforms_views(path: Path, data: Any) -> list[View]:
         with _number_errors(path, f"view {name}: expected numbers"):
             entries.append((name, _array(frame["transform_matrix"]), {**common, **_camera_values(frame)}))
     bare = not any(key in values for _, _, values in entries for key in _FOCAL_KEYS)
-    views = []
+    views, size_of = [], cache(image_size)  # of photos that many frames may name
     for name, pose, values in entries:
         with _number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values)
-            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values)
+            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values, size_of)
             views.append(View(name, pose, K, size, lens))
     return views
 
@@ -130,7 +131,9 @@ def _stored_size(values: Mapping[str, float]) -> tuple[int, int]:
     return round(values.get("w", 0)), round(values.get("h", 0))
 
 
-def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
+def _intrinsics(
+    path: Path, name: str, values: Mapping[str, Any], size_of: Callable[[Path], Size]
+) -> tuple[np.ndarray, Size]:
     """Return intrinsics ``[3,3]`` and (width, height) of a frame, from its own values or those of all frames."""
     if not any(key in values for key in _FOCAL_KEYS):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
@@ -141,7 +144,7 @@ def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.nd
         image = find_image(path.parent, name)
         if image is None:
             raise SceneError(path, f"view {name}: expected 'w' and 'h', found neither them nor the image itself")
-        width, height = image_size(image)
+        width, height = size_of(image)
     fx = _focal(values, "x", width) or _focal(values, "y", height)
     fy = _focal(values, "y", height) or fx
     K = make_pinhole(fx, fy, values.get("cx", width / 2), values.get("cy", height / 2))

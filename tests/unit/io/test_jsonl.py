@@ -112,3 +112,9 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with refuses(SceneError, "lines.jsonl", "File exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})
+
+
+def test_a_line_of_more_values_than_its_bytes_allow_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text('{"a": 1}\n{"b": [' + "[]," * 2_000_000 + "[]]}\n")
+    assert [value for _, value in each_line(path)] == [{"a": 1}, None]
