@@ -13,7 +13,7 @@ from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
-_MAX_PARTS = 16  # of a path that are compared: folders within folders, and the name
+_MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
 ImageSource = StrPath | Sequence[StrPath]
 
 

@@ -33,8 +33,8 @@ _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
-_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8])  # of a number of each type
-_MAX_TAGS = 1 << 16
+_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
+_MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _BAND = 256  # rows of a mask that are converted at once
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
@@ -144,7 +144,10 @@ def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
     What it may take is that of its bytes and of its ``photo``'s: a mask packs to nothing.
     """
 
+    budget = ReadBudget(path, check_file(path) + (0 if photo is None else check_file(photo)))
+
     def brightness(image: Image.Image) -> np.ndarray:
+        _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
         has_alpha = "A" in image.getbands()
@@ -157,7 +160,7 @@ def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
                 rows *= np.asarray(band.getchannel("A"))
         return grey
 
-    grey = _decode_channel(path, brightness, 0 if photo is None else check_file(photo))
+    grey = _decode_channel(path, brightness)
     assert grey is not None
     return np.asarray(grey > grey.max(initial=0) / 2)
 
@@ -168,27 +171,28 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
-        has_any = "A" in image.getbands() or "transparency" in image.info
-        return image.convert("RGBA").getchannel("A") if has_any else None
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return None
+        _check_channels(read_budget(path), image)
+        return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
     return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
 
 
-def _decode_channel(
-    path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None], more_bytes: int = 0
-) -> np.ndarray | None:
-    """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded.
+def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
+    """Raise SceneError if an image, and one channel of it, take more memory than its file allows."""
+    num_bytes = (len(image.getbands()) + 1) * image.width * image.height
+    budget.check_memory(num_bytes, f"{image.width} x {image.height} pixels")
 
-    ``more_bytes`` are those of another file that it is read together with.
-    """
-    width, height = _stored_size(path)  # refuses what is no image, or too large
-    budget = ReadBudget(path, check_file(path) + more_bytes)
+
+def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
+    """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded."""
+    _stored_size(path)  # refuses what is no image, or too large
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path, formats=("PNG", *_FORMATS)) as image:
-                budget.check_memory((len(image.getbands()) + 1) * width * height, f"{width} x {height} pixels")
                 channel = choose(image)
                 return None if channel is None else np.asarray(channel)
     except SceneError:

@@ -118,11 +118,12 @@ def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> l
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:
     """Refuse arrays other than c poses and ``[c,3,3]`` intrinsics of finite numbers; ``names`` are for messages."""
-    poses, Ks = np.atleast_1d(poses), np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
+    Ks = np.zeros((*poses.shape[:1], 3, 3)) if Ks is None else Ks
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
-    if len(poses) == 0 or poses.shape[1:] not in ((3, 4), (4, 4)) or Ks.shape != (len(poses), 3, 3):
+    is_list = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
+    if not is_list or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
     check_count(path, len(poses))
     if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < _MAX_INTRINSIC)):
