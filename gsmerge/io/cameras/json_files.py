@@ -120,9 +120,8 @@ def _number(value: Any) -> float:
 def _array(values: Any) -> np.ndarray:
     """Convert lists of numbers to float64; errors as of :func:`_number`."""
     array = np.array(values, np.float64)
-    for value in np.array(values, object).flat:
-        if isinstance(value, bool):
-            _number(value)
+    if bool in set(map(type, np.array(values, object).flat)):
+        raise TypeError("found true or false")
     return array
 
 
