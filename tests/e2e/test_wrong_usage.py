@@ -156,7 +156,7 @@ PLACES = {
     "stress alone.ply --hint order=none --targets room/targets": "alone.ply*none*--cameras",
     "chart -o out nowhere": "nowhere*no such",
     "chart -o out room --targets {{scene}}/none.json": "room/none.json*cameras*nothing",
-    "generate -o out --ranges nowhere.toml": "nowhere.toml*TOML*JSON",
+    "generate -o out --ranges nowhere.toml": "nowhere.toml*no such",
     "generate -o alone.ply": "alone.ply*folder*file",
     "train --data nowhere -o out": "nowhere*no such",
 }
