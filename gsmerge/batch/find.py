@@ -13,7 +13,7 @@ from gsmerge.batch.batch_options import BatchOptions
 from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
-from gsmerge.io.bounds import read_text
+from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.ply import header_counts
 from gsmerge.runtime.estimate import memory_bytes
@@ -33,7 +33,7 @@ from gsmerge.settings.compact import CompactOptions
 
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it
-MAX_LISTED = 1_000_000  # lines of a list
+_JOB_BYTES = 700  # of memory for each scene of a list
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
@@ -279,13 +279,12 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
 
 def _listed(file: Path, search: _Search) -> Iterator[Path]:
     """Yield the scenes of a list, relative to its folder; a missing one fails when it is read."""
-    text = read_text(file)
-    if "\0" in text:
-        raise SceneError(file, "expected a text file with one path per line, found no text")
-    lines = dict.fromkeys(line.strip() for line in text.splitlines())
-    if len(lines) > MAX_LISTED:
-        problem = f"expected at most {MAX_LISTED:,} scenes in a list, found more"
-        raise SceneError(file, problem, "split it")
+    budget, lines = read_budget(file), dict[str, None]()
+    for line in read_lines(file):
+        if "\0" in line:
+            raise SceneError(file, "expected a text file with one path per line, found no text")
+        lines[line.strip()] = None
+        budget.check_memory(_JOB_BYTES * len(lines), f"{len(lines):,} scenes")
     for entry in lines:
         if not entry or entry.startswith("#"):
             continue

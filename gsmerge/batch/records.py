@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
+from gsmerge.io.jsonl import each_line
 from gsmerge.report import csv_text, document_head, file_sha256, human_bytes, text_table
-from gsmerge.runtime.jsonl import each_line
 
 RECORDS, SUMMARY = "batch.jsonl", "summary.csv"
 DONE, FAILED, SKIPPED = "done", "failed", "skipped"  # of records

@@ -36,8 +36,8 @@ from gsmerge.batch.records import (
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
+from gsmerge.io.jsonl import append_line
 from gsmerge.report import SCHEMA_VERSION, file_sha256, finite
-from gsmerge.runtime.jsonl import append_line
 from gsmerge.scene.content_hash import content_hash, digest, filled, read_files
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.compact import CHECKPOINTS

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
@@ -29,6 +29,7 @@ MAX_PIXELS = 1 << 26  # of one image
 
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # of 20 microseconds: 5 s, and 2 s for each MB
+_PARTS_PER_STEP = 4000  # parts of a TOML key, squared
 # Bytes of Python's objects for each of these characters in JSON, the most that CPython 3.10 to 3.14 takes
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 
@@ -45,11 +46,15 @@ class ReadBudget:
     path: StrPath
     file_bytes: int
 
+    @property
+    def memory(self) -> int:
+        """Bytes of memory that the file allows."""
+        return _FREE_MEMORY + _MEMORY_PER_BYTE * self.file_bytes
+
     def check_memory(self, num_bytes: float, what: str) -> None:
         """Raise SceneError if ``what``, which takes ``num_bytes`` at once, is more than the file allows."""
-        most = _FREE_MEMORY + _MEMORY_PER_BYTE * self.file_bytes
-        if not num_bytes <= most:
-            problem = f"expected at most {most / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
+        if not num_bytes <= self.memory:
+            problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB")
 
     def check_steps(self, count: int, what: str) -> None:
@@ -112,12 +117,24 @@ def walk_files(folder: Path) -> list[Path]:
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
     """Read a UTF-8 text file; SceneError if it is no text or has more than ``limit`` bytes."""
+    with _text_file(path, limit) as file:
+        return file.read()
+
+
+def read_lines(path: Path, limit: int = MAX_TEXT_BYTES) -> Iterator[str]:
+    """Yield the lines of a UTF-8 text file, with their ends, one at a time in memory; SceneError as read_text."""
+    with _text_file(path, limit) as file:
+        yield from file
+
+
+@contextmanager
+def _text_file(path: Path, limit: int) -> Iterator[TextIO]:
     size = check_file(path)
     if size > limit:
         raise SceneError(path, f"expected a text file of at most {limit >> 20} MiB, found {size >> 20} MiB")
     try:
-        with read_errors(path):
-            return path.read_text(encoding="utf-8-sig")
+        with read_errors(path), path.open(encoding="utf-8-sig") as file:
+            yield file
     except ValueError as error:
         raise SceneError(path, f"cannot be read as text ({error})") from error
 
@@ -136,9 +153,13 @@ def read_table(path: Path) -> dict[str, Any]:
     is_json = path.suffix.lower() == ".json"
     if not is_json and sys.version_info < (3, 11):
         raise SceneError(path, "TOML needs Python 3.11", "write the settings as JSON")
-    text = read_text(path, MAX_SETTINGS_BYTES)
+    text, budget = read_text(path, MAX_SETTINGS_BYTES), read_budget(path)
+    if not is_json:  # whose reader compares each part of a dotted key with all before it
+        parts = sum(line.count(".") ** 2 for line in text.splitlines())
+        budget.check_steps(parts // _PARTS_PER_STEP, "steps for dotted keys")
     try:
-        table = parse_json(text, read_budget(path)) if is_json else import_module("tomllib").loads(text)
+        table = parse_json(text, budget) if is_json else import_module("tomllib").loads(text)
+        repr(table)  # fails for whole numbers of more digits than JSON may have
     except (ValueError, RecursionError) as error:
         raise SceneError(path, f"expected TOML or JSON, found a mistake ({str(error).splitlines()[0]})") from error
     if not isinstance(table, dict):

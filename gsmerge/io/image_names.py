@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
@@ -12,6 +13,7 @@ from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+_MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
 ImageSource = StrPath | Sequence[StrPath]
 
 
@@ -36,7 +38,7 @@ def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
         problem = f"expected {len(names)} images, one per camera, found {len(files)} and none for {missing}"
         raise SceneError(root, problem, "add what is missing, or name the right folder with --images")
     if len(set(paths)) < len(set(names)):  # layers of one view have its name
-        twice = next(path for path in paths if paths.count(path) > 1)
+        twice = Counter(paths).most_common(1)[0][0]
         raise SceneError(root, f"expected an image of its own for each camera, found {twice.name} for two of them")
     return paths
 
@@ -51,8 +53,9 @@ def _by_ending(root: Path, files: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def _endings(path: PurePath) -> list[str]:
-    """List every ending of a path, the longest first, with and without its extension."""
-    endings = [PurePosixPath(*path.parts[i:]) for i in range(len(path.parts))]
+    """List the endings of a path, the longest first, with and without its extension."""
+    parts = path.parts[-_MAX_PARTS:]
+    endings = [PurePosixPath(*parts[i:]) for i in range(len(parts))]
     return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_budget, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.memory import free_pages, make_array
@@ -35,6 +35,11 @@ _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
 _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
 _DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
+_TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
+_MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
+_CHANNELS = 3  # bytes of a decoded photo's pixel
+_BAND = 256  # rows of a mask that are converted at once
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
@@ -142,14 +147,27 @@ def same_shape(size: Size, other: Size) -> bool:
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
-def decode_mask(path: Path) -> np.ndarray:
-    """Decode a mask to ``[h,w]`` bool: True, the photo counts, where it is brighter than half of its maximum."""
+def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
+    """Decode a mask to ``[h,w]`` bool: True, the photo counts, where it is brighter than half of its maximum.
+
+    What it may take is that of its bytes and of its ``photo``'s: a mask packs to nothing.
+    """
+
+    budget = ReadBudget(path, check_file(path) + (0 if photo is None else check_file(photo)))
 
     def brightness(image: Image.Image) -> np.ndarray:
+        _check_channels(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
-        grey = np.asarray(image.convert("L"), np.float32)
-        return grey * np.asarray(image.getchannel("A")) if "A" in image.getbands() else grey
+        has_alpha = "A" in image.getbands()
+        grey = np.empty(image.size[::-1], np.uint16 if has_alpha else np.uint8)
+        for top in range(0, image.height, _BAND):  # whose copies take little memory
+            band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
+            rows = grey[top : top + _BAND]
+            rows[:] = band.convert("L")
+            if has_alpha:
+                rows *= np.asarray(band.getchannel("A"))
+        return grey
 
     grey = _decode_channel(path, brightness)
     assert grey is not None
@@ -162,22 +180,32 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         return None
 
     def alpha(image: Image.Image) -> Image.Image | None:
-        has_any = "A" in image.getbands() or "transparency" in image.info
-        return image.convert("RGBA").getchannel("A") if has_any else None
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return None
+        _check_channels(read_budget(path), image)
+        return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
     return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
 
 
+def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
+    """Raise SceneError if an image, and one channel of it, take more memory than its file allows."""
+    num_bytes = (len(image.getbands()) + 1) * image.width * image.height
+    budget.check_memory(num_bytes, f"{image.width} x {image.height} pixels")
+
+
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded."""
-    image_size(path)  # refuses what is no image, or too large
+    _stored_size(path)  # refuses what is no image, or too large
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             with Image.open(path, formats=("PNG", *_FORMATS)) as image:
                 channel = choose(image)
                 return None if channel is None else np.asarray(channel)
+    except SceneError:
+        raise
     except Exception as error:  # whatever damage makes the library raise
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
 
@@ -185,8 +213,15 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 def image_size(path: Path) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file; its orientation is ignored.
 
-    SceneError if it is another file, cannot be read, or has a size that no image of Gaussians has.
+    SceneError if it is another file, cannot be read, has a size that no image of Gaussians has, or its pixels take
+    more memory than the file allows.
     """
+    width, height = _stored_size(path)
+    read_budget(path).check_memory(_CHANNELS * width * height, f"{width} x {height} pixels")
+    return width, height
+
+
+def _stored_size(path: Path) -> Size:
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
         width, height = _header_size(path, file)
@@ -213,11 +248,15 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
         if start[:8] == _PNG:  # Pillow refuses a PNG for damage outside its pixels as well
             width, height = struct.unpack(">II", start[16:24])
         else:
+            if start[:4] in _TIFF:
+                _check_tags(path, file)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 image = Image.open(file, formats=_FORMATS)
             tags = getattr(image, "tag_v2", None)
             width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
+    except SceneError:
+        raise
     except Image.DecompressionBombError as error:
         problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels an image, found more"
         raise SceneError(path, problem) from error
@@ -225,6 +264,23 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
     check_pixels(path, width, height)
     return width, height
+
+
+def _check_tags(path: Path, file: BinaryIO) -> None:
+    """Raise SceneError if the tags of a TIFF refer to more bytes than the file allows: its decoder copies all."""
+    num_bytes = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    start = file.read(16)
+    order, large = "<" if start[:1] == b"I" else ">", 43 in start[2:4]
+    file.seek(*struct.unpack_from(f"{order}8xQ" if large else f"{order}4xI", start))
+    (count,) = struct.unpack(f"{order}{'Q' if large else 'H'}", file.read(8 if large else 2))
+    number = f"{order}u{8 if large else 4}"
+    entry = np.dtype([("tag", f"{order}u2"), ("type", f"{order}u2"), ("count", number), ("value", number)])
+    data = file.read(min(count, _MAX_TAGS) * entry.itemsize)
+    file.seek(0)
+    tags = np.frombuffer(data, entry, len(data) // entry.itemsize)
+    sizes = _TAG_BYTES[np.minimum(tags["type"], len(_TAG_BYTES) - 1)]
+    ReadBudget(path, num_bytes).check_memory(float((tags["count"] * sizes.astype(np.float64)).sum()), "tags")
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
@@ -239,8 +295,8 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
-    at_once = len(files) if 3 * len(files) * width * height <= _AT_ONCE else 1
-    num_bytes = (3 * at_once + _DECODING_BYTES) * width * height
+    at_once = len(files) if _CHANNELS * len(files) * width * height <= _AT_ONCE else 1
+    num_bytes = (_CHANNELS * at_once + _DECODING_BYTES) * width * height
     budget.check_memory(num_bytes, f"{at_once} photos of {width} x {height}")
     _check_scans(budget, files, sizes[0])
     if at_once < len(files):
@@ -277,19 +333,19 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
     The decoder prints lines of its own about damage, in colour profiles and texts as well.
     """
-    view, start = np.ascontiguousarray(data).data, len(_PNG)
-    parts: list[bytes | memoryview] = [_PNG]
+    view, start, pixels = np.ascontiguousarray(data).data, len(_PNG), bytearray(_PNG)
     while start + 12 <= len(view):
         length, kind = struct.unpack_from(">I4s", view, start)
         end = start + 12 + length
         if kind == b"IEND":
-            return np.frombuffer(b"".join([*parts, _PNG_END]), np.uint8)
+            pixels += _PNG_END
+            return np.frombuffer(pixels, np.uint8)
         if end > len(view) or (kind[:1].isupper() and kind not in _PNG_CHUNKS):
             return None
         if kind in _PNG_CHUNKS:
             if zlib.crc32(view[start + 4 : end - 4]) != int.from_bytes(view[end - 4 : end], "big"):
                 return None
-            parts.append(view[start:end])
+            pixels += view[start:end]
         start = end
     return None
 

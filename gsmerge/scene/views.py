@@ -283,7 +283,7 @@ def find_larger_and_masks(
         """Read what a mask, upright, and the photo's transparency, as it is stored, say."""
         mask, photo = named[view], alphas[view]
         parts = [None if photo is None else decode_alpha(photo)]
-        parts += [None if mask is None else np.rot90(decode_mask(mask), -turns)]
+        parts += [None if mask is None else np.rot90(decode_mask(mask, photo), -turns)]
         return [part for part in parts if part is not None]
 
     return large, _read_masks(read_parts, len(names), file_size, cameras, cut), notes

@@ -147,10 +147,19 @@ def _of_kind(kind: str, poses: str, Ks: str, images: str) -> dict[str, Case]:
             cases[f"{name} times {factor}"] = Case(saved(kind, scaled(name, factor)), EITHER)
     cases["images of no pixels"] = Case(saved(kind, replaced(images, np.zeros((VIEWS, 0, 0, 3), np.uint8))))
     cases["a bomb of images"] = Case(zipped(kind, images, bomb(2**27, (VIEWS, 3800, 3800, 3))))
+    cases["a bomb of floats"] = Case(zipped(kind, images, lambda _: member(np.zeros((VIEWS, 1400, 1400, 3), "<f4"))))
+    cases["a header of 60 MB"] = Case(zipped(kind, images, lambda _: long_header(60 << 20)))
+    cases["20,000 poses"] = Case(
+        saved(kind, lambda a, _: a.update({poses: np.tile(np.eye(4), (20_000, 1, 1)), Ks: None}))
+    )
     cases["a bomb of poses"] = Case(zipped(kind, poses, bomb(2**27, (2**27,))))
     for method in ("ZIP_BZIP2", "ZIP_LZMA"):
         cases[method] = Case(zipped(kind, images, member, getattr(zipfile, method)), EITHER)
     return {f"{kind}: {word}": replace(case, named=kind) for word, case in cases.items()}
+
+
+def long_header(size: int) -> bytes:
+    return b"\x93NUMPY\2\0" + struct.pack("<I", size) + bytes(size)
 
 
 def brackets(depth: int) -> bytes:

@@ -73,6 +73,7 @@ def _transforms() -> dict[str, Case]:
     return {
         **{f"transforms: {word}": replace(case, named=name) for word, case in cases.items()},
         **_raw_json(name),
+        **_large(name),
         "transforms: a frame missing": Case(
             edit_json(name, lambda data: data["frames"].pop() and None), named="scene.ply", says=a_third
         ),
@@ -129,6 +130,35 @@ def _raw_json(name: str) -> dict[str, Case]:
     cases[f"{name}: with a byte order mark"] = Case(marked(name), READ)
     cases[f"{name}: 20,000 frames"] = Case(edit_json(name, multiplied(20_000 // 3)), named=name)
     cases[f"{name}: 3000 frames"] = Case(edit_json(name, multiplied(1000)))
+    return cases
+
+
+def _large(name: str) -> dict[str, Case]:
+    """What all frames share is large, and frames are many: neither is copied for the other."""
+    pose = np.eye(4).tolist()
+    shared: dict[str, Callable[[], dict[str, Any]]] = {
+        "keys": lambda: {f"{i:x}": 0 for i in range(300_000)},
+        "distortion": lambda: {"distortion_params": [0] * 1_000_000},
+        "model": lambda: {"camera_model": "a" * 3_000_000}, "digits": lambda: {"fl_x": "1" * 3_000_000},
+    }  # fmt: skip
+    frames: dict[str, dict[str, Any]] = {"empty": {}, "with poses": {"transform_matrix": pose, "file_path": "a"}}
+    cases = {}
+    for word, make in shared.items():
+        for kind, frame in frames.items():
+
+            def spoil(folder: Path, make: Callable[[], dict[str, Any]] = make, frame: dict[str, Any] = frame) -> None:
+                data = {"fl_x": 30, "cx": 12, "cy": 8, **make(), "frames": [frame] * 10_000}
+                (folder / name).write_text(json.dumps(data))
+
+            cases[f"{name}: large {word}, 10,000 frames {kind}"] = Case(spoil)
+    for key, value in (("fl_x", True), ("w", True), ("cx", False), ("k1", True), ("distortion_params", [True])):
+        said = (name, str(value if isinstance(value, bool) else value[0]).lower())
+        cases[f"{name}: {key} of {value}"] = Case(edit_json(name, set_key(key, value)), says=said)
+    cases[f"{name}: a pose of true"] = Case(edit_json(name, set_pose(True)), says=(name, "view_001", "true"))
+    for key in ("w", "h", "cx", "k1", "camera_model", "distortion_params", "is_fisheye"):
+        cases[f"{name}: {key} of null"] = Case(edit_json(name, set_first(key, None)), READ)
+    deep = set_first("file_path", "a/" * 20_000 + "view_000.png")
+    cases[f"{name}: a path of 20,000 folders"] = Case(edit_json(name, deep), READ)
     return cases
 
 

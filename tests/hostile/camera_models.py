@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
+import textwrap
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -86,7 +89,26 @@ def _other_json() -> dict[str, Case]:
     for word, entry in entries.items():
         wrong: Callable[[Any], None] = lambda data, entry=entry: data.update(extrinsics=entry)  # noqa: E731
         cases[f"WorldMirror poses as {word}"] = "camera_params.json", changed(world_mirror, wrong), (3,)
+    for key in ("extrinsics", "intrinsics"):
+        cases[f"WorldMirror {key} of 20,000 cameras"] = "camera_params.json", repeated(world_mirror, key), (3,)
+    cases["INRIA of 20,000 cameras"] = "cameras.json", repeated(inria), (3,)
+    for name in ("camera_params.json", "stray.json"):
+        cases[f"{name} with camera_id of 5,000 digits"] = name, changed(world_mirror, long_ids), EITHER
     return {word: Case(in_place_of_transforms(name, make), codes, name) for word, (name, make, codes) in cases.items()}
+
+
+def long_ids(data: Any) -> None:
+    for side in data.values():
+        for i, entry in enumerate(side):
+            entry["camera_id"] = str(i) * 5000
+
+
+def repeated(make: Make, key: str = "") -> Make:
+    def many(c2w: np.ndarray, K: np.ndarray) -> Any:
+        data = make(c2w, K)
+        return {**data, key: data[key][:1] * 20_000} if key else data[:1] * 20_000
+
+    return many
 
 
 def _beside_long_lrm() -> dict[str, Case]:
@@ -98,7 +120,7 @@ def _beside_long_lrm() -> dict[str, Case]:
         return both
 
     contents = {
-        "input_frame_idx.txt": ["nan", "-1", "7", "1e300", "a b", "", "0 0 0"],
+        "input_frame_idx.txt": ["nan", "-1", "7", "1e300", "a b", "", "0 0 0", "0 " * 3_000_000],
         "pos_avg_inv.txt": ["0 " * 16, "1 " * 15, "nan " * 16, "1e200 " * 16, "x"],
         "scene_scale.txt": ["0", "-1", "inf", "1e-320", "1e300", "1 2", ""],
     }
@@ -151,6 +173,7 @@ def _binary() -> dict[str, Case]:
     images |= {f"{n} points": packed(84, "<Q", n) for n in (1, 2**40, 2**61, 2**64 - 1)}
     images |= {f"rotation {x}": packed(12, "<4d", x, x, x, x) for x in (np.nan, np.inf, 0.0, 1e300)}
     images |= {f"position {x}": packed(44, "<d", x) for x in (np.nan, np.inf, 1e300)}
+    images["a million images"] = lambda data: struct.pack("<Q", 10**6) + data[8:] * 330_000
     images["a name of 1 MB"] = lambda data: data[:72] + b"x" * 2**20 + data[72:]
     images["a name that is not UTF-8"] = packed(72, "<2B", 255, 254)
     images["a name with line breaks"] = packed(72, "<3B", 10, 13, 27)
@@ -168,12 +191,17 @@ def _text() -> dict[str, Case]:
     lines = {
         "no numbers": b"1 PINHOLE a b c d e f", "too few": b"1 PINHOLE", "NaN": b"1 PINHOLE 24 16 nan nan nan nan",
         "an unknown model": b"1 MAGIC 24 16 1 2 3 4", "a distorted number": b"1 OPENCV 24 16 20 20 12 8 .1. 0 0 0",
+        "a size of 400 digits": b"1 PINHOLE 1%s 16 20 20 12 8" % (b"0" * 400),
         "a size of 10^30": b"1 PINHOLE 1%s 16 20 20 12 8" % (b"0" * 30), "a size of 5000 digits": b"1 PINHOLE "
         + b"9" * 5000 + b" 16 20 20 12 8", "bytes": bytes(range(256)), "nothing": b"", "half a size": b"1 PINHOLE 24.5 "
         b"16 20 20 12 8", "a negative size": b"1 PINHOLE -24 -16 20 20 12 8",
     }  # fmt: skip
     for word, line in lines.items():
         cases[f"cameras.txt with {word}"] = Case(model(lambda c, i, line=line: (line, i), text=True))
+    many = b"".join(b"%d SIMPLE_PINHOLE 1 1 1 1 1\n" % i for i in range(20_000))
+    cases["cameras.txt with 20,000 cameras"] = Case(model(lambda c, i: (many, i), text=True))
+    million = b"0 1 0 0 0 0 0 0 1 a\n"
+    cases["images.txt with a million images"] = Case(model(lambda c, i: (c, million * 1_000_000), text=True))
     lines = {
         "nothing": b"", "one line": b"1 2 3", "words": b"a b c d e f g h i j", "bytes": bytes(range(256)),
         "an unknown camera": b"0 1 0 0 0 0 0 0 77 view_000.png\n\n", "inf": b"0 inf inf inf inf 0 0 0 1 a\n\n",
@@ -214,6 +242,7 @@ def _pose_lists() -> dict[str, Case]:
         "1e300": lambda x: ["1e300 " * 12, *x[1:]], "zeros": lambda x: ["0 " * 12, *x[1:]],
         "nothing": lambda _: [], "empty lines": lambda _: [""] * 1000, "a line of 1 MB": lambda _: ["1 " * 2**19],
         "50,000 lines": lambda x: [x[1]] * 50_000, "a zero byte": lambda x: [x[0] + " \0", *x[1:]],
+        "4,000,000 lines of one number": lambda x: [x[0], "1\n" * 4_000_000],
     }  # fmt: skip
     cases = {f"pose list with {word}": Case(spoil(change)) for word, change in changes.items()}
     for text in ("", "nan nan nan nan", "1 2", "a b c d", "0 0 0 0", "1e300 1e300 0 0", "1 1 1 1\n1 1 1 1"):
@@ -222,5 +251,31 @@ def _pose_lists() -> dict[str, Case]:
     return cases
 
 
-GROUPS = (_other_json, _beside_long_lrm, _binary, _text, _pose_lists)
+def _embedded() -> dict[str, Case]:
+    def spoil(change: Callable[[bytes], bytes] = lambda text: text, before: int = 0) -> Spoil:
+        """The cameras inside the .ply, after so many bytes of other comments."""
+
+        def both(folder: Path) -> None:
+            text = zlib.compress(change((folder / "transforms.json").read_bytes()), 9)
+            (folder / "transforms.json").unlink()
+            wrapped = textwrap.wrap(base64.b64encode(text).decode(), 900)
+            lines = [b"x" * 91] * (before // 100) + [b"gsmerge cameras: " + line.encode() for line in wrapped]
+            start, end, rest = (folder / "scene.ply").read_bytes().partition(b"element vertex")
+            comments = b"".join(b"comment " + line + b"\n" for line in lines)
+            (folder / "scene.ply").write_bytes(start + comments + end + rest)
+
+        return both
+
+    cases = {f"after {size} bytes": Case(spoil(before=size), READ) for size in (0, 3_900, 4_000, 8_100, 60_000)}
+    texts: dict[str, Callable[[bytes], bytes]] = {
+        "of empty lists": lambda _: b'{"frames":[' + b"[]," * (10 << 20) + b"[]]}",
+        "of wide letters": lambda _: '{"a":"\U0001f600'.encode() + b"a" * (16 << 20) + b'"}',
+        "of nested lists": lambda _: b"[" * 100_000, "of spaces": lambda _: b" " * (32 << 20),
+        "not UTF-8": lambda _: b'{"\xff":1}', "of nothing": lambda _: b"",
+    }  # fmt: skip
+    cases |= {word: Case(spoil(change), (3,), "scene.ply") for word, change in texts.items()}
+    return {f"inside the ply, {word}": case for word, case in cases.items()}
+
+
+GROUPS = (_embedded, _other_json, _beside_long_lrm, _binary, _text, _pose_lists)
 CASES = {f"cameras: {name}": case for group in GROUPS for name, case in group().items()}

@@ -38,7 +38,7 @@ READ, USAGE, REFUSED, EITHER = (0,), (2,), (3,), (0, 3)
 
 NUMBERS: dict[str, Any] = {
     "NaN": float("nan"), "inf": float("inf"), "-inf": float("-inf"), "1e300": 1e300, "-1": -1, "zero": 0,
-    "a huge integer": 10**400, "a word": "wide", "null": None, "a list": [1, 2], "an object": {"a": 1},
+    "a huge integer": 10**400, "a word": "wide", "null": None, "true": True, "a list": [1, 2], "an object": {"a": 1},
 }  # fmt: skip
 
 

@@ -74,6 +74,23 @@ def bomb(_: bytes) -> bytes:
     return black(9000, 9000)
 
 
+def with_texts(data: bytes) -> bytes:
+    text = zlib.compress(bytes(2**20), 9)
+    return data[:33] + b"".join(chunk(b"zTXt", b"a%d\0\0" % i + text) for i in range(60)) + data[33:]
+
+
+def with_empty_chunks(data: bytes) -> bytes:
+    return data[:33] + chunk(b"IDAT", b"") * 1_000_000 + data[33:]
+
+
+def with_tags(order: str) -> bytes:
+    """A TIFF of 240 kB with 4,000 tags that refer to all of it, each."""
+    size, rows = 240_000, {256: WIDTH, 257: HEIGHT, 258: 8, 259: 1, 262: 1, 273: 100_000, 277: 1, 278: HEIGHT, 279: 384}
+    tags = [(tag, 4, 1, value) for tag, value in rows.items()] + [(1000 + i, 7, size - 8, 8) for i in range(4000)]
+    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
+    return (head + b"".join(struct.pack(f"{order}HHII", *tag) for tag in tags)).ljust(size, b"\0")
+
+
 def jpeg_size(width: int, height: int) -> Change:
     def change(data: bytes) -> bytes:
         at = data.index(b"\xff\xc0") + 5
@@ -104,6 +121,12 @@ def _spoiled() -> dict[str, Case]:
     cases["smaller than the grid"] = Case(small, says=("24 x 16", "12 x 8"))
     cases["a bomb"] = Case(first(bomb))
     cases["three bombs"] = Case(every(bomb))
+    cases["solid of 8190 x 8190"] = Case(every(lambda _: black(8190, 8190)), says=("view_000.png", "8190 x 8190"))
+    cases["60 texts of 1 MB"] = Case(every(with_texts), READ)
+    cases["a million chunks without data"] = Case(every(with_empty_chunks), EITHER)
+    for order in "<>":
+        tags = recoded(".tiff", lambda _, order=order: with_tags(order))
+        cases[f".tiff whose tags are all of it, {order}"] = Case(tags, says=("view_000.tiff", "tags"))
     cases["script"] = Case(first(lambda data: b"#!/bin/sh\ntouch executed\n"))
     cases["SVG"] = Case(first(lambda data: b'<svg xmlns="http://www.w3.org/2000/svg" width="24" height="16"/>'))
     cases["no rows"] = Case(first(lambda data: png(WIDTH, HEIGHT)), EITHER)

@@ -124,8 +124,7 @@ def make_camera_file(
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
-    if len(views) > MAX_VIEWS:
-        raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found {len(views)}")
+    check_count(path, len(views))
     missing = all(view.K is None for view in views)
     if missing:  # a place holder, until the focal length is estimated
         sides = [float(max(view.size)) or 1.0 for view in views]
@@ -164,6 +163,12 @@ def make_camera_file(
         lenses=lenses if any(lenses) else (),
         focal=None if missing else "",
     )
+
+
+def check_count(path: StrPath, count: int) -> None:
+    """Raise SceneError if a file has more cameras than are read, before anything is made for each."""
+    if count > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
 
 
 def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,8 +13,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
-from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import View, make_lens, make_pinhole
+from gsmerge.io.bounds import MAX_MODEL_BYTES, check_file, read_lines
+from gsmerge.io.cameras.camera_file import View, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
@@ -31,7 +31,9 @@ _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 
 MAX_NAME = 1 << 16  # bytes of an image's name
 
-_WHOLE = re.compile(r"[+-]?[0-9]{1,18}([.]0*)?")
+_MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # of a camera's line
+_MAX_DIGITS = 18  # of a whole number
+_WHOLE = re.compile(rf"[+-]?[0-9]{{1,{_MAX_DIGITS}}}([.]0*)?")
 _NOT_UNIT = 0.05  # difference of its length from 1 by which four numbers are no rotation
 
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
@@ -56,10 +58,10 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
             with _mapped(camera_path) as data:
                 cameras = _binary_cameras(camera_path, data)
             with _mapped(image_path) as data:
-                images = _binary_images(data)
+                images = _binary_images(image_path, data)
         else:
-            cameras = _text_cameras(camera_path, read_text(camera_path))
-            images = _text_images(read_text(image_path, MAX_MODEL_BYTES), cameras)
+            cameras = _text_cameras(camera_path, read_lines(camera_path))
+            images = _text_images(image_path, read_lines(image_path, MAX_MODEL_BYTES), cameras)
         unknown = next((name for name, camera, _ in images if camera not in cameras), None)
         if unknown is not None:
             raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
@@ -101,6 +103,7 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
 
 def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, View]:
     (count,) = struct.unpack_from("<Q", data)
+    check_count(path, count)
     position, cameras = 8, {}
     for _ in range(count):
         camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, position)
@@ -112,8 +115,9 @@ def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, View]:
     return cameras
 
 
-def _binary_images(data: mmap.mmap) -> list[_Image]:
+def _binary_images(path: Path, data: mmap.mmap) -> list[_Image]:
     (count,) = struct.unpack_from("<Q", data)
+    check_count(path, count)
     position, images = 8, []
     for _ in range(count):
         _, *numbers, camera = struct.unpack_from("<i7di", data, position)
@@ -127,8 +131,6 @@ def _binary_images(data: mmap.mmap) -> list[_Image]:
         if position > len(data):
             raise ValueError("early end of file")
         images.append((name, camera, _pose(numbers)))
-        if len(images) > MAX_VIEWS:
-            break  # which is refused as too many
     return images
 
 
@@ -136,28 +138,30 @@ def _says_something(line: str) -> bool:
     return line.strip()[:1] not in ("", "#")
 
 
-def _text_cameras(path: Path, text: str) -> dict[int, View]:
-    cameras = {}
-    for line in filter(_says_something, text.splitlines()):
-        camera_id, model, width, height, *params = line.split()
-        if len(params) != _NUM_PARAMS.get(model, len(params)):
-            raise ValueError("wrong number of parameters")
+def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, View]:
+    cameras: dict[int, View] = {}
+    for line in filter(_says_something, lines):
+        check_count(path, len(cameras) + 1)
+        camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
+        if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
+            raise ValueError("wrong number of parameters, or digits")
         size = int(width), int(height)
         cameras[int(camera_id)] = _camera(path, int(camera_id), model, size, [float(p) for p in params])
     return cameras
 
 
-def _text_images(text: str, cameras: Mapping[int, View]) -> list[_Image]:
+def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, View]) -> list[_Image]:
     """Parse the lines of the images: pose and name (maybe with spaces); each is followed by its points, or is not.
 
     Programs that rewrite ``images.txt`` leave out the lines of points, or only the empty ones.
     """
     images: list[_Image] = []
     after_image = False
-    for line in filter(_says_something, text.splitlines()):
+    for line in filter(_says_something, lines):
         if after_image and _lists_points(line, cameras):
             after_image = False
             continue
+        check_count(path, len(images) + 1)
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")

@@ -14,7 +14,7 @@ import numpy as np
 from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.bounds import read_errors
+from gsmerge.io.bounds import ReadBudget, parse_json, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.json_files import transforms_document, transforms_views
@@ -26,7 +26,7 @@ EMBEDDED = "inside the .ply"  # source of such cameras
 PREFIX = "gsmerge cameras: "
 LINE = 900  # characters of a comment: readers in C keep lines of 1,024
 MAX_CHARS = 96 << 10  # of all: splat-transform looks for the end of a header in 128 KiB
-MAX_TEXT = 32 << 20  # bytes of the JSON, as of a file of cameras
+_TEXT_COPIES = 8  # bytes of memory for each of unpacked JSON: as it comes, and four for each character
 DIGITS = 10  # of each number: 1e-9 of a pixel or of the scene, in half the space of all
 SHARP = "SHARP"  # the same
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
@@ -65,14 +65,15 @@ def read_embedded(source: CameraSource) -> StoredCameras:
     """Read the cameras in the header of a ``.ply``; SceneError if they are damaged."""
     path, lines = source.path, camera_lines(source.path)
     try:
-        unpacking = zlib.decompressobj()
-        text = unpacking.decompress(base64.b64decode(b"".join(lines), validate=True), MAX_TEXT)
+        packed, unpacking = base64.b64decode(b"".join(lines), validate=True), zlib.decompressobj()
+        budget = ReadBudget(path, len(packed))
+        text = unpacking.decompress(packed, budget.memory // _TEXT_COPIES)
         if not unpacking.eof:
             raise ValueError("they are cut off or too long")
-        data = json.loads(text)
+        data = parse_json(text.decode("utf-8"), budget)
         if not isinstance(data, dict) or "frames" not in data:
             raise ValueError("they have no 'frames'")
-    except (ValueError, RecursionError, zlib.error, binascii.Error) as error:
+    except (ValueError, zlib.error, binascii.Error) as error:
         problem = f"expected whole cameras in its header, found damaged ones ({error})"
         raise SceneError(path, problem, "name others with --cameras") from error
     return StoredCameras(transforms_views(path, data))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,29 +14,33 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, normalize
-from gsmerge.io.bounds import read_json, read_text
+from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENGL,
     MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
     Lens,
     View,
+    check_count,
     from_viewmats,
     is_orthonormal,
     make_lens,
     make_pinhole,
 )
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.image_names import find_image
-from gsmerge.io.photo_files import image_size
+from gsmerge.io.image_names import find_image, natural_key
+from gsmerge.io.photo_files import Size, image_size
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.types import Cameras
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of "distortion_params"
+_COEFFICIENTS = (*_DISTORTION, "k5", "k6")
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PERSPECTIVE = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
+_NUMBER_KEYS = (*_FOCAL_KEYS, "w", "h", "cx", "cy", *_COEFFICIENTS)
+_MAX_MODEL = 40  # letters of a camera model's name
 _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
@@ -71,64 +76,96 @@ def read_transforms(source: CameraSource) -> StoredCameras:
 
 def transforms_views(path: Path, data: Any) -> list[View]:
     """Read the views of a parsed ``transforms.json``; see :func:`read_transforms`."""
-    common, frames = (data, data["frames"]) if isinstance(data, dict) else ({}, data)
+    frames = data["frames"] if isinstance(data, dict) else data
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
-    views = []
-    bare = not any(key in {**common, **frame} for frame in frames for key in _FOCAL_KEYS)
+    check_count(path, len(frames))
+    with _number_errors(path, "expected numbers"):
+        common = _camera_values(data) if isinstance(data, dict) else {}
+    entries: list[tuple[str, np.ndarray, dict[str, Any]]] = []
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
             raise SceneError(path, f"view {name}: expected 'transform_matrix', found none")
-        values = {**common, **frame}
         with _number_errors(path, f"view {name}: expected numbers"):
-            pose = np.array(frame["transform_matrix"], np.float64)
+            entries.append((name, _array(frame["transform_matrix"]), {**common, **_camera_values(frame)}))
+    bare = not any(key in values for _, _, values in entries for key in _FOCAL_KEYS)
+    views, size_of = [], cache(image_size)  # of photos that many frames may name
+    for name, pose, values in entries:
+        with _number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values)
-            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values)
+            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values, size_of)
             views.append(View(name, pose, K, size, lens))
     return views
 
 
-def _stored_size(values: Mapping[str, Any]) -> tuple[int, int]:
+def _camera_values(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a file, or a frame in it, says of a camera's intrinsics; null counts as missing."""
+    values: dict[str, Any] = {key: _number(entry[key]) for key in _NUMBER_KEYS if entry.get(key) is not None}
+    values |= {key: entry[key] for key in ("camera_model", "is_fisheye") if entry.get(key) is not None}
+    if "camera_model" in values:
+        values["camera_model"] = str(values["camera_model"]).upper()[:_MAX_MODEL]
+    if entry.get("distortion_params") is not None:
+        values["distortion_params"] = [_number(value) for value in entry["distortion_params"][: len(_DISTORTION)]]
+    return values
+
+
+def _number(value: Any) -> float:
+    """Convert a number of JSON; TypeError for true, false and null, ValueError for text that is none."""
+    if isinstance(value, bool):
+        raise TypeError(f"found {str(value).lower()}")
+    return float(value)
+
+
+def _array(values: Any) -> np.ndarray:
+    """Convert lists of numbers to float64; errors as of :func:`_number`."""
+    array = np.array(values, np.float64)
+    if bool in set(map(type, np.array(values, object).flat)):
+        raise TypeError("found true or false")
+    return array
+
+
+def _stored_size(values: Mapping[str, float]) -> tuple[int, int]:
     """Return (width, height) of a frame; 0 where the file has none."""
-    return round(float(values.get("w") or 0)), round(float(values.get("h") or 0))
+    return round(values.get("w", 0)), round(values.get("h", 0))
 
 
-def _intrinsics(path: Path, name: str, values: Mapping[str, Any]) -> tuple[np.ndarray, tuple[int, int]]:
+def _intrinsics(
+    path: Path, name: str, values: Mapping[str, Any], size_of: Callable[[Path], Size]
+) -> tuple[np.ndarray, Size]:
     """Return intrinsics ``[3,3]`` and (width, height) of a frame, from its own values or those of all frames."""
     if not any(key in values for key in _FOCAL_KEYS):
         missing = ", ".join(key for key in ("fl_x", "w", "h") if key not in values)
         problem = f"expected intrinsics (fl_x, fl_y, cx, cy, w, h), found none of {missing} for view {name}"
         raise SceneError(path, problem, "add them in pixels, for all frames or for each")
-    width, height = float(values.get("w") or 0), float(values.get("h") or 0)
+    width, height = values.get("w", 0.0), values.get("h", 0.0)
     if not (width and height) and not {"fl_x", "cx", "cy"} <= values.keys():
         image = find_image(path.parent, name)
         if image is None:
             raise SceneError(path, f"view {name}: expected 'w' and 'h', found neither them nor the image itself")
-        width, height = image_size(image)
+        width, height = size_of(image)
     fx = _focal(values, "x", width) or _focal(values, "y", height)
     fy = _focal(values, "y", height) or fx
-    K = make_pinhole(fx, fy, float(values.get("cx", width / 2)), float(values.get("cy", height / 2)))
+    K = make_pinhole(fx, fy, values.get("cx", width / 2), values.get("cy", height / 2))
     return K, (round(width), round(height))
 
 
-def _focal(values: Mapping[str, Any], axis: str, size: float) -> float:
+def _focal(values: Mapping[str, float], axis: str, size: float) -> float:
     """Return the focal length along an axis in pixels, 0 where the file has none."""
     if f"fl_{axis}" in values:
-        return float(values[f"fl_{axis}"])
+        return values[f"fl_{axis}"]
     if f"camera_angle_{axis}" in values:
-        half = 0.5 * float(values[f"camera_angle_{axis}"])
+        half = 0.5 * values[f"camera_angle_{axis}"]
         return float(0.5 * size * cos(half) / sin(half))
     return 0.0
 
 
 def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
     """Return the lens of a frame, None for a pinhole."""
-    model = str(values.get("camera_model", "PINHOLE")).upper()
-    params = {key: float(values.get(key) or 0) for key in (*_DISTORTION, "k5", "k6")}
-    listed = [float(value) for value in values.get("distortion_params") or ()]
+    model = values.get("camera_model", "PINHOLE")
+    params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
     if not any(params.values()):
-        params |= dict(zip(_DISTORTION, listed, strict=False))
+        params |= dict(zip(_DISTORTION, values.get("distortion_params", ()), strict=False))
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
         return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
     odd = next((key for key in ("k4", "k5", "k6") if params[key]), None)
@@ -147,15 +184,16 @@ def read_inria(source: CameraSource) -> StoredCameras:
     It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle.
     """
     views, path = [], source.path
+    check_count(path, len(source.json))
     for i, entry in enumerate(source.json):
         name = str(entry.get("img_name", f"view {i}"))
-        missing = [key for key in _INRIA_KEYS if key not in entry]
+        missing = [key for key in _INRIA_KEYS if entry.get(key) is None]
         if missing:
             raise SceneError(path, f"view {name}: missing {', '.join(missing)}")
         with _number_errors(path, f"view {name}: expected numbers"):
-            rotation = np.array(entry["rotation"], np.float64).reshape(3, 3)
-            centre = np.array(entry["position"], np.float64).reshape(3, 1)
-            fx, fy, width, height = (float(entry[key]) for key in ("fx", "fy", "width", "height"))
+            rotation = _array(entry["rotation"]).reshape(3, 3)
+            centre = _array(entry["position"]).reshape(3, 1)
+            fx, fy, width, height = (_number(entry[key]) for key in ("fx", "fy", "width", "height"))
             size = round(width), round(height)
         K = make_pinhole(fx, fy, width / 2, height / 2)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
@@ -175,7 +213,7 @@ def read_world_mirror(source: CameraSource) -> StoredCameras:
     if poses.keys() != Ks.keys():
         odd = sorted(poses.keys() ^ Ks.keys())[0]
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
-    names = sorted(poses, key=int) if all(name.isdecimal() for name in poses) else list(poses)
+    names = sorted(poses, key=natural_key) if all(name.isdecimal() for name in poses) else list(poses)
     size = _centred_size([Ks[name] for name in names])
     return StoredCameras([View(name, poses[name], Ks[name], size) for name in names])
 
@@ -194,10 +232,11 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     entries = data.get(key)
     if not isinstance(entries, list):
         raise SceneError(path, f"expected {key!r} to be a list, found something else")
+    check_count(path, len(entries))
     matrices = {}
     for entry in entries:
         with _number_errors(path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
-            name, matrix = str(entry["camera_id"]), np.array(entry["matrix"], np.float64)
+            name, matrix = str(entry["camera_id"]), _array(entry["matrix"])
         if matrix.shape not in ((side, side), (3, side)):
             raise SceneError(path, f"{key} of {name}: expected {side}x{side} numbers, found shape {matrix.shape}")
         matrices[name] = matrix
@@ -216,9 +255,9 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     for i, frame in enumerate(source.json["frames"]):
         name = str(frame.get("file_path") or frame.get("image_path") or f"view {i}")
         with _number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
-            pose = np.array(frame["w2c"], np.float64).reshape(4, 4)
-            K = make_pinhole(*(float(frame[key]) for key in ("fx", "fy", "cx", "cy")))
-            frames.append(View(name, pose, K, (round(float(frame["w"])), round(float(frame["h"])))))
+            pose = _array(frame["w2c"]).reshape(4, 4)
+            K = make_pinhole(*(_number(frame[key]) for key in ("fx", "fy", "cx", "cy")))
+            frames.append(View(name, pose, K, (round(_number(frame["w"])), round(_number(frame["h"])))))
     beside = path.parent
     if folder is not None and not (beside / FRAMES_FILE).is_file() and (folder / FRAMES_FILE).is_file():
         beside = folder
@@ -263,8 +302,11 @@ def _numbers(path: Path) -> np.ndarray | None:
     """Read all numbers of a text file; None where there is no file."""
     if not path.is_file():
         return None
+    words = read_text(path).replace(",", " ").split(maxsplit=MAX_VIEWS)
+    if len(words) > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} numbers, found more")
     with _number_errors(path, "expected numbers"):
-        values = np.array(read_text(path).replace(",", " ").split(), np.float64)
+        values = np.array(words, np.float64)
     if not np.isfinite(values).all():
         raise SceneError(path, "expected finite numbers, found NaN or inf")
     return values
@@ -333,18 +375,18 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     data = read_json(path)
     with _number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
-        scale = float(data["scale"])
+        scale = _number(data["scale"])
     frames = [_similarity(path, moved, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with _number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
-            applied, factor = _square(camera_data["applied_transform"]), float(camera_data.get("applied_scale") or 1)
+            applied, factor = _square(camera_data["applied_transform"]), _number(camera_data.get("applied_scale") or 1)
             frames.append(_similarity(path, matmul(moved, invert(applied)), scale / factor))
     return frames
 
 
 def _square(values: Any) -> np.ndarray:
-    matrix = np.asarray(values, np.float64)
+    matrix = _array(values)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")
     return np.concatenate([matrix[:3], [[0.0, 0, 0, 1]]])

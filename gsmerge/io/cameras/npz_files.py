@@ -8,6 +8,7 @@ order of the rows of the ``.ply``, where it is known.
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
 import zipfile
@@ -17,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file, check_pixels
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View
+from gsmerge.io.bounds import check_pixels, read_budget
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
@@ -26,8 +27,7 @@ _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _L
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
-_FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
-_MAX_RATIO = 100  # of unpacked to packed bytes; photos and depth maps reach 20
+_MAX_HEADER = 1 << 16  # bytes of an array's header
 _KINDS = "biufU"
 
 
@@ -122,8 +122,10 @@ def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tu
     for name, array in zip(names, (poses, Ks), strict=True):
         if array.dtype.kind not in "fiu":
             raise SceneError(path, f"expected numbers in {name}, found {array.dtype}")
-    if poses.ndim != 3 or len(poses) == 0 or Ks.shape != (len(poses), 3, 3):
+    is_list = poses.ndim == 3 and len(poses) > 0 and poses.shape[1:] in ((3, 4), (4, 4))
+    if not is_list or Ks.shape != (len(poses), 3, 3):
         raise SceneError(path, f"expected {names[0]} and {names[1]}, found {poses.shape} and {Ks.shape}")
+    check_count(path, len(poses))
     if not (np.isfinite(poses).all() and np.all(np.abs(Ks.astype(np.float64)) < _MAX_INTRINSIC)):
         raise SceneError(path, f"expected finite numbers in {names[0]} and {names[1]}, found others")
 
@@ -137,10 +139,13 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     if images.dtype.kind not in "fiu":
         raise SceneError(path, f"expected images of numbers, found {images.dtype}")
     check_pixels(path, images.shape[2], images.shape[1])
-    if images.dtype != np.uint8:
-        share = np.nan_to_num(np.clip(images, 0, 1).astype(np.float32))
-        images = np.round(share * 255).astype(np.uint8)
-    return np.ascontiguousarray(images)
+    if images.dtype == np.uint8:
+        return np.ascontiguousarray(images)
+    read_budget(path).check_memory(images.nbytes + images.size, "images")
+    out = np.empty(images.shape, np.uint8)
+    for row in range(images.shape[1]):  # by rows, whose floats take little memory
+        out[:, row] = np.round(np.nan_to_num(np.clip(images[:, row], 0, 1).astype(np.float32)) * 255)
+    return out
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -171,17 +176,18 @@ def array_names(path: Path) -> frozenset[str]:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name; names that it lacks are left out.
 
-    SceneError if it cannot be read, an array has anything but numbers and text, or is larger than its bytes in the
-    archive allow.
+    SceneError if it cannot be read, an array has anything but numbers and text, or they take more memory than the file
+    allows.
     """
-    check_file(path)
+    budget = read_budget(path)
     if not zipfile.is_zipfile(path):
         raise SceneError(path, "expected a readable .npz file, found something else")
     try:
         with zipfile.ZipFile(path) as archive, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers in old styles
-            members = _members(archive)
-            return {name: _read_array(path, archive, info) for name, info in members.items() if name in names}
+            members = {name: info for name, info in _members(archive).items() if name in names}
+            budget.check_memory(sum(info.file_size for info in members.values()), "arrays")
+            return {name: _read_array(path, archive, info) for name, info in members.items()}
     except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
@@ -194,12 +200,11 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     name = info.filename
-    if info.file_size > max(_FREE_BYTES, _MAX_RATIO * info.compress_size):
-        raise SceneError(path, f"{name}: found {info.file_size >> 20} MiB in {info.compress_size} packed bytes")
     with archive.open(info) as file:
-        first = np.lib.format.read_magic(file) == (1, 0)
-        read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read_header(file)
+        start = io.BytesIO(file.read(_MAX_HEADER))
+    first = np.lib.format.read_magic(start) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(start)
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
         raise SceneError(path, f"{name}: expected numbers, found {kind}")

@@ -10,8 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_VIEWS, check_file, read_text
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, View, make_pinhole
+from gsmerge.io.bounds import check_file, read_lines
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    W2C_OPENCV,
+    CameraFile,
+    View,
+    check_count,
+    make_pinhole,
+)
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
@@ -37,6 +45,7 @@ CAMERA_PLACES = (
 )  # fmt: skip
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
+_MOST_COLUMNS = max(_POSE_COLUMNS)
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 
 
@@ -114,7 +123,7 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
 
 def _lists_poses(path: Path) -> bool:
     with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
-        return len(_numbers(file.readline(4096))) in _POSE_COLUMNS
+        return len(np.array(_words(file.readline(4096)), np.float64)) in _POSE_COLUMNS
     return False
 
 
@@ -138,23 +147,24 @@ def _read_poses(source: CameraSource) -> StoredCameras:
 
 
 def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
-    lines = [(number, line) for number, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
-    if len(lines) > MAX_VIEWS:
-        raise SceneError(path, f"expected at most {MAX_VIEWS} views, found more")
-    rows = []
-    for number, line in lines:
+    rows: list[np.ndarray] = []
+    for number, line in enumerate(read_lines(path), 1):
+        words = _words(line)
+        if words and len(words) not in lengths:
+            counts = " or ".join(map(str, lengths))
+            found = len(words) if len(words) <= _MOST_COLUMNS else f"more than {_MOST_COLUMNS}"
+            raise SceneError(path, f"line {number}: expected {counts} numbers, found {found}")
         try:
-            rows.append(_numbers(line))
+            rows += [np.array(words, np.float64)] if words else []
         except ValueError as error:
             raise SceneError(path, f"line {number}: expected numbers ({error})") from error
-        if len(rows[-1]) not in lengths:
-            counts = " or ".join(map(str, lengths))
-            raise SceneError(path, f"line {number}: expected {counts} numbers, found {len(rows[-1])}")
+        check_count(path, len(rows))
     return rows
 
 
-def _numbers(line: str) -> np.ndarray:
-    return np.array(line.replace(",", " ").split(), np.float64)
+def _words(line: str) -> list[str]:
+    """Split a line into words; the last has all that follows the most that a pose has."""
+    return line.replace(",", " ").split(maxsplit=_MOST_COLUMNS)
 
 
 _SHARP = CameraFormat(

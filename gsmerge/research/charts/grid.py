@@ -95,9 +95,12 @@ def read_grid(path: Path) -> Grid:
         odd = ", ".join(sorted(values.keys() - names))
         raise SceneError(path, f"expected lists named {', '.join(sorted(names))}, found {odd}")
     try:
-        return Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
+        grid = Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
     except (TypeError, ValueError) as error:
         raise SceneError(path, str(error)) from error
+    if not all(isinstance(method, str) for method in grid.methods):
+        raise SceneError(path, f"methods: expected names, found {grid.methods}")
+    return grid
 
 
 def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:

@@ -124,12 +124,15 @@ def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch)
         actual("all")
 
 
-def test_a_list_may_name_a_scene_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_list_may_name_a_scene_again_and_again() -> None:
     touch("s/a/scene.ply", "s/b.ply")
     Path("list").write_text("s/a\ns/b.ply\n" * 100_000 + "./s/a\ns\n")
     assert actual("list") == ["s/a", "s/b.ply", "s/b.ply"]
-    monkeypatch.setattr("gsmerge.batch.find.MAX_LISTED", 3)
-    with refuses(SceneError, "list", "3 scenes"):
+
+
+def test_a_list_of_more_scenes_than_its_bytes_allow_is_refused() -> None:
+    Path("list").write_text("\n".join(f"{i:x}" for i in range(200_000)))
+    with refuses(SceneError, "list", f"{Path('list').stat().st_size:,} bytes"):
         actual("list")
 
 

@@ -28,7 +28,7 @@ from gsmerge.batch.records import (
     write_summary,
 )
 from gsmerge.errors import SceneError
-from gsmerge.runtime.jsonl import append_line
+from gsmerge.io.jsonl import append_line
 
 SHA = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of abc
 

@@ -13,7 +13,7 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import bounds
-from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_table, read_text
+from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, parse_json, read_lines, read_table, read_text
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.content_hash import content_hash
 
@@ -34,8 +34,14 @@ def test_only_files_are_read(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"\xef\xbb\xbfab")
     assert check_file(tmp_path / "a") == 5
     assert read_text(tmp_path / "a") == "ab"
-    with refuses(SceneError, "a", "0 MiB"):
-        read_text(tmp_path / "a", 4)
+    assert list(read_lines(tmp_path / "a")) == ["ab"]
+    for read in (read_text, lambda *arguments: list(read_lines(*arguments))):
+        with refuses(SceneError, "a", "0 MiB"):
+            read(tmp_path / "a", 4)
+    (tmp_path / "a").write_bytes(b"a\n\xff")
+    for read in (read_text, lambda path: list(read_lines(path))):
+        with refuses(SceneError, "a", "text"):
+            read(tmp_path / "a")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
@@ -119,3 +125,13 @@ def test_content_is_names_and_bytes(tmp_path: Path) -> None:
     assert len({before, renamed, content_hash([folder])}) == 3
     with refuses(SceneError, "nothing", "No such file"):
         content_hash([tmp_path / "nothing"])
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="TOML needs Python 3.11")
+@pytest.mark.parametrize(
+    ("text", "found"), [(".".join("a" * 100_000) + " = 1", "keys"), (f"a = 0x{'f' * 10_000}", "digits")]
+)
+def test_settings_that_take_too_long_or_are_too_large(tmp_path: Path, text: str, found: str) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with refuses(SceneError, "a.toml", found):
+        read_table(tmp_path / "a.toml")

@@ -114,3 +114,20 @@ def test_masks_without_photos_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
     write(tiny_folder / "masks" / tiny.names[0], half(tiny).astype(np.uint8) * 255)
     shutil.rmtree(tiny_folder / "images")
     assert "masks are not used: there are no photos" in load_scene(tiny_folder).notes
+
+
+def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:
+    """Rows beyond the first that are converted at once count, too."""
+    levels = np.random.default_rng(0).integers(0, 256, (600, 3, 2), np.uint8)
+    write(tmp_path / "a.png", np.dstack([levels[..., 0]] * 3 + [levels[..., 1]]))
+    products = levels[..., 0].astype(int) * levels[..., 1]
+    assert np.array_equal(decode_mask(tmp_path / "a.png"), products > products.max() / 2)
+
+
+def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
+    mask, photo = tmp_path / "mask.png", tmp_path / "photo.jpg"
+    write(mask, np.full((6000, 6000), 255, np.uint8))
+    photo.write_bytes(bytes(1_000_000))
+    with refuses(SceneError, mask, "6000 x 6000", "72 MB"):
+        decode_mask(mask)
+    assert decode_mask(mask, photo).all()

@@ -14,7 +14,7 @@ from tiny_scene import make_tiny
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import read_cameras, read_ply, write_gaussians
-from gsmerge.io.cameras.embedded import EMBEDDED, LINE, MAX_TEXT, PREFIX, camera_comments, holds_cameras
+from gsmerge.io.cameras.embedded import EMBEDDED, LINE, PREFIX, camera_comments, holds_cameras
 from gsmerge.types import Cameras
 
 TINY = make_tiny()
@@ -73,7 +73,7 @@ def wrap(content: bytes) -> list[str]:
         wrap(zlib.compress(b'{"frames": 3}')),
         wrap(zlib.compress(b'{"frames": []}')),
         wrap(zlib.compress(b"[" * 100_000)),
-        wrap(zlib.compress(b" " * (MAX_TEXT + 1))),
+        wrap(zlib.compress(b" " * (32 << 20))),
         camera_comments(CAMERAS, TINY.names)[:-1] or [PREFIX + camera_comments(CAMERAS, TINY.names)[0][-100:]],
     ],
     ids=["letters", "packed", "text", "list", "number", "none", "deep", "bomb", "cut"],

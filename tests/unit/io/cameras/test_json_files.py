@@ -104,7 +104,7 @@ def test_a_bare_list_is_opencv_and_may_lack_intrinsics(tmp_path: Path, tiny: Tin
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "images/a b/2.png", "EQUIRECTANGULAR"),
         ({"k4": 0.1}, "images/a b/2.png", "k4"),
-        ({"fl_x": -3}, "images/a b/2.png", -3), ({"fl_x": "wide"}, "images/a b/2.png", "'wide'"),
+        ({"fl_x": -3}, "images/a b/2.png", -3), ({"fl_x": "wide"}, "", "'wide'"),
         ({"w": 1e999}, "images/a b/2.png", "infinity"), ({"h": -14}, "", "20 x -14"),
         ({"cx": float("nan")}, "images/a b/2.png", "NaN"), ({"frames": []}, "", "camera"),
         ({"frames": {"a": 1}}, "", "'frames'"),

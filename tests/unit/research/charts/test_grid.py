@@ -100,6 +100,7 @@ def test_toml_files(tmp_path: Path) -> None:
     [
         ("{", ("grid.json", "TOML", "JSON")), ("[]", ("grid.json", "table")), ('{"kk": [1]}', ("grid.json", "kk")),
         ('{"views": [0]}', ("grid.json: views", 0)), ('{"views": [[1]]}', ("grid.json: views", 1)),
+        ('{"methods": [1]}', ("grid.json: methods", 1)),
     ],
 )  # fmt: skip
 def test_files_that_hold_no_grid(text: str, named: tuple[object, ...], tmp_path: Path) -> None:

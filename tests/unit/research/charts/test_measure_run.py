@@ -16,6 +16,7 @@ from experiments import make_record
 import gsmerge
 from gsmerge.batch import BatchOptions
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
+from gsmerge.io.jsonl import append_line
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.measure_run import (
     SEGMENTATIONS,
@@ -26,7 +27,6 @@ from gsmerge.research.charts.measure_run import (
     proxy_psnr,
     read_runs,
 )
-from gsmerge.runtime.jsonl import append_line
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import CompactOptions
 

@@ -10,11 +10,11 @@ import pytest
 from messages import refuses
 
 from gsmerge.errors import SceneError
-from gsmerge.runtime.jsonl import append_line, each_line
+from gsmerge.io.jsonl import append_line, each_line
 
 APPEND = """
 import pathlib, sys
-from gsmerge.runtime.jsonl import append_line
+from gsmerge.io.jsonl import append_line
 for number in range(25):
     append_line(pathlib.Path(sys.argv[1]), {"name": sys.argv[2], "number": number, "padding": "x" * 5000})
 """
@@ -56,7 +56,7 @@ def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> N
     code = f"""
 import resource, pathlib
 from gsmerge.errors import SceneError
-from gsmerge.runtime.jsonl import append_line
+from gsmerge.io.jsonl import append_line
 resource.setrlimit(resource.RLIMIT_FSIZE, ({len(whole) + 20}, {len(whole) + 20}))
 try:
     append_line(pathlib.Path({str(path)!r}), {{"text": "x" * 100}})
@@ -112,3 +112,9 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with refuses(SceneError, "lines.jsonl", "File exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})
+
+
+def test_a_line_of_more_values_than_its_bytes_allow_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "lines.jsonl"
+    path.write_text('{"a": 1}\n{"b": [' + "[]," * 2_000_000 + "[]]}\n")
+    assert [value for _, value in each_line(path)] == [{"a": 1}, None]

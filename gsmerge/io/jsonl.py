@@ -13,27 +13,32 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
-    """Yield, for each complete line from byte ``start`` on, the position after it and its value (None if damaged)."""
+    """Yield, for each complete line from byte ``start`` on, the position after it and its value (None if damaged).
+
+    A line whose value takes more memory than the file allows counts as damaged.
+    """
     if not path.exists():
         return
+    budget = read_budget(path)
     try:
         with path.open("rb") as file:
             end = file.seek(start)
             for line in file:
                 if line.endswith(b"\n"):
                     end += len(line)
-                    yield end, _parse(line)
+                    yield end, _parse(line, budget)
     except OSError as error:
         raise SceneError(path, f"cannot be read ({error.strerror})") from error
 
 
-def _parse(line: bytes) -> dict[str, Any] | None:
+def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
     try:
-        value = json.loads(line)
-    except (ValueError, RecursionError):
+        value = parse_json(line.decode("utf-8"), budget)
+    except (ValueError, SceneError):
         return None
     return value if isinstance(value, dict) else None
 
