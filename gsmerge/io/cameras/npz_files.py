@@ -25,6 +25,7 @@ _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz``
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
+READ_ARRAYS = frozenset((*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS, "c2w", "K", "order"))
 _MAX_INTRINSIC, _SMALL = 1e12, 1e-9
 _FREE_BYTES = 64 << 20  # an array of that size is read however well it is compressed
 _MAX_RATIO = 100  # of unpacked to packed bytes; photos and depth maps reach 20

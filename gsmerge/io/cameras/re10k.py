@@ -11,7 +11,7 @@ import pickle
 import struct
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from math import prod
@@ -52,7 +52,15 @@ def read_re10k(source: CameraSource) -> StoredCameras:
         keys = ", ".join(str(entry.get("key"))[:40] for entry in entries[:3])
         problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
         raise SceneError(path, problem, "name the .ply as its scene is named")
-    entry = entries[0] if len(entries) == 1 else named[0]
+    return _read_scene(path, entries[0] if len(entries) == 1 else named[0])
+
+
+def read_scenes(path: Path) -> Iterator[StoredCameras]:
+    """Read the cameras and photos of all scenes of a chunk, one after the other, as :func:`read_re10k`."""
+    return (_read_scene(path, entry) for entry in _load(path))
+
+
+def _read_scene(path: Path, entry: Mapping[str, Any]) -> StoredCameras:
     rows = _rows(path, entry.get("cameras"))
     names = [f"view {i}" for i in range(len(rows))]
     photos = _photos(path, entry.get("images"), names)
