@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,6 +13,7 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
+from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import as_pinholes, to_cameras
 from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.embedded import holds_cameras
@@ -90,10 +92,12 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    if path.is_dir() and list_plys(path):
+    is_folder = os.path.isdir(path)
+    if is_folder and list_plys(path):
         return _read_scene(path)
-    if path.is_dir() or suffix in CAMERAS:
+    if is_folder or suffix in CAMERAS:
         return _read_cameras(path)
+    check_file(path)
     if suffix not in SCENE_SUFFIXES:
         endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
         raise SceneError(path, f"expected one of {endings}, found another kind of file", "it is not checked")
@@ -198,7 +202,7 @@ def _read_gsm(path: Path) -> FileCheck:
     try:
         stored = load_stored(path)
     except SceneError as error:
-        problems.append(error.problem)
+        problems.append(_problem(error, path))
         return FileCheck(str(path), "", problems=tuple(problems), notes=notes)
     kind = "encoded scene" if isinstance(stored, Encoded) else "state"
     return FileCheck(str(path), kind, len(stored), problems=tuple(problems), notes=notes)
