@@ -40,7 +40,7 @@ from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 from gsmerge.io.cameras.embedded import PREFIX, camera_comments
 
-COUNT, MANY = 6, 200  # mutations of a kind
+COUNT, MANY = 6, 60  # mutations of a kind
 LIMITS = Limits(1 << 30, 100)
 EXACT = any_of(change_bytes, change_words)
 
