@@ -109,7 +109,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
 
 def read_all_cameras(path: Path) -> Iterator[CameraFile]:
     """Read the cameras of a path as :func:`read_cameras`; of a ``.torch`` chunk, those of each of its scenes."""
-    if path.suffix.lower() == CHUNK and not os.path.isdir(path):
+    if path.suffix.lower() == CHUNK and os.path.isfile(path):
         yield from (_RE10K.convert(path, scene) for scene in read_scenes(path))
     else:
         yield read_cameras(path)
