@@ -20,15 +20,13 @@ import json
 import os
 import random
 import re
-import resource
 import shutil
-import signal
 import sys
 import tempfile
-import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -36,8 +34,11 @@ os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "helpers"))
 
+import forked_commands
 import numpy as np
+from forked_commands import Outcome
 from hostile import CASES, MARKER, array_files, camera_models, ply_files
 from hostile.case import cameras_of
 from hostile.changes import (
@@ -61,7 +62,7 @@ from gsmerge.cli import main as command
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 1000
-SECONDS, MEMORY = 100, 3 << 30  # limits of a process: of processor time; address space, bytes
+LIMITS = forked_commands.Limits(3 << 30, 100)
 TIMES_INPUT, SLACK = 3, 32 << 20  # memory beyond the sound run's: times the input, and what differs by chance
 CODES = (0, 2, 3, 4, 5)
 FAST = ("--effort", "draft", "--set", "fit_steps=4", "--threads", "1", "--set", "checkpoint=none")
@@ -193,48 +194,9 @@ def _write_cameras(folder: Path) -> None:
             (place / name / f"{part}.{suffix}").write_bytes(data)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a process did."""
-
-    code: int  # exit code, or minus the signal that ended it
-    err: str
-    peak: int  # bytes beyond those of the process that it was forked from
-    seconds: float  # of processor time
-
-
-def run_forked(words: list[str], place: Path) -> Outcome:
+def run_forked(words: list[str]) -> Outcome:
     """The command in a child of this process, in limits."""
-    base = _memory()[1]
-    pid = os.fork()
-    if pid == 0:
-        code = 99
-        try:
-            _limit(place)
-            code = command(words)
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    _, status, usage = os.wait4(pid, 0)
-    err = (place / "err").read_text(errors="backslashreplace")
-    peak = (usage.ru_maxrss << 10) - base
-    return Outcome(os.waitstatus_to_exitcode(status), err, peak, usage.ru_utime + usage.ru_stime)
-
-
-def _limit(place: Path) -> None:
-    for number, name in ((1, "out"), (2, "err")):
-        descriptor = os.open(place / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666)
-        os.dup2(descriptor, number)
-    resource.setrlimit(resource.RLIMIT_AS, (_memory()[0] + MEMORY,) * 2)
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
-
-
-def _memory() -> list[int]:
-    """Address space and resident memory of this process, bytes."""
-    return [int(pages) * resource.getpagesize() for pages in Path("/proc/self/statm").read_text().split()[:2]]
+    return forked_commands.run_forked(partial(command, words), LIMITS)
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -259,7 +221,7 @@ def try_kind(name: str, inputs: Path, place: Path, rng: random.Random | None) ->
     if name in STARTED_FROM:
         shutil.copytree(folder / STARTED_FROM[name], out, dirs_exist_ok=True)
     before, earlier = contents(folder), contents(out)
-    outcome = run_forked(kind.words(folder, out), place)
+    outcome = run_forked(kind.words(folder, out))
     faults = _check_end(outcome)
     if contents(folder) != before:
         faults.append("the input has changed")
@@ -273,7 +235,7 @@ def try_case(name: str, scene: Path, place: Path) -> list[str]:
     folder, case = Path(shutil.copytree(scene, place / "in" / "scene")), CASES[name]
     words = [str(word) for word in case.spoil(folder) or [folder]]
     before = sizes(folder.parent)
-    outcome = run_forked(["compact", "--quiet", *FAST, *(["--"] if words[0].startswith("-") else []), *words], place)
+    outcome = run_forked(["compact", "--quiet", *FAST, *(["--"] if words[0].startswith("-") else []), *words])
     codes = {*case.codes, 3} if 0 in case.codes else case.codes  # the table's are those of a plan
     faults = _check_end(outcome) + ([f"exit code {outcome.code}"] if outcome.code not in codes else [])
     if outcome.code and sizes(folder.parent) != before:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,18 +13,26 @@ from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, find_cameras, read_sharp_camera
+from gsmerge.io.bounds import check_file
+from gsmerge.io.cameras.camera_file import as_pinholes, to_cameras
+from gsmerge.io.cameras.colmap import is_colmap
+from gsmerge.io.cameras.embedded import holds_cameras
+from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
+from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, read_all_cameras, read_sharp_camera
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import FileInfo, degree_notes, read_level
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
-from gsmerge.scene.files import find_plys, list_plys
+from gsmerge.scene.files import find_scene_files, list_plys
+from gsmerge.scene.no_gaussians import check_scene_file
+from gsmerge.scene.read import load_files
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
-ARCHIVES = (".sog", ".npz")
+ARCHIVES = (".sog", ".npz", CHUNK)
 
 
 @dataclass(frozen=True)
@@ -35,7 +46,9 @@ class FileCheck:
     layout: str = ""  # of the columns or of the cameras' file
     file_bytes: int = 0
     problems: tuple[str, ...] = ()  # one sentence each, without a full stop
-    notes: tuple[str, ...] = ()  # what is odd, and not wrong
+    notes: tuple[str, ...] = ()  # what is odd, and not wrong, and what was not read
+    num_views: int = 0  # cameras of a scene's folder
+    num_photos: int = 0  # and their photos
 
     @property
     def line(self) -> str:
@@ -46,24 +59,29 @@ class FileCheck:
         unit = units.get(self.kind)
         size = f", {human_bytes(self.file_bytes)}" if self.file_bytes else ""
         layout = f", {self.layout}" if self.layout else ""
-        return f"ok     {self.path}: {self.count:,} {unit or f'groups, {self.kind}'}{layout}{size}"
+        views = f", {self.num_views:,} cameras, {self.num_photos:,} photos" if self.num_views else ""
+        return f"ok     {self.path}: {self.count:,} {unit or f'groups, {self.kind}'}{layout}{views}{size}"
 
 
 def check_content(path: Path) -> FileCheck:
-    """Read a file of Gaussians, cameras or networks, or a ``.gsm``, to its end, and check its content.
+    """Read a file of Gaussians, cameras or networks, a ``.gsm`` or a scene to its end, and check its content.
 
-    The ending says which it is; a folder has the cameras of a COLMAP model. UsageError if a package
-    is missing.
+    The ending says which it is; a folder has a scene, which is read as ``compact`` reads it, or cameras. UsageError if
+    a package is missing.
     """
     try:
         file_check = _read(path)
     except SceneError as error:
-        problem = str(error).removeprefix(f"{path}: ")
-        return FileCheck(str(path), "", problems=(problem,))
+        return FileCheck(str(path), "", problems=(_problem(error, path),))
     damaged = _damaged_member(path) if path.suffix.lower() in ARCHIVES else None
     problems = (*file_check.problems, *([damaged] if damaged else []))
     size = 0 if path.is_dir() else path.stat().st_size
     return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
+
+
+def _problem(error: SceneError, path: Path) -> str:
+    """Describe an error, with its file if that is another than ``path``."""
+    return str(error).removeprefix(f"{path}: ")
 
 
 def _read(path: Path) -> FileCheck:
@@ -74,38 +92,88 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    if path.is_dir() and list_plys(path):  # a scene
+    is_folder = os.path.isdir(path)
+    if is_folder and list_plys(path):
         return _read_scene(path)
-    if path.is_dir() or suffix in CAMERAS:
-        cameras = read_cameras(path)
-        return FileCheck(str(path), "cameras", len(cameras), cameras.source)
+    if is_folder or suffix in CAMERAS:
+        return _read_cameras(path)
+    check_file(path)
     if suffix not in SCENE_SUFFIXES:
         endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
         raise SceneError(path, f"expected one of {endings}, found another kind of file", "it is not checked")
-    info = read_gaussians(path).info
+    file_check = _read_gaussians(path)
+    beside: list[Path | None] = []
+    with suppress(SceneError):  # of another file
+        files = find_scene_files(path)
+        beside = [files.cameras, files.images, files.masks]
+    names = [place.name for place in beside if place not in (None, path)]
+    return replace(file_check, notes=(*file_check.notes, *_not_read(names, " beside it")))
+
+
+def _read_gaussians(path: Path) -> FileCheck:
+    """Read a file of Gaussians, with the cameras inside it."""
+    check_scene_file(path)
+    info, suffix = read_gaussians(path).info, path.suffix.lower()
     problems = _problems(info)
     if suffix == ".spz":
         problems += [problem for problem in [spz.problem_at_end(path)] if problem]
     elif suffix == ".ply":
+        if holds_cameras(path):
+            pinholes, *_ = as_pinholes(read_cameras(path), None)
+            to_cameras(pinholes)
         read_sharp_camera(path)
         left = ply.bytes_after_rows(path)
         behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
         problems += [behind] if left else []
-    notes = [*(note for note in file_notes(info) if "opacit" in note), *degree_notes(info)]
-    facts = (str(path), "Gaussians", info.count, info.layout)
-    return FileCheck(*facts, problems=tuple(problems), notes=tuple(notes))
+    notes = (*(note for note in file_notes(info) if "opacit" in note), *degree_notes(info))
+    return FileCheck(str(path), "Gaussians", info.count, info.layout, info.file_bytes, tuple(problems), notes)
 
 
 def _read_scene(path: Path) -> FileCheck:
-    """Read the Gaussians of a folder, of all parts if it has several, and its cameras."""
-    cameras_path, plys = find_cameras(path), find_plys(path)
-    if cameras_path is not None:
-        read_cameras(cameras_path, scene=plys[0].stem)
-    parts = [_read(ply) for ply in plys]
-    starts = [f"{ply.name}: " if len(plys) > 1 else "" for ply in plys]
+    """Read the Gaussians of a folder, of all parts if it has several, and its cameras and photos as they fit them."""
+    files = find_scene_files(path)
+    parts = [_read_gaussians(ply) for ply in files.plys]
+    starts = [f"{ply.name}: " if files.parts else "" for ply in files.plys]
     problems = [start + text for start, part in zip(starts, parts, strict=True) for text in part.problems]
-    count, notes = sum(part.count for part in parts), tuple(dict.fromkeys(note for p in parts for note in p.notes))
-    return replace(parts[0], path=str(path), count=count, problems=tuple(problems), notes=notes)
+    notes = [note for part in parts for note in part.notes]
+    scene = replace(
+        parts[0], path=str(path), count=sum(part.count for part in parts),
+        file_bytes=sum(part.file_bytes for part in parts),
+    )  # fmt: skip
+    try:
+        load = load_files(files)
+    except SceneError as error:
+        problems.append(_problem(error, path))
+    else:
+        notes += [note for note in load.notes if note not in file_notes(load.info)]
+        photos = load.views.images
+        scene = replace(scene, num_views=len(load.views.cameras), num_photos=0 if photos is None else len(photos))
+    return replace(scene, problems=tuple(problems), notes=tuple(dict.fromkeys(notes)))
+
+
+def _read_cameras(path: Path) -> FileCheck:
+    """Read the cameras of a file, of all scenes if it has several, or of a folder."""
+    count, notes = 0, list[str]()
+    for cameras in read_all_cameras(path):
+        count += len(cameras)
+    source, place = cameras.source, Path(cameras.path)
+    if path.is_dir() and not is_colmap(path):
+        notes.append("the folder has no Gaussians: its cameras alone were read")
+    if place.is_dir():
+        ending = ".bin" if source == "COLMAP binary" else ".txt"
+        read = {f"{name}{ending}" for name in ("cameras", "images")}
+        others = sorted(file.name for file in place.iterdir() if file.suffix in (".bin", ".txt"))
+        notes += _not_read([name for name in others if name not in read])
+    elif place.suffix == ".npz":
+        read_depths(place)
+        notes += _not_read(sorted(array_names(place) - READ_ARRAYS), " but for their checksums")
+    return FileCheck(str(path), "cameras", count, source, notes=tuple(notes))
+
+
+def _not_read(names: Sequence[str], remark: str = "") -> list[str]:
+    """Make a note of what was not read; none where that is nothing."""
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return [f"not read{remark}: {', '.join(names[:4])}{more}"] if names else []
 
 
 def _read_levels(path: Path) -> FileCheck:
@@ -135,7 +203,7 @@ def _read_gsm(path: Path) -> FileCheck:
     try:
         stored = load_stored(path)
     except SceneError as error:
-        problems.append(error.problem)
+        problems.append(_problem(error, path))
         return FileCheck(str(path), "", problems=tuple(problems), notes=notes)
     kind = "encoded scene" if isinstance(stored, Encoded) else "state"
     return FileCheck(str(path), kind, len(stored), problems=tuple(problems), notes=notes)

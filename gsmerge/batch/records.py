@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
+from gsmerge.io.bounds import check_file
 from gsmerge.io.jsonl import each_line
 from gsmerge.report import csv_text, document_head, file_sha256, human_bytes, text_table
 
@@ -133,7 +134,10 @@ def check_folder(folder: Path) -> None:
     """Make the output folder, and check that records can be written to it; SceneError if not."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / RECORDS).open("ab"):
+        records = folder / RECORDS
+        if records.exists():
+            check_file(records)  # a pipe waits for its reader
+        with records.open("ab"):
             pass
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"

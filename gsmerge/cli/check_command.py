@@ -12,8 +12,8 @@ from gsmerge.errors import SceneError
 
 @opt.command(
     opt.argument("paths", list[Path], "FILE...", "Files of Gaussians (.ply, .spz, .sog, .splat, .glb), "
-                 "cameras (.json, .npz, ..., a COLMAP folder), .gsm files, and networks "
-                 "(.safetensors)."),
+                 "cameras (.json, .npz, ..., a COLMAP folder), .gsm files, networks (.safetensors), "
+                 "and folders of scenes, with their cameras and photos."),
 )  # fmt: skip
 def check(args: opt.Args) -> None:
     """Read files to their ends and say what is wrong: counts, NaN, ranges, checksums."""

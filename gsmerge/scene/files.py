@@ -207,10 +207,13 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
             raise SceneError(folder, problem, "add it, or name one of the files")
     elif plys[0].parent.name == SCENES_PLACE or not _has_camera_each(plys, cameras):
         return None
-    with suppress(SceneError):
-        if not any(holds_cameras(path) or read_sharp_camera(path) is not None for path in plys):
-            return [numbers[number] for number in ordered]
-    return None
+    return None if any(map(_has_own_camera, plys)) else [numbers[number] for number in ordered]
+
+
+def _has_own_camera(path: Path) -> bool:
+    with suppress(SceneError):  # which reading the part raises again
+        return holds_cameras(path) or read_sharp_camera(path) is not None
+    return False
 
 
 def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:

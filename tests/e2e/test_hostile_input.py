@@ -1,28 +1,33 @@
-"""Every hostile input ends in a result or in one clear line: in bounded time and memory, and nothing is executed."""
+"""Every hostile input ends in a result or in one clear line: in bounded time and memory, and nothing is executed.
+
+Each runs in a process of its own. What ``compact`` refuses, ``check`` refuses by the same line.
+"""
 
 from __future__ import annotations
 
 import json
-import os
-import resource
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import cv2
 import pytest
-from hostile import CASES, MARKER, Case
+from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_check, run_forked
+from hostile import CASES, MARKER
 from messages import ERROR, names
 from tiny_scene import edited_json
 
 from .conftest import Run, listing
 
-SECONDS = 100  # of processor time; what never ends takes more
-BYTES = 2**30
+FREE_MEMORY, MEMORY_PER_BYTE = 64e6, 20  # the budget of a reader, as SECURITY.md has it
+FREE_SECONDS, SECONDS_PER_BYTE = 5, 2e-6
+MEMORY_MARGIN, SECONDS_MARGIN = 2, 10  # a scene is read, and its rows are placed; a slow machine
+MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more than a machine has
+OPTIONS = {"-o", "--images"}  # what they name is nothing for ``check``
+FOR_OTHER_REASONS = ("nothing where the scene was", "the ply as cameras")  # sound files of another kind than expected
+SLOW = ("transforms.json: 3000 frames", "glb: nodes in one another")  # seconds of processor time
 
 COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",
              "rotations 1e38")  # fmt: skip
@@ -31,28 +36,14 @@ COMPACTED = tuple(f"ply: {name}" for name in COMPACTED)
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 
 
-class TooLong(BaseException):
-    """The time is over; no reader can take this for an error of its own."""
+def limits(num_bytes: int) -> Limits:
+    """Far more than a reader of so many bytes may take."""
+    seconds = SECONDS_MARGIN * (FREE_SECONDS + SECONDS_PER_BYTE * num_bytes)
+    return Limits(MOST_MEMORY + min(MEMORY_PER_BYTE * num_bytes, MOST_MEMORY), min(seconds, MOST_SECONDS))
 
 
-@contextmanager
-def limits() -> Iterator[None]:
-    """A block that may take so many seconds of processor time, and so much memory on top of what is in use."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-
-    def stop(*_: object) -> None:
-        raise TooLong
-
-    handler = signal.signal(signal.SIGPROF, stop)
-    resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, before[1]))
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        resource.setrlimit(resource.RLIMIT_AS, before)
-        signal.signal(signal.SIGPROF, handler)
+def size_of(folder: Path) -> int:
+    return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +54,12 @@ def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPa
     return folder
 
 
-@pytest.fixture(scope="module", autouse=True)
-def warm(small_scene: Path) -> None:
-    """What is loaded once is loaded before memory is limited."""
-    from gsmerge.cli import main
-
-    assert main(["compact", str(small_scene), "--dry-run"]) == 0
+@pytest.fixture(scope="module")
+def server(small_scene: Path) -> Iterator[CommandServer]:
+    """A process that has imported what the commands need."""
+    ply = small_scene / "scene.ply"
+    with CommandServer([("compact", small_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
+        yield server
 
 
 @pytest.fixture
@@ -85,41 +76,47 @@ def one_line(err: str) -> None:
     assert "unexpected" not in err.split(":")[2]
 
 
-def sweep(cases: dict[str, Case]) -> list[Any]:
-    """One in four by default and those with a text, all with -m slow: a tenth of a second each."""
-    late = [i % 4 and not case.says for i, case in enumerate(cases.values())]
-    return [pytest.param(name, marks=[pytest.mark.slow] * bool(slow)) for name, slow in zip(cases, late, strict=True)]
+def within_budget(outcome: Outcome, num_bytes: int) -> None:
+    """Check that a command ended by itself, had the memory it asked for, and took no more than its readers may."""
+    assert outcome.code in (0, 2, 3), outcome
+    budget = MEMORY_MARGIN * (FREE_MEMORY + MEMORY_PER_BYTE * num_bytes)
+    assert outcome.peak < budget, f"{outcome.peak / 1e6:.0f} MB of {budget / 1e6:.0f}"
+    assert "out of memory" not in outcome.err or budget > MOST_MEMORY
+    if outcome.code:
+        assert outcome.out == ""
+        one_line(outcome.error)
 
 
-@pytest.mark.parametrize("name", sweep(CASES))
-def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, run: Run) -> None:
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, server: CommandServer) -> None:
     case = CASES[name]
     arguments = [str(argument) for argument in case.spoil(scene) or [scene]]
-    if arguments[0].startswith("-"):
-        arguments.insert(0, "--")
-    before = listing(scene.parent)
-    with limits():
-        outcome = run("compact", *([] if case.says else ["--dry-run"]), *arguments)
+    end_of_options = ["--"] * arguments[0].startswith("-")
+    before, num_bytes = listing(scene.parent), size_of(scene.parent)
+    words = ["compact", *([] if case.says else ["--dry-run"]), *end_of_options, *arguments]
+    outcome = server.run(words, limits(num_bytes))
+    within_budget(outcome, num_bytes)
     assert outcome.code in case.codes, outcome.err
     assert not list(scene.parent.rglob(MARKER))
     assert listing(scene.parent) == before
     if outcome.code == 0:
         assert "gsmerge: warning" not in outcome.err
         return
-    assert outcome.out == ""
-    one_line(outcome.err)
     assert case.named in outcome.err
     assert names(outcome.err, *case.says), outcome.err
+    if outcome.code == 3 and name not in FOR_OTHER_REASONS and not OPTIONS & {*arguments}:
+        files = [argument for argument in arguments if argument != "--cameras"]
+        check = server.run(["check", "--quiet", "--", *files], limits(num_bytes))
+        within_budget(check, num_bytes)
+        refused_by_check(outcome, check)
 
 
 @pytest.mark.parametrize("name", [*list(CASES)[::12], "ply: 600000 rows of one place"])
-def test_hostile_input_can_be_inspected(name: str, scene: Path, run: Run) -> None:
+def test_hostile_input_can_be_inspected(name: str, scene: Path, server: CommandServer) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
-    with limits():
-        actual = run("inspect", "--", arguments[0])
-    assert actual.code in (0, 3), actual.err
-    if actual.code:
-        one_line(actual.err)
+    num_bytes = size_of(scene.parent)
+    outcome = server.run(["inspect", "--", arguments[0]], limits(num_bytes))
+    within_budget(outcome, num_bytes)
     assert not list(scene.parent.rglob(MARKER))
 
 
@@ -133,19 +130,22 @@ def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
 
 
 @pytest.mark.slow
-def test_a_frame_of_67_million_pixels_is_drawn_in_bands(scene: Path, run: Run) -> None:
+def test_a_frame_of_67_million_pixels_is_drawn_in_bands(scene: Path, server: CommandServer) -> None:
     path = Path(shutil.copy(scene / "transforms.json", scene.parent / "path.json"))
     with edited_json(path) as data:
         focal, data["w"], data["h"] = 8190 / data["w"], 8190, 8190
         data |= {name: focal * data[name] for name in ("fl_x", "fl_y")} | {"cx": 4095, "cy": 4095}
         data["frames"] = data["frames"][:1]
-    with limits():
-        run("render", scene, "--path", path, "-o", scene / "out", code=0)
+    words = ["render", str(scene), "--path", str(path), "-o", str(scene / "out")]
+    assert server.run(words, Limits(MOST_MEMORY, MOST_SECONDS)).code == 0
     assert cv2.imread(str(scene / "out" / "frame_00000.png"), cv2.IMREAD_REDUCED_GRAYSCALE_8).shape == (1023, 1023)
 
 
 def test_limits_hold() -> None:
-    with pytest.raises(MemoryError), limits():
-        bytearray(2 * BYTES)
-    with limits():
-        assert len(os.urandom(16)) == 16
+    """A process that takes more ends, however it ends."""
+    limits = Limits(1 << 28, 0.3)
+    assert run_forked(lambda: len(bytearray(1 << 30)), limits).code == FAILED
+    filled = run_forked(lambda: len(bytearray(b"x") * (1 << 26)) >> 26, limits)
+    assert filled.code == 1
+    assert 6e7 < filled.peak < 1.2e8
+    assert run_forked(lambda: sum(iter(int, 1)), limits).code == -signal.SIGPROF

@@ -25,7 +25,7 @@ class Case:
         spoil: Changes a scene's folder; returns the arguments of the command where they are others than the folder.
         codes: The exit codes of ``compact`` that are right.
         named: The file that an error line has to name.
-        says: Values in the error line, as ``messages.names``. A case that has some is in the default run.
+        says: Values in the error line, as ``messages.names``. A case that has some is no dry run.
     """
 
     spoil: Spoil

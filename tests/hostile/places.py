@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import math
 import os
+import re
 import shutil
 import struct
 from collections.abc import Callable, Sequence
@@ -111,6 +113,47 @@ def equal_points(folder: Path) -> Sequence[object]:
     return [folder / "a.spz"]
 
 
+def in_parts(change: Callable[[Path], object]) -> Spoil:
+    """A scene whose views are files of their own, the last of them changed."""
+
+    def spoil(folder: Path) -> None:
+        head, rows = (folder / "scene.ply").read_bytes().split(b"end_header\n", 1)
+        count = len(rows) // (4 * 17 * 3)
+        head = re.sub(rb"element vertex \d+", b"element vertex %d" % count, head)
+        for part in range(3):
+            size = len(rows) // 3
+            content = head + b"end_header\n" + rows[size * part : size * (part + 1)]
+            (folder / f"view_{part:03d}.ply").write_bytes(content)
+        (folder / "scene.ply").unlink()
+        change(folder / "view_002.ply")
+
+    return spoil
+
+
+def pipe(path: Path) -> None:
+    """A pipe in the place of a file."""
+    path.unlink()
+    os.mkfifo(path)
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def not_finite(path: Path) -> None:
+    head, rows = path.read_bytes().split(b"end_header\n", 1)
+    path.write_bytes(head + b"end_header\n" + struct.pack("<f", math.nan) * (len(rows) // 4))
+
+
+def other_columns(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"float nx", b"float n0", 1))
+
+
+def damaged_cameras(path: Path) -> None:
+    """Cameras inside a ``.ply`` that cannot be unpacked."""
+    path.write_bytes(path.read_bytes().replace(b"element", b"comment gsmerge cameras: AAAA\nelement", 1))
+
+
 def many_images(folder: Path) -> None:
     for i in range(500):
         (folder / "images" / f"other_{i}.png").write_bytes(b"")
@@ -142,11 +185,19 @@ for thing, make in {"loop": loop, "ring": ring, "pipe": os.mkfifo, "folder": os.
         said = given("-o", f"{{}}/out.{suffix}", make=lambda f, make=make, suffix=suffix: make(f / f"out.{suffix}"))
         CASES[f"output out.{suffix}, a {thing}"] = Case(said, (0, 2, 3))
 CASES |= {
+    "parts": Case(in_parts(lambda path: None), READ),
+    "a part as a pipe": Case(in_parts(pipe), says=("view_002.ply", "pipe")),
+    "a part as an empty file": Case(in_parts(lambda path: path.write_bytes(b"")), says=("view_002.ply",)),
+    "a part of half its bytes": Case(in_parts(halve), says=("view_002.ply", "384")),
+    "a part of NaN": Case(in_parts(not_finite), EITHER),
+    "a part with other columns": Case(in_parts(other_columns), says=("view_002.ply", "view_000.ply")),
+    "a part with damaged cameras": Case(in_parts(damaged_cameras), EITHER),
     "links to all files": Case(given(make=linked), READ),
     "images in an endless folder": Case(replaced("images", endless), EITHER),
     "an endless folder beside the images": Case(given(make=lambda folder: endless(folder / "images" / "more")), READ),
     "a path of 2000 letters": Case(deep, READ),
     "500 empty images": Case(given(make=many_images), READ),
+    "damaged cameras inside the ply": Case(given(make=lambda f: damaged_cameras(f / "scene.ply")), says=("scene.ply",)),
     "nothing where the scene was": Case(given(make=remove("scene.ply")), says=("scene",)),
     "an image missing": Case(
         given(make=remove("images/view_001.png")), says=("images", "3 images", "found 2", "view_001")

@@ -70,6 +70,9 @@ class CameraFormat:
 
     def cameras(self, source: CameraSource) -> CameraFile:
         """Read the cameras of a file; SceneError if it is damaged or incomplete."""
-        stored = self.read(source)
+        return self.convert(source.path, self.read(source))
+
+    def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
+        """Convert the cameras that a file stores; SceneError if one is none."""
         convention = stored.convention or self.convention
-        return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
+        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)

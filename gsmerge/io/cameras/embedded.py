@@ -14,7 +14,7 @@ import numpy as np
 from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.bounds import ReadBudget, parse_json, read_errors
+from gsmerge.io.bounds import ReadBudget, check_file, parse_json, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.json_files import transforms_document, transforms_views
@@ -55,6 +55,7 @@ def holds_cameras(path: Path) -> bool:
 
 def camera_lines(path: Path) -> list[bytes]:
     """Return the comment lines of a ``.ply`` that hold cameras; empty without any."""
+    check_file(path)
     with read_errors(path), path.open("rb") as file:
         header = file.read(MAX_HEADER_BYTES if file.peek(3)[:3] == b"ply" else 0).partition(b"\nend_header")[0]
     start = f"comment {PREFIX}".encode()

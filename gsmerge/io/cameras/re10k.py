@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import prod
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,6 +52,12 @@ def read_re10k(source: CameraSource) -> StoredCameras:
         problem = f"expected one scene with the key {scene!r}, found {len(named)} among {len(entries)} ({keys}, ...)"
         raise SceneError(path, problem, "name the .ply as its scene is named")
     return _read_scene(budget, entries[0] if len(entries) == 1 else named[0])
+
+
+def read_scenes(path: Path) -> Iterator[StoredCameras]:
+    """Read the cameras and photos of all scenes of a chunk, one after the other, as :func:`read_re10k`."""
+    budget = read_budget(path)
+    return (_read_scene(budget, entry) for entry in _load(budget))
 
 
 def _read_scene(budget: ReadBudget, entry: Mapping[str, Any]) -> StoredCameras:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -33,7 +34,7 @@ from gsmerge.io.cameras.json_files import (
 )
 from gsmerge.io.cameras.npz_files import array_names, holds_poses, is_da3, read_da3, read_dump
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.re10k import read_re10k
+from gsmerge.io.cameras.re10k import read_re10k, read_scenes
 from gsmerge.types import StrPath
 
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
@@ -115,6 +116,14 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     return chosen.cameras(source)
 
 
+def read_all_cameras(path: Path) -> Iterator[CameraFile]:
+    """Read the cameras of a path as :func:`read_cameras`; of a ``.torch`` chunk, those of each of its scenes."""
+    if path.suffix.lower() == CHUNK and os.path.isfile(path):
+        yield from (_RE10K.convert(path, scene) for scene in read_scenes(path))
+    else:
+        yield read_cameras(path)
+
+
 def read_sharp_camera(path: Path) -> CameraFile | None:
     """Read the camera that SHARP writes into its ``.ply``; None without one."""
     source = CameraSource(path)
@@ -171,6 +180,10 @@ _SHARP = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
+_RE10K = CameraFormat(
+    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k, W2C_OPENCV,
+    "divided by the size",
+)  # fmt: skip
 # In the order of trial: the first of a file's ending that recognises it
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(read_colmap, suffix=".bin"),
@@ -197,8 +210,7 @@ CAMERA_FORMATS = (
                  W2C_OPENCV, "pixels, or divided by the size; may be missing", lambda file: is_da3(file.path)),
     CameraFormat("npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3,
                  W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
-    CameraFormat("re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k,
-                 W2C_OPENCV, "divided by the size"),
+    _RE10K,
     CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-for-viewers))", ".ply", read_embedded,
                  C2W_OPENGL, "pixels", lambda file: bool(camera_lines(file.path))),
     _SHARP,

@@ -189,3 +189,10 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pa
         check_folder(tmp_path / "file" / "out")
     check_folder(tmp_path / "new" / "out")
     assert (tmp_path / "new" / "out" / RECORDS).exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes")
+def test_a_pipe_in_the_place_of_the_records_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / RECORDS)
+    with refuses(SceneError, RECORDS, "pipe"):
+        check_folder(tmp_path)

@@ -1,0 +1,221 @@
+"""``gsmerge check`` refuses what other commands refuse, by the same line: mutations of sound files of every kind.
+
+``test_hostile_input.py`` holds the same for the table of hostile inputs.
+"""
+
+from __future__ import annotations
+
+import base64
+import random
+import shutil
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from forked_commands import CommandServer, Limits, refused_by_check
+from hostile import array_files, camera_models, chunks, places
+from hostile.case import cameras_of, without_transforms
+from hostile.changes import (
+    Mutate,
+    any_of,
+    change_bytes,
+    change_json,
+    change_ply_head,
+    change_text,
+    change_words,
+    in_safetensors,
+    inside_gzip,
+    inside_zip,
+    member,
+)
+from messages import noted, says
+
+import gsmerge
+from gsmerge.cli import main
+from gsmerge.file_checks import check_content
+from gsmerge.io.cameras.embedded import PREFIX, camera_comments
+
+COUNT, MANY = 6, 60  # mutations of a kind
+LIMITS = Limits(1 << 30, 100)
+EXACT = any_of(change_bytes, change_words)
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
+
+
+def change_embedded(rng: random.Random, data: bytes) -> bytes:
+    """Cameras in the header of a ``.ply``: their text before it is packed, or its letters."""
+    lines = data.partition(b"end_header")[0].splitlines()
+    start = f"comment {PREFIX}".encode()
+    packed = [line for line in lines if line.startswith(start)]
+    letters = b"".join(line.removeprefix(start) for line in packed)
+    if rng.random() < 0.3:
+        changed = change_bytes(rng, letters).replace(b"\n", b"")
+    else:
+        changed = base64.b64encode(zlib.compress(change_json(rng, zlib.decompress(base64.b64decode(letters)))))
+    first, *others = packed
+    for line in others:
+        data = data.replace(line + b"\n", b"", 1)
+    return data.replace(first, start + changed, 1)
+
+
+def embed(folder: Path) -> None:
+    cameras = gsmerge.read_cameras(folder / "transforms.json")
+    scene = gsmerge.read_scene(folder)
+    without_transforms(folder)
+    lines = "".join(f"comment {line}\n" for line in camera_comments(scene.cameras, cameras.names))
+    path = folder / "scene.ply"
+    path.write_bytes(path.read_bytes().replace(b"element", lines.encode() + b"element", 1))
+
+
+def alone(name: str) -> Callable[[Path], None]:
+    """A file of the Gaussians, with nothing beside it."""
+
+    def make(folder: Path) -> None:
+        gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
+        shutil.rmtree(folder)
+        folder.mkdir()
+        gsmerge.write_gaussians(folder / name, gaussians)
+
+    return make
+
+
+def in_levels(folder: Path) -> None:
+    gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
+    gsmerge.write_levels(folder / "levels" / "lod-meta.json", [gaussians, gaussians[::4]])
+
+
+def of_views(kind: str) -> Callable[[Path], None]:
+    return array_files.saved(kind, lambda arrays, folder: None)
+
+
+def colmap(suffix: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        contents = camera_models.colmap(*cameras_of(folder), text=suffix == "txt")
+        without_transforms(folder)
+        (folder / "sparse").mkdir()
+        for part, data in zip(("cameras", "images"), contents, strict=True):
+            (folder / "sparse" / f"{part}.{suffix}").write_bytes(data)
+
+    return make
+
+
+def encoded(*words: str) -> Callable[[Path], None]:
+    def make(folder: Path) -> None:
+        last = [str(folder) if word == "{}" else str(folder / word) if "." in word else word for word in words]
+        assert main([*last, "--superpixels", "60", "--checkpoint", "none", "--quiet"]) == 0
+
+    return make
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Files of a kind in a scene's folder, one of which is changed, and the command that reads them."""
+
+    pattern: str
+    change: Mutate
+    make: Callable[[Path], Any] = lambda _: None
+    words: tuple[str, ...] = ("compact", "--dry-run", "{}")  # the last is what is checked, {} the folder
+
+
+INSPECT = ("inspect", "levels/lod-meta.json")
+DECODE = ("decode", "-o", "made.ply", "--overwrite")
+KINDS = {
+    "rows": Kind("scene.ply", any_of(EXACT, change_ply_head)),
+    "parts": Kind("view_*.ply", any_of(EXACT, change_ply_head), places.in_parts(lambda path: None)),
+    "cameras inside": Kind("scene.ply", change_embedded, embed),
+    "transforms": Kind("transforms.json", any_of(change_json, change_bytes)),
+    "photos": Kind("images/*.png", change_bytes),
+    "views.npz": Kind("views.npz", any_of(change_bytes, inside_zip(member)), of_views("views.npz")),
+    "results.npz": Kind("results.npz", any_of(change_bytes, inside_zip(member)), of_views("results.npz")),
+    "COLMAP, binary": Kind("sparse/*.bin", EXACT, colmap("bin")),
+    "COLMAP, text": Kind("sparse/*.txt", any_of(change_text, change_bytes), colmap("txt")),
+    "chunk": Kind("*.torch", EXACT, chunks.saved(lambda entry, _: None)),
+    "spz": Kind("a.spz", any_of(change_bytes, inside_gzip(EXACT)), alone("a.spz"), ("inspect", "a.spz")),
+    "sog": Kind("a.sog", any_of(change_bytes, inside_zip(member)), alone("a.sog"), ("inspect", "a.sog")),
+    "splat": Kind("a.splat", EXACT, alone("a.splat"), ("inspect", "a.splat")),
+    "glb": Kind("a.glb", EXACT, alone("a.glb"), ("inspect", "a.glb")),
+    "index": Kind("levels/lod-meta.json", any_of(change_json, change_bytes), in_levels, INSPECT),
+    "chunks": Kind("levels/*/*", EXACT, in_levels, INSPECT),
+    "encoded": Kind("a.gsm", any_of(change_bytes, in_safetensors), encoded("encode", "{}", "-o", "a.gsm"),
+                    (*DECODE, "a.gsm")),
+    "state": Kind("a.gsm", any_of(change_bytes, in_safetensors), encoded("extend", "a.gsm", "{}"), (*DECODE, "a.gsm")),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of 24 x 16 with cameras and images. Read only."""
+    folder = make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=3, width=24, height=16)
+    shutil.rmtree(folder / "targets")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def server(small_scene: Path) -> Iterator[CommandServer]:
+    ply = small_scene / "scene.ply"
+    with CommandServer([("compact", small_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
+        yield server
+
+
+def placed(words: tuple[str, ...], folder: Path) -> list[object]:
+    return [folder if word == "{}" else folder / word if "." in word else word for word in words]
+
+
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", KINDS)
+def test_what_a_command_refuses_check_refuses(
+    name: str, number: int, small_scene: Path, tmp_path: Path, server: CommandServer
+) -> None:
+    kind, rng = KINDS[name], random.Random(f"{name} {number}")
+    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+    kind.make(folder)
+    words = placed(kind.words, folder)
+    assert server.run(words, LIMITS).code == 0
+    assert server.run(["check", words[-1]], LIMITS).code == 0
+    num_refused = 0
+    for _ in range(MANY if number else COUNT):
+        path = rng.choice(sorted(folder.glob(kind.pattern)))
+        sound = path.read_bytes()
+        path.write_bytes(kind.change(rng, sound))
+        refusal = server.run(words, LIMITS)
+        assert refusal.code in (0, 3), refusal
+        if refusal.code == 3:
+            num_refused += 1
+            refused_by_check(refusal, server.run(["check", words[-1]], LIMITS))
+        path.write_bytes(sound)
+    assert num_refused or number == 0
+
+
+def test_what_was_not_read_is_said(small_scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+    whole, alone = check_content(folder), check_content(folder / "scene.ply")
+    assert (whole.num_views, whole.num_photos, whole.problems, whole.notes) == (3, 3, (), ())
+    assert (alone.num_views, alone.count) == (0, whole.count)
+    assert noted(alone.notes, "not read", "transforms.json", "images")
+    of_views("views.npz")(folder)
+    np.savez(folder / "more.npz", **np.load(folder / "views.npz"), confidence=np.ones(3))
+    assert noted(check_content(folder / "more.npz").notes, "not read", "confidence")
+    assert not check_content(folder / "views.npz").notes
+    (folder / "scene.ply").unlink()
+    assert noted(check_content(folder).notes, "no Gaussians")
+
+
+def test_all_scenes_of_a_chunk_are_read(small_scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+
+    def twice(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
+        return [entry, {**entry, "key": "other"}]
+
+    def damaged(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
+        return [entry, {**entry, "key": "other", "images": entry["images"][:2]}]
+
+    chunks.saved(twice)(folder)
+    assert check_content(folder / chunks.NAME).count == 6
+    shutil.copy(small_scene / "transforms.json", folder)
+    chunks.saved(damaged)(folder)
+    assert says(check_content(folder / chunks.NAME).problems[0], "", "3 images", "found 2")
