@@ -78,7 +78,7 @@ def test_indices_outside_their_arrays_are_refused(box):
         count_boxes(np.array([box], np.int16), 2, 2, np.zeros(9, np.int64), np.zeros(4, np.int64))
 
 
-@pytest.mark.parametrize("cursor", [-1, 1, 1 << 62])
+@pytest.mark.parametrize("cursor", [-1, 1, 1 << 62, 2**63 - 1])
 def test_a_cursor_outside_the_list_is_refused(cursor):
     cursors, flatten_ids = np.full(4, cursor), np.zeros(1, np.int32)
     with refuses(ValueError, "deal_tiles", "indices"):

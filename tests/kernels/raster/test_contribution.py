@@ -119,7 +119,7 @@ def test_chains_that_do_not_end_are_refused(pairs: list[tuple[float, float, floa
     heads, active, counts = np.zeros(1, np.int32), np.zeros(2, np.int32), np.array([num_pairs, 1, 0])
     totals, seen = np.zeros(num_labels), np.empty(num_labels, np.int32)
     values, owners = np.zeros(1, np.float32), np.zeros(1, np.int32)
-    with pytest.raises(ValueError, match="settle_row: .*indices"):
+    with pytest.raises(ValueError, match=r"settle_row: .*indices"):
         settle_row(
             0, np.zeros((1, 8), np.float32), heads, rows, rows.copy(), active, totals, seen, values, owners, counts
         )
@@ -128,7 +128,7 @@ def test_chains_that_do_not_end_are_refused(pairs: list[tuple[float, float, floa
 @pytest.mark.parametrize(("line", "tile_width"), [(2**63 - 1, 1), (2**62, 2), (0, 2**63 - 1), (-1, 1)])
 def test_rows_of_tiles_that_no_picture_has_are_refused(line: int, tile_width: int) -> None:
     labels, ids, counts = np.zeros((1, 1), np.int32), np.zeros(1, np.int32), np.zeros(3, np.int64)
-    with pytest.raises(ValueError, match="add_row: (line|tile_width)"):
+    with pytest.raises(ValueError, match=r"add_row: (line|tile_width)"):
         add_row(
             np.zeros((1, 8), np.float32), ids, np.array([0, 1]), tile_width, line, labels, ids.copy(),
             np.empty((1, 3)), np.zeros(2, np.int32), np.full(1, -1, np.int32), counts,

@@ -122,7 +122,7 @@ def test_nothing_in_view(count: int) -> None:
 def test_starts_of_another_length_are_refused(more: int) -> None:
     entries = (np.zeros(more, np.int64), np.zeros(1, np.uint8), np.zeros(1, np.float32), np.zeros(1, np.int32))
     lists, rows = (*entries, np.array([0, 1]), 1), np.zeros((1, 4), np.float32)
-    with pytest.raises(ValueError, match="spread: .*indices"):
+    with pytest.raises(ValueError, match=r"spread: .*indices"):
         spread(*lists, rows, rows[None].copy())
-    with pytest.raises(ValueError, match="collect: .*indices"):
+    with pytest.raises(ValueError, match=r"collect: .*indices"):
         collect(*lists, rows[None], np.zeros((1, 4)))
