@@ -4,10 +4,10 @@ Three runs, each on a library of its own in a temporary folder:
 
 - The kernels' tests under the address and undefined-behaviour sanitizers, with the plugin ``mutated_calls``: every
   function is also called with changed arguments.
-- All commands, and hostile inputs through them, under the same.
-- Two fits on four threads under the thread sanitizer. Its library is loaded before Python's, and only the kernels are
-  made for it: it sees their reads and writes, and the locks of all others. So that silence means something, two threads
-  first write one array, which it has to report.
+- All commands, hostile inputs, and compacting in three ways, under the same.
+- The three ways under the thread sanitizer, on four threads. Its library is loaded before Python's, and only the
+  kernels are made for it: it sees their reads and writes, and the locks of all others. So that silence means something,
+  two threads first write one array, which it has to report.
 
 Arguments are passed to pytest in place of the tests below, under the first two sanitizers.
 """
@@ -30,6 +30,8 @@ COMMANDS = ("tests/e2e/test_every_command.py", "tests/e2e/test_hostile_input.py"
 FLAGS = ("-fno-omit-frame-pointer", "-g", "-O1", "-w")
 MEMORY = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", *FLAGS)
 THREADS = ("-fsanitize=thread", *FLAGS)
+PYTHON = ("setarch", "-R", sys.executable)  # the thread sanitizer's memory has a fixed place
+WAYS = ((), ("--effort", "draft"), ("--fit", "none"))
 RACE = 66  # exit code of a process with a report of the thread sanitizer
 
 WRITE_ONE_ARRAY = """
@@ -75,25 +77,26 @@ def check_memory(folder: Path, runs: tuple[tuple[str, ...], ...]) -> bool:
     pytest = (sys.executable, "-m", "pytest", "-q", "-n0", "--capture=sys")  # reports are seen, not captured
     calls = [subprocess.Popen([*pytest, *run], cwd=ROOT, env=env) for run in runs]
     codes = [call.wait() for call in calls]
+    codes += compact(folder, env)
     print(f"memory: exit codes {codes}", flush=True)
     return not any(codes)
 
 
-def check_threads(folder: Path) -> bool:
-    """Run fits on several threads under the thread sanitizer -> whether all is well."""
-    env = environment(folder, THREADS, "libtsan.so")
-    env["TSAN_OPTIONS"] = f"ignore_noninstrumented_modules=1:exitcode={RACE}"
-    python = ("setarch", "-R", sys.executable)  # the sanitizer's memory has a fixed place
-    race = subprocess.run([*python, "-c", WRITE_ONE_ARRAY], env=env, capture_output=True, check=False).returncode
-    print(f"threads: writing one array at once gives exit code {race}, expected {RACE}", flush=True)
+def compact(folder: Path, env: dict[str, str]) -> list[int]:
+    """Make a scene and compact it on four threads in all ways -> exit codes."""
     sizes = ("--views", "3", "--width", "96", "--height", "64")
     subprocess.run([sys.executable, "examples/01_make_scene.py", folder / "scene", *sizes], cwd=ROOT, check=True)
-    compact = (*python, "-m", "gsmerge", "compact", folder / "scene", "--threads", "4", "--quiet")
-    codes = [
-        subprocess.run([*compact, "-o", folder / f"{fit}.ply", "--fit", fit], env=env, check=False).returncode
-        for fit in ("full", "none")
-    ]
-    print(f"threads: two fits give exit codes {codes}", flush=True)
+    call = (*PYTHON, "-m", "gsmerge", "compact", folder / "scene", "-o", folder / "small.ply", "--overwrite", "--quiet")
+    return [subprocess.run([*call, "--threads", "4", *way], env=env, check=False).returncode for way in WAYS]
+
+
+def check_threads(folder: Path) -> bool:
+    """Compact on several threads under the thread sanitizer -> whether all is well."""
+    env = environment(folder, THREADS, "libtsan.so")
+    env["TSAN_OPTIONS"] = f"ignore_noninstrumented_modules=1:exitcode={RACE}"
+    race = subprocess.run([*PYTHON, "-c", WRITE_ONE_ARRAY], env=env, capture_output=True, check=False).returncode
+    codes = compact(folder, env)
+    print(f"threads: exit codes {codes}; {race} of two threads that write one array, expected {RACE}", flush=True)
     return race == RACE and not any(codes)
 
 
