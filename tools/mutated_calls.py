@@ -8,6 +8,7 @@ end, and a sanitizer sees what it reads and writes. The run fails where a functi
 from __future__ import annotations
 
 import faulthandler
+import sys
 import threading
 import zlib
 from collections import Counter
@@ -52,7 +53,7 @@ def declare(name: str, returns: signature.Argument | None = None, /, **arguments
 def repeat(name: str, call: Callable[..., Any], arguments: Arguments, values: tuple[Any, ...]) -> None:
     """Call a function with changed copies of its arguments, the same in every run."""
     rng = np.random.default_rng((zlib.crc32(name.encode()), _recorded[name]))
-    faulthandler.dump_traceback_later(SECONDS, exit=True)
+    faulthandler.dump_traceback_later(SECONDS, exit=True, file=sys.__stderr__)  # not what pytest captures
     for _ in range(CHANGES):
         copies = change(arguments, values, rng)
         tried[name] += 1
