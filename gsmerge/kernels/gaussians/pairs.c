@@ -139,7 +139,8 @@ API int32_t agglomerate(const double *restrict means, const float *restrict cova
     if (count > CELL) return OUTSIDE;
     if (count < 2) continue;
     load_cell(&s, means, covars, masses, colors, order + low, (int)count);
-    int least = (int)maxi((int64_t)(least_share * (double)count), 1);
+    double left = least_share * (double)count;
+    int least = left > 1.0 ? (int)mind(left, CELL) : 1;
     for (float most = 0.f; s.n > least; at++) {
       int i = find_least(s.best_costs, s.n);
       if (i < 0) break;
