@@ -14,7 +14,7 @@ import ctypes
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 from typing import Any
 
 import numpy as np
@@ -60,10 +60,26 @@ class Argument:
         name = _CODES[self.code][0]
         return name if not self.shape else f"{name} *" if self.out else f"const {name} *"
 
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The type in NumPy."""
+        return np.dtype(self.code)
+
+    @cached_property
+    def span(self) -> tuple[int, int]:
+        """Smallest and largest integer that the type and the rules with numbers admit."""
+        limits = np.iinfo(self.dtype)
+        most = self.below - 1 if isinstance(self.below, int) else self.most
+        return (
+            self.least if isinstance(self.least, int) else int(limits.min),
+            most if isinstance(most, int) else int(limits.max),
+        )
+
     @property
     def has_rules(self) -> bool:
-        """Whether values are checked, not only type and shape."""
-        return self.ascending or not (self.least is self.below is self.most is None)
+        """Whether values are checked once all sizes are there: those of arrays, and scalars by rules with names."""
+        rules = [rule for rule in (self.least, self.below, self.most) if rule is not None]
+        return self.ascending or any(self.shape or isinstance(rule, str) for rule in rules)
 
     def __str__(self) -> str:
         return f"{np.dtype(self.code)} [{','.join(map(str, self.shape))}]"
@@ -155,28 +171,33 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
     if not kind.shape:
         if kind.code[0] != "f":
             value = int(value)
+            low, high = kind.span
+            if not low <= value <= high:
+                raise ValueError(f"{name}: {key}: expected an integer from {low} to {high}, found {value}")
             if sizes.setdefault(key, value) != value:
                 raise ValueError(f"{name}: {key}: expected {sizes[key]}, as arrays have it, got {value}")
         return value
     if value is None and kind.optional:
         return None
-    if type(value) is not np.ndarray or value.dtype != kind.code or value.ndim != len(kind.shape):
+    dtype, shape = kind.dtype, kind.shape
+    if type(value) is not np.ndarray or (value.dtype is not dtype and value.dtype != dtype) or value.ndim != len(shape):
         raise ValueError(f"{name}: {key}: expected {kind}, got {_describe(value)}")
-    for size, length in zip(kind.shape, value.shape, strict=True):
+    for size, length in zip(shape, value.shape, strict=True):
         if (size if isinstance(size, int) else sizes.setdefault(size, length)) != length:
             known = f" with {size} = {sizes[size]}" if isinstance(size, str) else ""
             raise ValueError(f"{name}: {key}: expected {kind}{known}, got {_describe(value)}")
     flags = value.flags
-    if not flags.c_contiguous or not flags.aligned or (kind.out and not flags.writeable):
+    writeable = flags.writeable
+    if not flags.c_contiguous or not flags.aligned or (kind.out and not writeable):
         raise ValueError(f"{name}: {key}: expected an aligned{' writable' * kind.out} array in C order")
-    return _address(value)
+    return _address(value, writeable)
 
 
-def _address(array: np.ndarray[Any, Any]) -> int:
+def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
     """Return where an array's values lie; through the buffer where that can be, a fifth of the time."""
-    if array.flags.writeable and array.size:
+    if writeable and array.size:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
-    return int(array.ctypes.data)
+    return int(array.__array_interface__["data"][0])
 
 
 def _check_values(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> None:

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.raster.binning import count_boxes, deal_tiles, sort_bits
+from gsmerge.kernels.raster.binning import MOST_TILES, count_boxes, deal_tiles, sort_bits
+from gsmerge.kernels.raster.project import CAMERA, cull
 
 
 def arrays(m=3):
@@ -54,13 +55,30 @@ def test_scalars_have_ranges():
         count_boxes(np.zeros((0, 4), np.int16), -1, 1, np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
+@pytest.mark.parametrize("start", [2**31, 2**32 + 1, -(2**31) - 1, 2**64])
+def test_integers_beyond_the_type_in_c_are_refused(start):
+    rows, opacities = np.zeros((1, 3), np.float32), np.zeros(1, np.float32)
+    with refuses(ValueError, "cull: start", start):
+        cull(rows, rows, opacities, None, None, np.zeros(CAMERA, np.float32), start, np.zeros(1, np.int32))
+
+
+@pytest.mark.parametrize("tiles", [MOST_TILES + 1, 2**62, 2**63 - 1])
+def test_more_tiles_than_boxes_can_name_are_refused(tiles):
+    boxes, counts = np.zeros((1, 4), np.int16), np.zeros(1, np.int64)
+    for side, height, width in (("height", tiles, 1), ("width", 1, tiles)):
+        with refuses(ValueError, f"count_boxes: tile_{side}", tiles):
+            count_boxes(boxes, height, width, counts, counts.copy())
+    with refuses(ValueError, "deal_tiles: tile_width", tiles):
+        deal_tiles(np.zeros(1, np.int32), boxes, tiles, counts, np.zeros(1, np.int32))
+
+
 @pytest.mark.parametrize("box", [(0, 3, 0, 1), (0, 1, 0, 3), (-1, 1, 0, 1), (2, 1, 0, 1), (0, 1, 2, 1)])
 def test_indices_outside_their_arrays_are_refused(box):
     with refuses(ValueError, "count_boxes", "indices"):
         count_boxes(np.array([box], np.int16), 2, 2, np.zeros(9, np.int64), np.zeros(4, np.int64))
 
 
-@pytest.mark.parametrize("cursor", [-1, 1, 1 << 62])
+@pytest.mark.parametrize("cursor", [-1, 1, 1 << 62, 2**63 - 1])
 def test_a_cursor_outside_the_list_is_refused(cursor):
     cursors, flatten_ids = np.full(4, cursor), np.zeros(1, np.int32)
     with refuses(ValueError, "deal_tiles", "indices"):

@@ -133,13 +133,14 @@ API int32_t agglomerate(const double *restrict means, const float *restrict cova
                         int32_t *restrict pairs, float *restrict costs, int64_t n, int64_t ends) {
   cell s = {(float(*)[CELL])work, work + COLUMNS * CELL, work + (COLUMNS + 1) * CELL, spare,
             spare + CELL, spare + 2 * CELL, 0, (float)color_weight, (float)exponent};
-  if (first < 0 || last >= ends || starts[last] > n) return OUTSIDE;
+  if (first < 0 || first > last || last >= ends || starts[last] > n) return OUTSIDE;
   for (int64_t number = first; number < last; number++) {
     int64_t low = starts[number], count = starts[number + 1] - low, at = low;
     if (count > CELL) return OUTSIDE;
     if (count < 2) continue;
     load_cell(&s, means, covars, masses, colors, order + low, (int)count);
-    int least = (int)maxi((int64_t)(least_share * (double)count), 1);
+    double left = least_share * (double)count;
+    int least = left > 1.0 ? (int)mind(left, CELL) : 1;
     for (float most = 0.f; s.n > least; at++) {
       int i = find_least(s.best_costs, s.n);
       if (i < 0) break;

@@ -47,21 +47,22 @@ API void sort_bits(const uint32_t *bits, int32_t *order, uint64_t *keys, uint64_
 API int32_t count_boxes(const int16_t *boxes, int64_t tile_height, int64_t tile_width, int64_t *corners,
                         int64_t *counts, int64_t m, int64_t num_corners, int64_t tiles) {
   int64_t stride = tile_width + 1;
+  uint64_t *marks = (uint64_t *)corners;  // sums of any numbers are defined
   if (num_corners != (tile_height + 1) * stride || tiles != tile_height * tile_width) return OUTSIDE;
   for (int64_t i = 0; i < m; i++) {
     int64_t x0 = boxes[4 * i], x1 = boxes[4 * i + 1], y0 = boxes[4 * i + 2], y1 = boxes[4 * i + 3];
     if (x0 < 0 || y0 < 0 || x0 > x1 || y0 > y1 || x1 > tile_width || y1 > tile_height) return OUTSIDE;
-    corners[y0 * stride + x0]++;
-    corners[y0 * stride + x1]--;
-    corners[y1 * stride + x0]--;
-    corners[y1 * stride + x1]++;
+    marks[y0 * stride + x0]++;
+    marks[y0 * stride + x1]--;
+    marks[y1 * stride + x0]--;
+    marks[y1 * stride + x1]++;
   }
   for (int64_t line = 0; line < tile_height; line++) {
-    int64_t run = 0;
+    uint64_t run = 0;
     for (int64_t column = 0; column < tile_width; column++) {
       int64_t tile = line * tile_width + column;
-      run += corners[line * stride + column];
-      counts[tile] = run + (line > 0 ? counts[tile - tile_width] : 0);
+      run += marks[line * stride + column];
+      counts[tile] = (int64_t)(run + (line > 0 ? (uint64_t)counts[tile - tile_width] : 0));
     }
   }
   return 0;
@@ -76,9 +77,10 @@ API int32_t deal_tiles(const int32_t *order, const int16_t *boxes, int64_t tile_
     int64_t tile = y0 * tile_width + x0, column = 0;
     // One loop for both axes: most boxes hold a tile or two, and the end of a loop is mispredicted.
     for (int64_t n = width * height; n > 0; n--) {
-      uint64_t slot = (uint64_t)cursors[tile]++;
+      uint64_t slot = (uint64_t)cursors[tile];
       if (slot >= (uint64_t)intersections) return OUTSIDE;
       flatten_ids[slot] = order[i];
+      cursors[tile]++;
       column++;
       bool wrap = column == width;
       tile += wrap ? tile_width - width + 1 : 1;

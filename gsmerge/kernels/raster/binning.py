@@ -7,6 +7,8 @@ import numpy as np
 from gsmerge.kernels.raster.project import CONIC
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u4, u8
 
+MOST_TILES = 2**15 - 1  # in a row or a column, as boxes can name them
+
 
 @native(bits=u4("m"), order=i4("m", out=True), keys=u8("m", out=True), spare=u8("m", out=True))
 def sort_bits(bits, order, keys, spare):
@@ -22,8 +24,8 @@ def depth_order(bits):
 
 
 @native(
-    STATUS, boxes=i2("m", 4), tile_height=i8(least=0), tile_width=i8(least=0), corners=i8("num_corners", out=True),
-    counts=i8("tiles", out=True),
+    STATUS, boxes=i2("m", 4), tile_height=i8(least=0, most=MOST_TILES), tile_width=i8(least=0, most=MOST_TILES),
+    corners=i8("num_corners", out=True), counts=i8("tiles", out=True),
 )  # fmt: skip
 def count_boxes(boxes, tile_height, tile_width, corners, counts):
     """Write the number of boxes over each tile; ``corners``, zero before, has a place for every corner of a tile."""
@@ -40,7 +42,7 @@ def count_tiles(boxes, tile_height, tile_width):
 
 
 @native(
-    STATUS, order=i4("m"), boxes=i2("m", 4), tile_width=i8(), cursors=i8("tiles", out=True),
+    STATUS, order=i4("m"), boxes=i2("m", 4), tile_width=i8(least=0, most=MOST_TILES), cursors=i8("tiles", out=True),
     flatten_ids=i4("intersections", out=True),
 )  # fmt: skip
 def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):

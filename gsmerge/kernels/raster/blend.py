@@ -7,6 +7,7 @@ threads, and no result depends on them. The formula is in ``gsmerge/kernels/rast
 
 from __future__ import annotations
 
+from gsmerge.kernels.raster.binning import MOST_TILES
 from gsmerge.kernels.raster.project import CONIC, MAX_SIZE, SUMS
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
@@ -18,7 +19,7 @@ LISTS = {
     "conics": f4("m", CONIC),
     "flatten_ids": i4("n"),
     "isect_offsets": i8("ends"),
-    "tile_width": i8(),
+    "tile_width": i8(least=0, most=MOST_TILES),
 }
 TILES = {"first": i8(), "last": i8()}
 

@@ -18,6 +18,9 @@ static inline void chain(double *pairs, int64_t at, int32_t *heads, int64_t k, i
   heads[k] = (int32_t)at;
 }
 
+// A column of a pair as an index below n; -1 where it is none.
+static inline int64_t index_of(double value, int64_t n) { return value >= 0.0 && value < (double)n ? (int64_t)value : -1; }
+
 // Number the superpixels of a tile from 0: lanes gets each pixel's number, names each number's label -> how many.
 static int32_t number_labels(const int32_t *labels, const Tile *t, int64_t w, int32_t *stamps, int32_t *lanes,
                           int32_t *names) {
@@ -103,16 +106,18 @@ API int32_t settle_row(int64_t bottom, const float *restrict conics, int32_t *re
                        double *restrict totals, int32_t *restrict seen, float *restrict out_values,
                        int32_t *restrict out_labels, int64_t *restrict counts, int64_t m, int64_t room, int64_t slots,
                        int64_t num_labels) {
-  int64_t num_carried = 0, num_staying = 0;
-  if (counts[NUM_ACTIVE] > slots || counts[NUM_PAIRS] > room) return OUTSIDE;
+  int64_t num_carried = 0, num_staying = 0, num_pairs = counts[NUM_PAIRS], unread = num_pairs;
+  if (counts[NUM_ACTIVE] > slots || num_pairs > room) return OUTSIDE;
   for (int64_t a = 0; a < counts[NUM_ACTIVE]; a++) {
     int64_t k = active[a], count = 0;
     if (k < 0 || k >= m) return OUTSIDE;
-    for (int64_t pair = heads[k]; pair >= 0; pair = (int64_t)pairs[PAIR * pair + NEXT]) {
-      if (pair >= room) return OUTSIDE;
-      int64_t label = (int64_t)pairs[PAIR * pair + LABEL];
-      if (label < 0 || label >= num_labels) return OUTSIDE;
-      if (totals[label] == 0.0) seen[count++] = (int32_t)label;
+    for (int64_t pair = heads[k]; pair >= 0; pair = index_of(pairs[PAIR * pair + NEXT], num_pairs)) {
+      int64_t label = pair < num_pairs ? index_of(pairs[PAIR * pair + LABEL], num_labels) : -1;
+      if (label < 0 || unread-- <= 0) return OUTSIDE;  // a pair belongs to one chain: one that is met again is a ring
+      if (totals[label] == 0.0) {
+        if (count == num_labels) return OUTSIDE;  // sums of 0 or below
+        seen[count++] = (int32_t)label;
+      }
       totals[label] += pairs[PAIR * pair + SUM];
     }
     if (count == 0) return OUTSIDE;

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.kernels.raster.binning import MOST_TILES
 from gsmerge.kernels.raster.blend import LISTS
 from gsmerge.kernels.raster.project import CONIC, TILE
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native
@@ -19,9 +20,9 @@ NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # what the kernels count,
 
 
 @native(
-    STATUS, **LISTS, line=i8(), labels=i4("h", "w", least=0, below="num_labels"), heads=i4("m", out=True),
-    pairs=f8("room", PAIR, out=True), active=i4("slots", out=True), stamps=i4("num_labels", most=-1, out=True),
-    counts=i8(COUNTS, out=True),
+    STATUS, **LISTS, line=i8(least=0, most=MOST_TILES), labels=i4("h", "w", least=0, below="num_labels"),
+    heads=i4("m", out=True), pairs=f8("room", PAIR, out=True), active=i4("slots", out=True),
+    stamps=i4("num_labels", most=-1, out=True), counts=i8(COUNTS, out=True),
 )  # fmt: skip
 def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
     """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last that there is room for."""

@@ -44,11 +44,12 @@ API int32_t list_weights(const float *restrict conics, const int32_t *restrict f
   return 0;
 }
 
-API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
+API int32_t spread(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
                 const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
                 const float *restrict colors, float *restrict image, int64_t more, int64_t entries, int64_t n,
                 int64_t ends, int64_t m, int64_t h, int64_t w) {
-  (void)more, (void)entries, (void)n, (void)m;
+  (void)entries, (void)m;
+  if (more != n + 1) return OUTSIDE;
   float state[PLANE][CHANNELS] __attribute__((aligned(64)));
   for (int64_t tile = 0; tile < ends - 1; tile++) {
     for (int i = 0; i < PLANE; i++)
@@ -64,13 +65,15 @@ API void spread(const int64_t *restrict starts, const uint8_t *restrict lanes, c
         for (int c = 0; c < CHANNELS; c++)
           image[((top + y) * w + left + x) * CHANNELS + c] = state[y * TILE + x][c];
   }
+  return 0;
 }
 
-API void collect(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
+API int32_t collect(const int64_t *restrict starts, const uint8_t *restrict lanes, const float *restrict weights,
                  const int32_t *restrict flatten_ids, const int64_t *restrict isect_offsets, int64_t tile_width,
                  const float *restrict image, double *restrict sums, int64_t more, int64_t entries, int64_t n,
                  int64_t ends, int64_t h, int64_t w, int64_t m) {
-  (void)more, (void)entries, (void)n, (void)m;
+  (void)entries, (void)m;
+  if (more != n + 1) return OUTSIDE;
   float state[PLANE][CHANNELS] __attribute__((aligned(64)));
   for (int i = 0; i < PLANE; i++)
     for (int c = 0; c < CHANNELS; c++) state[i][c] = 0.f;
@@ -87,4 +90,5 @@ API void collect(const int64_t *restrict starts, const uint8_t *restrict lanes, 
       for (int c = 0; c < CHANNELS; c++) sums[CHANNELS * (int64_t)flatten_ids[i] + c] += own[c];
     }
   }
+  return 0;
 }

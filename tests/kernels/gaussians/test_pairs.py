@@ -121,6 +121,10 @@ def test_what_points_outside_is_refused() -> None:
         run(cloud, order, np.array([0, CELL + 1]), 0.5)  # more than a cell holds
     with refuses(ValueError, "agglomerate", "indices"):
         run(cloud, order, np.array([0, CELL + 2]), 0.5)
+    pairs, costs = np.zeros((CELL + 1, 2), np.int32), np.zeros(CELL + 1, np.float32)
+    for first, last in ((0, -1), (0, -(2**62)), (1, 0), (0, 2)):
+        with refuses(ValueError, "agglomerate", "indices"):
+            agglomerate(*cloud.values(), order, np.array([0, CELL]), WEIGHT, POWER, 0.5, first, last, pairs, costs)
     sizes, sh = np.ones(CELL + 1, np.int32), np.zeros((CELL + 1, 3), np.float32)
     with refuses(ValueError, "merge_pairs", "indices"):
         merge_pairs(np.array([[0, -1]], np.int32), cloud["means"], cloud["covars"], cloud["masses"], sh, sizes)

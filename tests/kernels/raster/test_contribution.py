@@ -10,7 +10,7 @@ from made_gaussians import random_gaussians
 from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
-from gsmerge.kernels.raster.contribution import FIRST_PAIRS
+from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, settle_row
 from gsmerge.raster import plan_view, prepare
 from gsmerge.stages.assign import find_owners, view_owners
 from gsmerge.stages.superpixels import superpixels
@@ -101,3 +101,35 @@ def test_of_equal_views_the_first() -> None:
     labels = np.stack([some_labels(30)] * 4)
     owners = find_owners(Scene(gaussians, cameras, None, None, tuple("abcd")), Groups(labels, (30,) * 4))
     assert set(owners.views.tolist()) <= {-1, 0}
+
+
+@pytest.mark.parametrize(
+    ("pairs", "num_pairs"),
+    [
+        pytest.param([(0, 1, 0), (1, 1, -1)], 2, id="a ring"),
+        pytest.param([(0, 1, 1), (1, 1, 0)], 2, id="a longer ring"),
+        pytest.param([(0, 0, 1), (0, 0, 2), (0, 0, -1)], 3, id="sums of zero"),
+        pytest.param([(0, 1, -1)], 0, id="a pair that is not there"),
+        pytest.param([(2, 1, -1)], 1, id="a label that is not there"),
+        pytest.param([(np.nan, 1, -1)], 1, id="a label that is no number"),
+    ],
+)
+def test_chains_that_do_not_end_are_refused(pairs: list[tuple[float, float, float]], num_pairs: int) -> None:
+    rows, num_labels = np.array(pairs, float), 2
+    heads, active, counts = np.zeros(1, np.int32), np.zeros(2, np.int32), np.array([num_pairs, 1, 0])
+    totals, seen = np.zeros(num_labels), np.empty(num_labels, np.int32)
+    values, owners = np.zeros(1, np.float32), np.zeros(1, np.int32)
+    with pytest.raises(ValueError, match=r"settle_row: .*indices"):
+        settle_row(
+            0, np.zeros((1, 8), np.float32), heads, rows, rows.copy(), active, totals, seen, values, owners, counts
+        )
+
+
+@pytest.mark.parametrize(("line", "tile_width"), [(2**63 - 1, 1), (2**62, 2), (0, 2**63 - 1), (-1, 1)])
+def test_rows_of_tiles_that_no_picture_has_are_refused(line: int, tile_width: int) -> None:
+    labels, ids, counts = np.zeros((1, 1), np.int32), np.zeros(1, np.int32), np.zeros(3, np.int64)
+    with pytest.raises(ValueError, match=r"add_row: (line|tile_width)"):
+        add_row(
+            np.zeros((1, 8), np.float32), ids, np.array([0, 1]), tile_width, line, labels, ids.copy(),
+            np.empty((1, 3)), np.zeros(2, np.int32), np.full(1, -1, np.int32), counts,
+        )  # fmt: skip

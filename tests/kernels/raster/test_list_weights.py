@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
 from gsmerge.geometry import quat_to_rotmat
+from gsmerge.kernels.raster.list_weights import collect, spread
 from gsmerge.raster import ViewPlan, composite, plan_view, prepare, splat_adjoint
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
@@ -115,3 +116,13 @@ def test_nothing_in_view(count: int) -> None:
     assert len(weights.lanes) == 0
     assert not apply(weights, np.ones((count, 3))).any()
     assert apply_transposed(weights, np.ones((HEIGHT, WIDTH, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("more", [0, 1, 3])
+def test_starts_of_another_length_are_refused(more: int) -> None:
+    entries = (np.zeros(more, np.int64), np.zeros(1, np.uint8), np.zeros(1, np.float32), np.zeros(1, np.int32))
+    lists, rows = (*entries, np.array([0, 1]), 1), np.zeros((1, 4), np.float32)
+    with pytest.raises(ValueError, match=r"spread: .*indices"):
+        spread(*lists, rows, rows[None].copy())
+    with pytest.raises(ValueError, match=r"collect: .*indices"):
+        collect(*lists, rows[None], np.zeros((1, 4)))
