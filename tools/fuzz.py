@@ -1,0 +1,187 @@
+"""Read changed files with every reader, and keep those that fail: ``python tasks.py fuzz --minutes 30 [READER...]``.
+
+With atheris (pip install atheris) changes follow the lines of code that they reach, and what was learnt is kept in
+build/fuzz; without it files are changed blindly. A reader returns, or raises an error of the package, within its budget;
+the smallest file that makes it do anything else goes to tests/fuzz/findings, which the tests read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from random import Random
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+TESTS = ROOT / "tests"
+sys.path[:0] = [str(ROOT), str(TESTS), str(TESTS / "helpers")]
+FINDINGS, LEARNT = TESTS / "fuzz" / "findings", ROOT / "build" / "fuzz"
+SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
+TRIES = 300  # to make a finding smaller
+SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None  # noqa: S108 - files that nobody else reads
+
+
+class TooLong(BaseException):
+    """The time is over; no reader can take this for an error of its own."""
+
+
+def failure(target: Any, data: bytes) -> tuple[str, str]:
+    """Read bytes -> where and how it fails, and the traceback; two empty texts if it does not."""
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    with tempfile.TemporaryDirectory(dir=SHARED_MEMORY) as folder:
+        try:
+            target.attempt(data, Path(folder))
+        except (Exception, TooLong) as error:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+            frames = [f for f in traceback.extract_tb(error.__traceback__) if "gsmerge/" in f.filename]
+            place = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "check"
+            return f"{type(error).__name__} at {place}", traceback.format_exc()
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0)
+    return "", ""
+
+
+def shrink(target: Any, data: bytes, cause: str) -> bytes:
+    """Leave out pieces of a file as long as it fails in the same way."""
+    size, tries = len(data) // 2, 0
+    while size and tries < TRIES:
+        for start in range(0, len(data), size):
+            shorter = data[:start] + data[start + size :]
+            tries += 1
+            if tries < TRIES and failure(target, shorter)[0] == cause:
+                data = shorter
+                break
+        else:
+            size //= 2
+    return data
+
+
+def keep(reader: str, data: bytes) -> Path:
+    """Write a finding to the folder of findings."""
+    FINDINGS.mkdir(exist_ok=True)
+    path = FINDINGS / f"{reader}.{hashlib.sha256(data).hexdigest()[:8]}"
+    path.write_bytes(data)
+    return path
+
+
+def work(reader: str, seconds: int) -> None:
+    """Try one reader for some seconds; print each finding, and the number of inputs as libFuzzer does."""
+    try:
+        import atheris
+    except ImportError:
+        atheris = None
+    with atheris.instrument_imports(include=["gsmerge"]) if atheris else tempfile.TemporaryDirectory():
+        from fuzz.mutate import mutate, splice
+        from fuzz.targets import TARGETS, seeds_of
+
+        target = TARGETS[reader]
+        seeds = seeds_of(target)
+        for seed in seeds:
+            failure(target, seed)  # which imports all that it takes
+    seeds += [path.read_bytes() for path in FINDINGS.glob(f"{reader}.*")]
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    causes: set[str] = set()
+
+    def attempt(data: bytes) -> None:
+        cause, trace = failure(target, data)
+        if cause and cause not in causes:
+            causes.add(cause)
+            path = keep(reader, data if cause.startswith("TooLong") else shrink(target, data, cause))
+            print(f"FINDING {cause}: {path}\n{trace}", flush=True)
+
+    if atheris:
+        learn(atheris, reader, seconds, seeds, attempt, mutate, splice)
+        return
+    random, count, end = Random(time.time_ns()), 0, time.monotonic() + seconds
+    while time.monotonic() < end:
+        attempt(mutate(random.choice(seeds), random))
+        count += 1
+    print(f"stat::number_of_executed_units: {count}", flush=True)
+
+
+def learn(
+    atheris: Any, reader: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
+) -> None:
+    """Run libFuzzer, which keeps the files that reach new lines; it ends the process."""
+    corpus = LEARNT / reader
+    corpus.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        (corpus / hashlib.sha256(seed).hexdigest()).write_bytes(seed)
+
+    def leaf(data: bytes, random: Random) -> bytes:
+        return splice(data, random) if random.random() < 0.5 else atheris.Mutate(data, len(data) + 64)
+
+    def change(data: bytes, most: int, seed: int) -> bytes:
+        return mutate(data, Random(seed), leaf)[:most]
+
+    options = {"max_total_time": seconds, "max_len": max(8192, 3 * max(map(len, seeds))), "timeout": 4 * SECONDS,
+               "artifact_prefix": f"{LEARNT}/{reader}-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
+    flags = [f"-{name}={value}" for name, value in options.items()]
+    atheris.Setup(["fuzz", *flags, str(corpus)], attempt, custom_mutator=change)
+    atheris.Fuzz()
+
+
+def run(reader: str, seconds: int) -> bool:
+    """Try one reader in a process of its own; print what came of it -> whether it is sound."""
+    for left in LEARNT.glob(f"{reader}-*"):
+        left.unlink()
+    begin = time.monotonic()
+    command = [sys.executable, __file__, "--seconds", str(seconds), reader]
+    log = LEARNT / f"{reader}.log"
+    with log.open("w") as file:
+        env = os.environ | {"MALLOC_ARENA_MAX": "1", "OPENCV_LOG_LEVEL": "SILENT"}
+        code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=file, env=env, check=False).returncode
+    text = log.read_text(errors="replace")
+    counted = re.findall(r"number_of_executed_units: +(\d+)", text)
+    findings = re.findall(r"^FINDING (.*)", text, re.MULTILINE)
+    for crash in LEARNT.glob(f"{reader}-*"):
+        findings.append(f"ended the process: {keep(reader, crash.read_bytes())}")
+    if code and not findings:
+        findings.append(f"ended with exit code {code}: {log}")
+    print(f"{reader:18}{int(counted[0]) if counted else 0:10,} inputs{time.monotonic() - begin:7.0f} s", flush=True)
+    for finding in findings:
+        print(f"  {finding}", flush=True)
+    return not findings
+
+
+def main() -> int:
+    """Try the named readers, or all, for some minutes together; exit code 1 if there are findings."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10)
+    parser.add_argument("--seconds", type=int, help="of one reader, in this process")
+    parser.add_argument("readers", nargs="*")
+    arguments = parser.parse_args()
+    if arguments.seconds:
+
+        def stop(*_: object) -> None:
+            raise TooLong
+
+        signal.signal(signal.SIGPROF, stop)
+        work(arguments.readers[0], arguments.seconds)
+        return 0
+    from fuzz.targets import TARGETS
+
+    LEARNT.mkdir(parents=True, exist_ok=True)
+    readers = arguments.readers or list(TARGETS)
+    processes = min(os.cpu_count() or 1, len(readers))
+    seconds = max(1, round(60 * arguments.minutes * processes / len(readers)))
+    with ThreadPoolExecutor(processes) as pool:
+        sound = list(pool.map(lambda reader: run(reader, seconds), readers))
+    return 0 if all(sound) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
