@@ -29,6 +29,7 @@ TESTS = ROOT / "tests"
 sys.path[:0] = [str(ROOT), str(TESTS), str(TESTS / "helpers")]
 FINDINGS, LEARNT = TESTS / "fuzz" / "findings", ROOT / "build" / "fuzz"
 SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
+INSTRUMENTED = ["gsmerge.io", "gsmerge.encoded.gsm_file", "gsmerge.online.file", "gsmerge.networks.checkpoint"]
 TRIES = 300  # to make a finding smaller
 SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None  # noqa: S108 - files that nobody else reads
 
@@ -82,7 +83,7 @@ def work(reader: str, seconds: int) -> None:
         import atheris
     except ImportError:
         atheris = None
-    with atheris.instrument_imports(include=["gsmerge"]) if atheris else tempfile.TemporaryDirectory():
+    with atheris.instrument_imports(include=INSTRUMENTED) if atheris else tempfile.TemporaryDirectory():
         from fuzz.mutate import mutate, splice
         from fuzz.targets import TARGETS, seeds_of
 

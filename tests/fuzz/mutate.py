@@ -199,7 +199,7 @@ def change_value(document: Any, random: Random) -> None:
         document[key] = json.dumps(inner[:1] and inner[0])
     elif what < 0.85:
         number = isinstance(value, int | float) and random.random() < 0.4
-        document[key] = random.choice((value * 2, -value, value + 1, value / 3)) if number else random.choice(VALUES)
+        document[key] = random.choice((value * 2, -value, value + 1, value // 3)) if number else random.choice(VALUES)
     elif what < 0.9:
         document[key] = document[random.choice(keys)]
     elif isinstance(document, dict):

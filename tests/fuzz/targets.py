@@ -49,7 +49,7 @@ from gsmerge.settings.setting import flat_settings
 from gsmerge.types import Cameras
 
 PHOTO_ENDINGS = (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")
-PLAIN = re.compile(r"(\w+/)?\w+\.\w+")
+PLAIN = re.compile(r"([\w-]+/)?[\w-]+\.\w+")
 UNPACKING = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError)
 Seeds = Callable[[Path], Iterable[bytes]]  # makes files in an empty folder
 
