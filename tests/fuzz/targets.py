@@ -331,7 +331,7 @@ def texts(*contents: bytes) -> Seeds:
     return lambda folder: contents
 
 
-TRAINING = b'{"steps": 100, "rate": 0.001, "densities": [0.1], "network": {"width": 32}, "views": [2, 3], "ks": [1, 2]}'
+TRAINING = b'{"steps": 100, "rate": 0.001, "densities": [0.1], "network": {"width": 32}, "random_views": [2, 3]}'
 PAIRS = b'k=2\nfit=none\nmin_opacity=0.01\nbudget=300\nquality=high\nphotos=null\nk="auto"\nlevels=1e3\n'
 TARGETS: dict[str, Target] = {
     "ply": Target("a.ply", plys, check_gaussians),
