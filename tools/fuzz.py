@@ -1,8 +1,8 @@
-"""Read changed files with every reader, and keep those that fail: ``python tasks.py fuzz --minutes 30 [READER...]``.
+"""Read changed files with every reader, and keep those that fail: ``python tasks.py fuzz --minutes 30 READER...``.
 
-With atheris (pip install atheris) changes follow the lines of code that they reach, and what was learnt is kept in
-build/fuzz; without it files are changed blindly. A reader returns, or raises an error of the package, within its budget;
-the smallest file that makes it do anything else goes to tests/fuzz/findings, which the tests read.
+With atheris (pip install atheris) changes follow the lines of code that they reach, and files that reached new ones are
+kept in build/fuzz; without it files are changed blindly. A reader returns, or raises an error of the package, within
+its budget; the smallest file that makes it do anything else goes to tests/fuzz/findings, which the tests read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FINDINGS, LEARNT = TESTS / "fuzz" / "findings", ROOT / "build" / "fuzz"
 SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
 INSTRUMENTED = ["gsmerge.io", "gsmerge.encoded.gsm_file", "gsmerge.online.file", "gsmerge.networks.checkpoint"]
 TRIES = 300  # to make a finding smaller
-SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None  # noqa: S108 - files that nobody else reads
+SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
 
 
 class TooLong(BaseException):
@@ -114,7 +114,13 @@ def work(reader: str, seconds: int) -> None:
 
 
 def learn(
-    atheris: Any, reader: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
+    atheris: Any,
+    reader: str,
+    seconds: int,
+    seeds: list[bytes],
+    attempt: Callable[[bytes], None],
+    mutate: Any,
+    splice: Any,
 ) -> None:
     """Run libFuzzer, which keeps the files that reach new lines; it ends the process."""
     corpus = LEARNT / reader
@@ -129,7 +135,7 @@ def learn(
         return mutate(data, Random(seed), leaf)[:most]
 
     options = {"max_total_time": seconds, "max_len": max(8192, 3 * max(map(len, seeds))), "timeout": 4 * SECONDS,
-               "artifact_prefix": f"{LEARNT}/{reader}-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
+               "artifact_prefix": f"{LEARNT}/{reader}.input-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
     flags = [f"-{name}={value}" for name, value in options.items()]
     atheris.Setup(["fuzz", *flags, str(corpus)], attempt, custom_mutator=change)
     atheris.Fuzz()
@@ -137,7 +143,7 @@ def learn(
 
 def run(reader: str, seconds: int) -> bool:
     """Try one reader in a process of its own; print what came of it -> whether it is sound."""
-    for left in LEARNT.glob(f"{reader}-*"):
+    for left in LEARNT.glob(f"{reader}.input-*"):
         left.unlink()
     begin = time.monotonic()
     command = [sys.executable, __file__, "--seconds", str(seconds), reader]
@@ -148,7 +154,7 @@ def run(reader: str, seconds: int) -> bool:
     text = log.read_text(errors="replace")
     counted = re.findall(r"number_of_executed_units: +(\d+)", text)
     findings = re.findall(r"^FINDING (.*)", text, re.MULTILINE)
-    for crash in LEARNT.glob(f"{reader}-*"):
+    for crash in LEARNT.glob(f"{reader}.input-*"):
         findings.append(f"ended the process: {keep(reader, crash.read_bytes())}")
     if code and not findings:
         findings.append(f"ended with exit code {code}: {log}")

@@ -19,8 +19,8 @@ from gsmerge.io.cameras.embedded import PREFIX
 Change = Callable[[bytes, Random], bytes]
 
 PIECES = (b"\0" * 8, b"\xff" * 8, b"-1", b"99999999999", b"nan", b"1e999", b"\n", b"list uchar", b"[" * 50, b"9" * 5000)
-VALUES = (None, True, -1, 0, 1, 24, 2.5, 2**31, 2**63, 10**400, 1e300, float("nan"), float("inf"), "", "wide", "9" * 5000,
-          "../a", "\0", [], [1, 2], {}, {"a": 1}, [[1.0] * 4] * 4, [[[]]])  # fmt: skip
+VALUES = (None, True, -1, 0, 1, 24, 2.5, 2**31, 2**63, 10**400, 1e300, float("nan"), float("inf"), "", "wide",
+          "9" * 5000, "../a", "\0", [], [1, 2], {}, {"a": 1}, [[1.0] * 4] * 4, [[[]]])  # fmt: skip
 WORDS = ("", "0", "-1", "nan", "1e999", "4294967296", "9" * 30, "list", "uchar", "int", "double", "float", "property",
          "element", "vertex", "chunk", "sh", "x", "#", ",", "ascii", "\0", "é", "PINHOLE", "OPENCV")  # fmt: skip
 

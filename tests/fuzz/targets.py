@@ -23,7 +23,6 @@ from tiny_scene import (
     save_json,
     write_colmap_binary,
     write_colmap_text,
-    write_images,
     write_inria,
     write_npz,
     write_transforms,
@@ -39,9 +38,8 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.photo_files import decode_alpha, decode_mask
 from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.networks.options import weight_shapes
 from gsmerge.online.compactor import Compactor
 from gsmerge.online.file import load_stored
 from gsmerge.settings.compact import CompactOptions
@@ -73,7 +71,7 @@ class Target:
 
         AssertionError if they are refused in another way than by one line that names the file.
         """
-        in_folder, slash, name = self.name.rpartition("/")
+        _, slash, name = self.name.rpartition("/")
         if slash:
             if not unpack(data, folder):
                 return False
@@ -83,11 +81,12 @@ class Target:
             warnings.simplefilter("error")
             try:
                 self.read(folder / name if name else folder)
+                return True
             except GsmergeError as error:
-                assert not isinstance(error, SceneError) or str(folder) in str(error), f"no file named: {error}"
-                assert "\n" not in str(error), f"several lines: {error}"
-                return False
-        return True
+                refused = error
+        assert not isinstance(refused, SceneError) or str(folder) in str(refused), f"no file named: {refused}"
+        assert "\n" not in str(refused), f"several lines: {refused}"
+        return False
 
 
 def pack(folder: Path) -> bytes:
@@ -115,7 +114,7 @@ def unpack(data: bytes, folder: Path) -> bool:
 def check_gaussians(path: Path) -> None:
     """Read Gaussians; assert that they are sound."""
     g = read_gaussians(path).gaussians
-    assert 0 < len(g)
+    assert len(g) > 0
     assert np.isfinite(g.means).all()
     assert (g.scales >= 0).all()
     assert np.isfinite(g.scales).all()
@@ -331,7 +330,7 @@ def texts(*contents: bytes) -> Seeds:
     return lambda folder: contents
 
 
-TRAINING = b'{"steps": 100, "rate": 0.001, "densities": [0.1], "network": {"width": 32}, "random_views": [2, 3]}'
+TRAINING = b'{"steps": 100, "rate": 0.001, "densities": [0.1, 0.2], "network": {"width": 32}, "seed": 3}'
 PAIRS = b'k=2\nfit=none\nmin_opacity=0.01\nbudget=300\nquality=high\nphotos=null\nk="auto"\nlevels=1e3\n'
 TARGETS: dict[str, Target] = {
     "ply": Target("a.ply", plys, check_gaussians),
