@@ -13,29 +13,37 @@ import os
 import re
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from random import Random
 from typing import Any
+
+try:
+    import atheris
+except ImportError:
+    atheris = None
 
 ROOT = Path(__file__).resolve().parent.parent
 TESTS = ROOT / "tests"
 sys.path[:0] = [str(ROOT), str(TESTS), str(TESTS / "helpers")]
 FINDINGS, LEARNT = TESTS / "fuzz" / "findings", ROOT / "build" / "fuzz"
 SECONDS, BYTES = 15, 512 << 20  # of processor time and memory, several times the budget of such small files
-INSTRUMENTED = ["gsmerge.io", "gsmerge.encoded.gsm_file", "gsmerge.online.file", "gsmerge.networks.checkpoint"]
 TRIES = 300  # to make a finding smaller
 SHARED_MEMORY = "/dev/shm" if os.path.isdir("/dev/shm") else None
 
 
 class TooLong(BaseException):
     """The time is over; no reader can take this for an error of its own."""
+
+
+def stop(*_: object) -> None:
+    """End the block that takes too long."""
+    raise TooLong
 
 
 def failure(target: Any, data: bytes) -> tuple[str, str]:
@@ -79,18 +87,14 @@ def keep(reader: str, data: bytes) -> Path:
 
 def work(reader: str, seconds: int) -> None:
     """Try one reader for some seconds; print each finding, and the number of inputs as libFuzzer does."""
-    try:
-        import atheris
-    except ImportError:
-        atheris = None
-    with atheris.instrument_imports(include=INSTRUMENTED) if atheris else tempfile.TemporaryDirectory():
-        from fuzz.mutate import mutate, splice
-        from fuzz.targets import TARGETS, seeds_of
+    from fuzz.mutate import mutate, splice
+    from fuzz.targets import TARGETS, seeds_of
 
-        target = TARGETS[reader]
-        seeds = seeds_of(target)
-        for seed in seeds:
-            failure(target, seed)  # which imports all that it takes
+    signal.signal(signal.SIGPROF, stop)
+    target = TARGETS[reader]
+    seeds = seeds_of(target)
+    for seed in seeds:
+        failure(target, seed)  # which imports all that it takes
     seeds += [path.read_bytes() for path in FINDINGS.glob(f"{reader}.*")]
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, resource.getrlimit(resource.RLIMIT_AS)[1]))
@@ -104,8 +108,7 @@ def work(reader: str, seconds: int) -> None:
             print(f"FINDING {cause}: {path}\n{trace}", flush=True)
 
     if atheris:
-        learn(atheris, reader, seconds, seeds, attempt, mutate, splice)
-        return
+        learn(reader, seconds, seeds, attempt, mutate, splice)
     random, count, end = Random(time.time_ns()), 0, time.monotonic() + seconds
     while time.monotonic() < end:
         attempt(mutate(random.choice(seeds), random))
@@ -114,13 +117,7 @@ def work(reader: str, seconds: int) -> None:
 
 
 def learn(
-    atheris: Any,
-    reader: str,
-    seconds: int,
-    seeds: list[bytes],
-    attempt: Callable[[bytes], None],
-    mutate: Any,
-    splice: Any,
+    reader: str, seconds: int, seeds: list[bytes], attempt: Callable[[bytes], None], mutate: Any, splice: Any
 ) -> None:
     """Run libFuzzer, which keeps the files that reach new lines; it ends the process."""
     corpus = LEARNT / reader
@@ -141,16 +138,27 @@ def learn(
     atheris.Fuzz()
 
 
-def run(reader: str, seconds: int) -> bool:
-    """Try one reader in a process of its own; print what came of it -> whether it is sound."""
+def start(reader: str, seconds: int) -> int:
+    """Try one reader in a process of its own, which writes a log -> its id."""
     for left in LEARNT.glob(f"{reader}.input-*"):
         left.unlink()
-    begin = time.monotonic()
-    command = [sys.executable, __file__, "--seconds", str(seconds), reader]
+    process = os.fork()
+    if process == 0:
+        log = os.open(LEARNT / f"{reader}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        try:
+            work(reader, seconds)
+            os._exit(0)
+        except Exception:
+            traceback.print_exc()
+            os._exit(1)
+    return process
+
+
+def report(reader: str, code: int, seconds: float) -> bool:
+    """Print what came of a reader -> whether it is sound."""
     log = LEARNT / f"{reader}.log"
-    with log.open("w") as file:
-        env = os.environ | {"MALLOC_ARENA_MAX": "1", "OPENCV_LOG_LEVEL": "SILENT"}
-        code = subprocess.run(command, cwd=ROOT, stdout=file, stderr=file, env=env, check=False).returncode
     text = log.read_text(errors="replace")
     counted = re.findall(r"number_of_executed_units: +(\d+)", text)
     findings = re.findall(r"^FINDING (.*)", text, re.MULTILINE)
@@ -158,7 +166,7 @@ def run(reader: str, seconds: int) -> bool:
         findings.append(f"ended the process: {keep(reader, crash.read_bytes())}")
     if code and not findings:
         findings.append(f"ended with exit code {code}: {log}")
-    print(f"{reader:18}{int(counted[0]) if counted else 0:10,} inputs{time.monotonic() - begin:7.0f} s", flush=True)
+    print(f"{reader:18}{int(counted[0]) if counted else 0:10,} inputs{seconds:7.0f} s", flush=True)
     for finding in findings:
         print(f"  {finding}", flush=True)
     return not findings
@@ -168,26 +176,26 @@ def main() -> int:
     """Try the named readers, or all, for some minutes together; exit code 1 if there are findings."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10)
-    parser.add_argument("--seconds", type=int, help="of one reader, in this process")
     parser.add_argument("readers", nargs="*")
     arguments = parser.parse_args()
-    if arguments.seconds:
-
-        def stop(*_: object) -> None:
-            raise TooLong
-
-        signal.signal(signal.SIGPROF, stop)
-        work(arguments.readers[0], arguments.seconds)
-        return 0
-    from fuzz.targets import TARGETS
-
     LEARNT.mkdir(parents=True, exist_ok=True)
-    readers = arguments.readers or list(TARGETS)
-    processes = min(os.cpu_count() or 1, len(readers))
-    seconds = max(1, round(60 * arguments.minutes * processes / len(readers)))
-    with ThreadPoolExecutor(processes) as pool:
-        sound = list(pool.map(lambda reader: run(reader, seconds), readers))
-    return 0 if all(sound) else 1
+    os.environ["OPENCV_LOG_LEVEL"] = "SILENT"
+    with atheris.instrument_imports(include=["gsmerge"]) if atheris else nullcontext():
+        from fuzz.targets import TARGETS
+
+        waiting = arguments.readers or list(TARGETS)
+        processes = min(os.cpu_count() or 1, len(waiting))
+        seconds = max(1, round(60 * arguments.minutes * processes / len(waiting)))
+        running: dict[int, tuple[str, float]] = {}
+        sound = True
+        while waiting or running:
+            while waiting and len(running) < processes:
+                reader, waiting = waiting[0], waiting[1:]
+                running[start(reader, seconds)] = reader, time.monotonic()
+            process, status = os.wait()
+            reader, begin = running.pop(process)
+            sound &= report(reader, os.waitstatus_to_exitcode(status), time.monotonic() - begin)
+    return 0 if sound else 1
 
 
 if __name__ == "__main__":
