@@ -1,6 +1,7 @@
 """The checks of this project, one command each: python tasks.py TASK... (CONTRIBUTING.md says when).
 
-The tools run from the environment of this Python; the first failure stops.
+The tools run from the environment of this Python; the first failure stops. Options, and what follows them, are passed
+to the last task: python tasks.py fuzz --minutes 30.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ TASKS = {
     "imports": (("lint-imports",),),
     "docs": (("python", "docs/generate_reference.py", "--check"),),
     "reference": (("python", "docs/generate_reference.py"),),
+    "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
     "preview": (("python", "tools/make_preview.py"),),
     "small": (("python", "tools/small_modules.py"),),
@@ -28,12 +30,15 @@ CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")
 
 def main(names: list[str]) -> int:
     """Run tasks one after the other; ``check`` stands for all checks."""
+    options = next((names[i:] for i, name in enumerate(names) if name.startswith("-")), [])
+    names = names[: len(names) - len(options)]
     names = [task for name in names for task in (CHECKS if name == "check" else (name,))]
     unknown = [name for name in names if name not in TASKS]
     if unknown or not names:
         print(f"usage: python tasks.py TASK...\ntasks: check (all of {' '.join(CHECKS)}), {', '.join(TASKS)}")
         return 2
-    for tool, *arguments in (call for name in names for call in TASKS[name]):
+    calls = [call for name in names for call in TASKS[name]]
+    for tool, *arguments in (*calls[:-1], (*calls[-1], *options)):
         print("+", tool, *arguments, flush=True)
         program = sys.executable if tool == "python" else str(TOOLS / tool)
         code = subprocess.run([program, *arguments], cwd=ROOT, check=False).returncode

@@ -88,7 +88,8 @@ def _rows(path: StrPath, cameras: Any) -> np.ndarray:
         raise SceneError(path, f"expected 1 to {MAX_VIEWS} cameras, found {cameras.shape[0]}")
     if cameras.storage.dtype is None or cameras.storage.dtype.kind != "f":
         raise SceneError(path, f"expected cameras of numbers, found {cameras.storage.dtype or 'another type'}")
-    return cameras.read().astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN, which is refused as any other
+        return cameras.read().astype(np.float64)
 
 
 def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | PhotoReader | None:

@@ -1,0 +1,368 @@
+"""The table of readers: what reads a file, and small sound files from which changed ones are made."""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from made_gaussians import random_gaussians
+from model_files import long_lrm
+from tiny_scene import (
+    make_tiny,
+    save_json,
+    write_colmap_binary,
+    write_colmap_text,
+    write_inria,
+    write_npz,
+    write_transforms,
+)
+
+import gsmerge
+from gsmerge.cli.parameters import parse_pairs
+from gsmerge.errors import GsmergeError, SceneError, UsageError
+from gsmerge.io import read_cameras, read_gaussians, read_images
+from gsmerge.io.cameras.embedded import camera_comments
+from gsmerge.io.cameras.json_files import read_dataparser
+from gsmerge.io.cameras.npz_files import read_depths
+from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.photo_files import decode_alpha, decode_mask
+from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
+from gsmerge.networks.options import NetworkOptions, weight_shapes
+from gsmerge.networks.weights import NetworkWeights
+from gsmerge.online.compactor import Compactor
+from gsmerge.online.file import load_stored
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import flat_settings
+from gsmerge.types import Cameras
+
+PHOTO_ENDINGS = (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")
+PLAIN = re.compile(r"([\w-]+/)?[\w-]+\.\w+")
+UNPACKING = (zipfile.BadZipFile, zlib.error, ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError)
+Seeds = Callable[[Path], Iterable[bytes]]  # makes files in an empty folder
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Args:
+        name: Of the file that it reads. With a slash, the input is an archive of a folder; what follows is read in it.
+        seeds: Makes sound files.
+        read: The reader, with checks of what it returns.
+    """
+
+    name: str
+    seeds: Seeds
+    read: Callable[[Path], Any]
+
+    def attempt(self, data: bytes, folder: Path) -> bool:
+        """Read these bytes from a file in an empty folder -> whether they are sound.
+
+        AssertionError if they are refused in another way than by one line that names the file.
+        """
+        _, slash, name = self.name.rpartition("/")
+        if slash:
+            if not unpack(data, folder):
+                return False
+        else:
+            (folder / name).write_bytes(data)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                self.read(folder / name if name else folder)
+                return True
+            except GsmergeError as error:
+                refused = error
+        assert not isinstance(refused, SceneError) or str(folder) in str(refused), f"no file named: {refused}"
+        assert "\n" not in str(refused), f"several lines: {refused}"
+        return False
+
+
+def pack(folder: Path) -> bytes:
+    """Return the files of a folder as an archive."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as file:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            file.writestr(str(path.relative_to(folder)), path.read_bytes())
+    return packed.getvalue()
+
+
+def unpack(data: bytes, folder: Path) -> bool:
+    """Write the files of an archive into a folder, those with plain names; return whether it is an archive."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            contents = {name: file.read(name) for name in file.namelist() if PLAIN.fullmatch(name)}
+    except UNPACKING:
+        return False
+    for name, content in contents.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+    return bool(contents)
+
+
+def check_gaussians(path: Path) -> None:
+    """Read Gaussians; assert that they are sound."""
+    g = read_gaussians(path).gaussians
+    assert len(g) > 0
+    assert np.isfinite(g.means).all()
+    assert (g.scales >= 0).all()
+    assert np.isfinite(g.scales).all()
+    assert ((g.opacities >= 0) & (g.opacities <= 1)).all()
+    assert (np.abs(np.linalg.norm(g.quats.astype(np.float64), axis=1) - 1) < 1e-5).all()
+
+
+def check_cameras(path: Path) -> None:
+    """Read cameras; assert that they are sound."""
+    actual = read_cameras(path)
+    assert 0 < len(actual) == len(actual.viewmats) == len(actual.Ks) == len(actual.widths) == len(actual.heights)
+    assert np.isfinite(actual.viewmats).all()
+    assert np.isfinite(actual.Ks).all()
+    assert (actual.Ks[:, 0, 0] > 0).all()
+    assert (actual.widths >= 0).all()
+
+
+def check_arrays(path: Path) -> None:
+    """Read depths and cameras."""
+    read_depths(path)
+    check_cameras(path)
+
+
+def check_photo(path: Path) -> None:
+    """Read a photo; assert that its colours are in range."""
+    actual = read_images([path], [path.name])
+    assert actual.shape[0] == 1
+    assert ((actual >= 0) & (actual <= 1)).all()
+
+
+def check_mask(path: Path) -> None:
+    """Read a mask, and the transparency of a photo."""
+    decode_mask(path)
+    decode_alpha(path)
+
+
+def check_list(path: Path) -> None:
+    """List the scenes of a batch; a list may name no other folder here, so that none is searched."""
+    from gsmerge.batch.find import find_scenes
+
+    if b"/" not in path.read_bytes() and b".." not in path.read_bytes():
+        list(find_scenes([str(path)], path.parent / "out"))
+
+
+def check_pairs(path: Path) -> None:
+    """Parse values of ``--set``, one a line."""
+    for line in path.read_text("utf-8", "replace").splitlines():
+        with suppress(UsageError):
+            parse_pairs("--set", [line], flat_settings(CompactOptions))
+
+
+def check_settings(path: Path) -> None:
+    """Read settings of a training and of a chart."""
+    from gsmerge.research.charts.grid import read_grid
+    from gsmerge.research.training.train_options import read_config
+
+    with suppress(SceneError):
+        read_grid(path)
+    read_config(path)
+
+
+def written(name: str, degree: int = 0, **options: Any) -> Seeds:
+    """Make a file of six Gaussians."""
+
+    def make(folder: Path) -> Iterable[bytes]:
+        gsmerge.write_gaussians(folder / name, random_gaussians(6, 0, degree=degree), **options)
+        yield (folder / name).read_bytes()
+
+    return make
+
+
+def plys(folder: Path) -> Iterable[bytes]:
+    """Make a ``.ply`` as binary of both orders, as text, with a list element, and with comments."""
+    g, tiny = random_gaussians(5, 1, degree=1), make_tiny(4, 4)
+    gsmerge.write_ply(folder / "a.ply", g)
+    data = (folder / "a.ply").read_bytes()
+    head, rows = data.split(b"end_header\n")
+    values = np.frombuffer(rows, "<f4")
+    yield data
+    yield head.replace(b"little", b"big") + b"end_header\n" + values.astype(">f4").tobytes()
+    text = "".join(" ".join(f"{v:.3f}" for v in row) + "\n" for row in values.reshape(5, -1)).encode()
+    yield head.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + text
+    faces = b"element face 2\nproperty list uchar int vertex_indices\n"
+    yield head + faces + b"end_header\n" + rows + b"\1\0\0\0\0\2\0\0\0\0\1\0\0\0"
+    yield head.replace(b"element vertex", faces + b"element vertex") + b"end_header\n" + bytes(2) + rows
+    cameras = Cameras(tiny.w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
+    gsmerge.write_ply(folder / "b.ply", g, comments=camera_comments(cameras, tiny.names))
+    yield (folder / "b.ply").read_bytes()
+
+
+def sharp(folder: Path) -> Iterable[bytes]:
+    """Make a ``.ply`` with the camera of SHARP, with two Gaussians."""
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 2", "property float x"]
+    for name, count in (("extrinsic", 16), ("intrinsic", 9), ("image_size", 2)):
+        lines += [f"element {name} {count}", f"property float {name}"]
+    camera = [*np.eye(4).ravel(), 2, 0, 1, 0, 2, 1, 0, 0, 1, 1, 1]
+    yield "\n".join([*lines, "end_header\n"]).encode() + np.array([0, 0, *camera], "<f4").tobytes()
+
+
+def levels(folder: Path) -> Iterable[bytes]:
+    """Make two levels of detail."""
+    gsmerge.write_levels(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)])
+    yield pack(folder)
+
+
+def json_cameras(folder: Path) -> Iterable[bytes]:
+    """Make cameras of every kind of JSON file."""
+    tiny = make_tiny(4, 4)
+    write_transforms(folder / "a.json", tiny)
+    write_inria(folder / "b.json", tiny)
+    Ks = np.tile(tiny.K, (3, 1, 1)).tolist()
+    views = [{"camera_id": str(i), "matrix": m.tolist()} for i, m in enumerate(tiny.c2w)]
+    lenses = [{"camera_id": str(i), "matrix": m} for i, m in enumerate(Ks)]
+    save_json(folder / "c.json", {"num_cameras": 3, "extrinsics": views, "intrinsics": lenses})
+    lens = {"fl_x": 20, "fl_y": 20, "cx": 12, "cy": 8, "w": 24, "h": 16, "k1": 0.1, "camera_model": "OPENCV"}
+    frames = [{"file_path": f"{i}.png", "transform_matrix": m.tolist(), **lens} for i, m in enumerate(tiny.c2w)]
+    save_json(folder / "d.json", {"frames": frames, "applied_transform": np.eye(4)[:3].tolist()})
+    save_json(folder / "e.json", frames)
+    save_json(folder / "f.json", {"camera_angle_x": 0.8, "frames": [{k: f[k] for k in list(f)[:2]} for f in frames]})
+    for name in "abcdef":
+        yield (folder / f"{name}.json").read_bytes()
+
+
+def colmap(write: Callable[..., None]) -> Seeds:
+    """Make a COLMAP model."""
+
+    def make(folder: Path) -> Iterable[bytes]:
+        write(folder, make_tiny(4, 4))
+        yield pack(folder)
+
+    return make
+
+
+def pose_list(folder: Path) -> Iterable[bytes]:
+    """Make a list of poses, with intrinsics beside it."""
+    (folder / "camera_poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
+    (folder / "intrinsic.txt").write_text("20 20 12 8\n")
+    yield pack(folder)
+
+
+def moved(folder: Path) -> Iterable[bytes]:
+    """Make Long-LRM's cameras, with the files that say how they were moved."""
+    export = long_lrm(folder / "export")
+    for name in ("input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"):
+        (folder / name).write_bytes((folder / "export" / name).read_bytes())
+    path = export.options["cameras"]
+    flat = folder / "flat"
+    flat.mkdir()
+    for file in (path, *folder.glob("*.txt")):
+        (flat / file.name).write_bytes(file.read_bytes())
+    yield pack(flat)
+
+
+def dataparser(folder: Path) -> Iterable[bytes]:
+    """Make the file in which nerfstudio says how it moved the cameras."""
+    save_json(folder / "dataparser_transforms.json", {"transform": np.eye(4)[:3].tolist(), "scale": 0.5})
+    save_json(folder / "transforms.json", {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0})
+    yield pack(folder)
+
+
+def arrays(folder: Path) -> Iterable[bytes]:
+    """Make ``.npz`` files of every kind."""
+    tiny = make_tiny(4, 4)
+    write_npz(folder / "a.npz", tiny)
+    Ks = np.tile(tiny.K, (3, 1, 1))
+    np.savez_compressed(folder / "b.npz", c2w=tiny.c2w, K=Ks, images=tiny.images, order="view-major")
+    np.savez(folder / "c.npz", extrinsic=tiny.w2c[None, :, :3], intrinsic=Ks[None])
+    for name in "abc":
+        yield (folder / f"{name}.npz").read_bytes()
+
+
+def chunk(folder: Path) -> Iterable[bytes]:
+    """Make a ``.torch`` chunk of one scene."""
+    import torch
+
+    rows = torch.cat([torch.tensor([[0.9, 0.9, 0.5, 0.5, 0, 0]]), torch.eye(4)[:3].reshape(1, 12)], 1)
+    photo = torch.from_numpy(np.frombuffer(next(photos(folder, (".jpg",))), np.uint8).copy())
+    torch.save([{"key": "a", "cameras": rows, "images": [photo]}], folder / "a.torch")
+    yield (folder / "a.torch").read_bytes()
+
+
+def photos(folder: Path, endings: Sequence[str] = PHOTO_ENDINGS) -> Iterator[bytes]:
+    """Make a small photo in every format, and PNG files with transparency, a palette and 16 bits."""
+    picture = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
+    for ending in endings:
+        yield cv2.imencode(ending, picture)[1].tobytes()
+    if ".png" in endings:
+        for image in (picture[..., 0], np.dstack([picture, picture[..., 0]]), picture.astype(np.uint16) * 257):
+            yield cv2.imencode(".png", image)[1].tobytes()
+
+
+def encoded(folder: Path) -> Iterable[bytes]:
+    """Make an encoded scene, and the state of two batches."""
+    scene = gsmerge.read_scene(make_tiny(6, 4).save(folder / "scene"))
+    gsmerge.save_encoded(folder / "a.gsm", gsmerge.encode_scene(scene, checkpoint="none"))
+    compactor = Compactor(checkpoint="none")
+    compactor.extend(scene)
+    compactor.save(folder / "b.gsm")
+    for name in "ab":
+        yield (folder / f"{name}.gsm").read_bytes()
+
+
+def checkpoint(folder: Path) -> Iterable[bytes]:
+    """Make small networks of zeros."""
+    options = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
+    arrays = {name: np.zeros(shape, np.float32) for name, shape in weight_shapes(options).items()}
+    save_checkpoint(folder / "a", NetworkWeights(options, arrays), {"steps": 0})
+    yield (folder / "a").read_bytes()
+
+
+def texts(*contents: bytes) -> Seeds:
+    """Make text files of this content."""
+    return lambda folder: contents
+
+
+TRAINING = b'{"steps": 100, "rate": 0.001, "densities": [0.1, 0.2], "network": {"width": 32}, "seed": 3}'
+PAIRS = b'k=2\nfit=none\nmin_opacity=0.01\nbudget=300\nquality=high\nphotos=null\nk="auto"\nlevels=1e3\n'
+TARGETS: dict[str, Target] = {
+    "ply": Target("a.ply", plys, check_gaussians),
+    "ply-compressed": Target("a.compressed.ply", written("a.compressed.ply", 1), check_gaussians),
+    "spz": Target("a.spz", written("a.spz", 1), check_gaussians),
+    "spz-4": Target("a.spz", written("a.spz", 1, spz_version=4), check_gaussians),
+    "sog": Target("a.sog", written("a.sog", 1), check_gaussians),
+    "splat": Target("a.splat", written("a.splat"), check_gaussians),
+    "glb": Target("a.glb", written("a.glb", 1), check_gaussians),
+    "levels": Target("levels/lod-meta.json", levels, check_gaussians),
+    "cameras-json": Target("cameras.json", json_cameras, check_cameras),
+    "colmap-text": Target("colmap/", colmap(write_colmap_text), check_cameras),
+    "colmap-binary": Target("colmap/", colmap(write_colmap_binary), check_cameras),
+    "pose-list": Target("poses/camera_poses.txt", pose_list, check_cameras),
+    "long-lrm": Target("moved/opencv_cameras.json", moved, check_cameras),
+    "dataparser": Target("moved/transforms.json", dataparser, lambda path: read_dataparser(path, path)),
+    "npz": Target("results.npz", arrays, check_arrays),
+    "chunk": Target("000000.torch", chunk, check_cameras),
+    "cameras-embedded": Target("a.ply", plys, check_cameras),
+    "sharp": Target("a.ply", sharp, read_sharp_camera),
+    "gsm": Target("a.gsm", encoded, load_stored),
+    "checkpoint": Target("a.safetensors", checkpoint, load_checkpoint),
+    "settings-json": Target("a.json", texts(TRAINING), check_settings),
+    "settings-toml": Target("a.toml", texts(b"steps = 100\nrate = 1e-3\n[network]\nwidth = 32\n"), check_settings),
+    "photo": Target("a.png", photos, check_photo),
+    "mask": Target("a.png", photos, check_mask),
+    "list": Target("list.txt", texts(b"a.ply\n# b\nscene c\n\nd.spz\n"), check_list),
+    "set": Target("pairs.txt", texts(PAIRS), check_pairs),
+}
+
+
+def seeds_of(target: Target) -> list[bytes]:
+    """Make the sound files of a target."""
+    with tempfile.TemporaryDirectory() as folder:
+        return list(target.seeds(Path(folder)))
