@@ -20,6 +20,7 @@ TASKS = {
     "docs": (("python", "docs/generate_reference.py", "--check"),),
     "reference": (("python", "docs/generate_reference.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
+    "kills": (("python", "benchmarks/kills.py"),),
     "preview": (("python", "tools/make_preview.py"),),
     "small": (("python", "tools/small_modules.py"),),
 }

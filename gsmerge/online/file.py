@@ -167,7 +167,8 @@ def extend_file(
     """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process
-    has changed it; of processes that end together, the second waits for the first and then sees its change. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
+    has changed it; of processes that end together, the second waits for the first and then sees its
+    change. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
     ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a file
     cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of
     range, or needs what the state or the scene does not have.
