@@ -22,6 +22,7 @@ TASKS = {
     "reference": (("python", "docs/generate_reference.py"),),
     "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
+    "kills": (("python", "benchmarks/kills.py"),),
     "preview": (("python", "tools/make_preview.py"),),
     "small": (("python", "tools/small_modules.py"),),
 }

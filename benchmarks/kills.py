@@ -1,11 +1,13 @@
-"""Commands that end at random moments: nothing half-written under an output's name, nothing left beside it.
+"""Commands that end before each call that changes their folder, on a disk that keeps all or drops what was not synced.
 
-python benchmarks/kills.py                                  # 50 moments of each signal, four commands; about an hour
-python benchmarks/kills.py --kills 5 --commands extend batch
+python benchmarks/kills.py                                       # every call of six commands; Linux and gcc
+python benchmarks/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
 
-Each run is a process of its own on a small scene, ended by SIGTERM, SIGHUP or SIGKILL. Half of the moments are spread
-over the whole of an undisturbed run, half over its last third, in which it works and writes. A process that is ended
-before it has set up its handlers ends as Python does; shells report the same code.
+A preloaded library (kills.c) counts the calls (opens for writing, writes, syncs, renames, removals, new folders) and
+ends the process by SIGKILL before one of them. Then every file must be what it was or what the command makes, no index
+may name a missing chunk, and the next run must make all and leave nothing beside it. The same must hold of the disks
+that a loss of power may leave: files are as long as at their last sync, and of the names that changed since their
+folder's last sync, all are lost, none, any single one, or all but one.
 """
 
 from __future__ import annotations
@@ -14,97 +16,106 @@ import argparse
 import hashlib
 import importlib
 import json
-import random
+import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-SIGNALS = ("SIGTERM", "SIGHUP", "SIGKILL")
-FAST = ("--effort", "draft", "--fit", "none", "--threads", "1")
-PATIENCE = 120  # seconds, on a machine that is busy with other things
-WRITES = 1 / 3  # share of a run, at its end, that gets half of the moments
-OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
+import numpy as np
 
-Contents = dict[str, str]  # name in the output folder -> SHA-256
+ROOT = Path(__file__).resolve().parent.parent
+FAST = "--effort draft --fit none --threads 1"
+COMPACT = f"compact {{scene}} -o {{out}}/a.ply --levels 2 --report {{out}}/a.json --overwrite {FAST}"
+LOD = f"compact {{scene}} -o {{out}}/lod/lod-meta.json --levels 2 --overwrite {FAST}"
+# What is run, with the scene of {scene}, and what is run before for the earlier files
+COMMANDS = {
+    "compact": (COMPACT.format(scene="{a}", out="{out}"), COMPACT.format(scene="{b}", out="{out}")),
+    "extend": ("extend {out}/a.gsm {b} --effort draft --threads 1", "extend {out}/a.gsm {a} --effort draft"),
+    "batch": (f"batch {{scenes}} -o {{out}} --jobs 1 {FAST}", None),
+    "encode": tuple(f"encode {{{x}}} -o {{out}}/a.gsm --effort draft --threads 1 --overwrite" for x in "ab"),
+    "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
+    "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
+}
+OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
+RECORDS = ("batch.jsonl", "summary.csv")  # of batches, for the next run
+
+Contents = dict[str, str]  # name in a folder -> SHA-256
 
 
 @dataclass(frozen=True)
-class Command:
-    """A command, what is there before, and what it writes."""
+class Ended:
+    """How a run ended."""
 
-    words: Callable[[Path, Path], list[str]]  # of the scenes' folder and of the output folder
-    outputs: tuple[str, ...]  # that are there together or not at all
-    prepare: Callable[[Path, Path], list[str]] | None = None  # the words that write earlier outputs
-    needs_earlier: bool = False  # whether it goes on from them
-    resumes: bool = False  # whether a run that was ended leaves files of its own for the next
+    code: int  # -9: by SIGKILL
+    text: str  # what it printed
+    calls: list[list[str]]  # kind, number of the file, its size, path, target
 
 
-COMMANDS = {
-    "compact": Command(
-        lambda scenes, out: [
-            *("compact", str(scenes / "a"), "-o", str(out / "a.ply"), "--levels", "2"),
-            *("--report", str(out / "a.json"), "--overwrite", *FAST),
-        ],
-        ("a.ply", "a.level1.ply", "a.cameras.json", "a.json"),
-        lambda scenes, out: [
-            *("compact", str(scenes / "b"), "-o", str(out / "a.ply"), "--levels", "2"),
-            *("--report", str(out / "a.json"), *FAST),
-        ],
-    ),
-    "encode": Command(
-        lambda scenes, out: [
-            *("encode", str(scenes / "a"), "-o", str(out / "a.gsm"), "--effort", "draft", "--overwrite"),
-        ],
-        ("a.gsm",),
-        lambda scenes, out: ["encode", str(scenes / "b"), "-o", str(out / "a.gsm"), "--effort", "draft"],
-    ),
-    "extend": Command(
-        lambda scenes, out: ["extend", str(out / "a.gsm"), str(scenes / "b"), "--effort", "draft"],
-        ("a.gsm",),
-        lambda scenes, out: ["extend", str(out / "a.gsm"), str(scenes / "a"), "--effort", "draft"],
-        needs_earlier=True,
-    ),
-    "batch": Command(
-        lambda scenes, out: ["batch", str(scenes), "-o", str(out), "--jobs", "2", *FAST],
-        ("a.ply", "b.ply"),
-        resumes=True,
-    ),
-}
+@dataclass(frozen=True)
+class Place:
+    """The folders of one command's runs."""
+
+    scenes: Path
+    out: Path
+    keep: Path  # links to files that were replaced or removed
+    notes: Path  # counter, list of calls, and what was printed
+
+    def run(self, words: str, at: int = 0) -> Ended:
+        """Run a command in a child with all modules loaded, which ends before one of its calls."""
+        shutil.rmtree(self.keep, ignore_errors=True)
+        shutil.rmtree(self.notes, ignore_errors=True)
+        self.keep.mkdir()
+        self.notes.mkdir()
+        (self.notes / "count").write_bytes(bytes(8))
+        files = {"out": self.out, "scenes": self.scenes, "a": self.scenes / "a", "b": self.scenes / "b"}
+        call = [word.format(**files) for word in words.split()]
+        log, printed = self.notes / "calls", self.notes / "printed"
+        log.touch()
+        printed.touch()
+        env = {"FOLDER": self.out, "KEEP": self.keep, "COUNT": self.notes / "count", "LOG": log, "AT": at}
+        if (child := os.fork()) == 0:
+            os.environ.update({f"KILLS_{key}": str(value) for key, value in env.items()})
+            os._exit(_main(call, printed))
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        return Ended(code, printed.read_text(), [line.split("\t") for line in log.read_text().splitlines()])
+
+    def set_up(self, earlier: Path) -> None:
+        """Make the output folder what it is before a run."""
+        shutil.rmtree(self.out, ignore_errors=True)
+        shutil.copytree(earlier, self.out)
 
 
-def gsmerge(words: list[str]) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "gsmerge", *words]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def _main(call: list[str], printed: Path) -> int:
+    """Run a command with its output in a file -> exit code."""
+    from gsmerge.cli import main
+
+    with printed.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        code = main(call)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return code
 
 
-def finish(words: list[str]) -> float:
-    """Run a command to its end; its seconds."""
-    start = time.perf_counter()
-    process = gsmerge(words)
-    _, err = process.communicate(timeout=PATIENCE)
-    if process.returncode:
-        raise SystemExit(f"an undisturbed run failed: {' '.join(words)}: {err}")
-    return time.perf_counter() - start
+def read_files(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every file below a folder by its name."""
+    return {str(x.relative_to(folder)): x.read_bytes() for x in sorted(folder.rglob("*")) if x.is_file()}
 
 
-def contents(folder: Path) -> Contents:
-    """Every file below a folder; reports without what differs from run to run."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {str(path.relative_to(folder)): hashlib.sha256(_content(path)).hexdigest() for path in files}
+def contents(files: dict[str, bytes]) -> Contents:
+    """Hash files; reports without what differs from run to run, batches without their records."""
+    return {name: hashlib.sha256(_settled(name, x)).hexdigest() for name, x in files.items() if name not in RECORDS}
 
 
-def _content(path: Path) -> bytes:
-    data = path.read_bytes()
-    if path.suffix != ".json":
+def _settled(name: str, data: bytes) -> bytes:
+    if not name.endswith(".json"):
         return data
     try:
         return json.dumps(json.loads(data, object_hook=_without_times)).encode()
@@ -116,149 +127,98 @@ def _without_times(document: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in document.items() if key not in OF_THE_RUN}
 
 
-def results(folder: Path) -> Contents:
-    """What a batch wrote, without its records, whose lines differ from run to run."""
-    return {name: digest for name, digest in contents(folder).items() if name not in ("batch.jsonl", "summary.csv")}
+def faults_of(files: dict[str, bytes], old: Contents, new: Contents) -> Iterator[str]:
+    """Yield what is wrong with files that a command left unfinished."""
+    actual = contents(files)
+    for name in sorted({*old, *new}):
+        if actual.get(name) not in (old.get(name), new.get(name)):
+            yield f"{name} is {'half-written' if name in actual else 'gone'}"
+    for name in sorted(actual.keys() - {*old, *new}):
+        if not Path(name).name.startswith((".gsmerge-", ".batch-")):
+            yield f"{name} is neither an output nor temporary"
+    for name in files.keys() & {"lod/lod-meta.json"}:
+        missing = [x for x in json.loads(files[name] or b"{}").get("filenames", []) if f"lod/{x}" not in files]
+        yield from [f"the index names {missing}"] if missing else []
+    for line in files.get(RECORDS[0], b"").split(b"\n")[:-1]:
+        for file in json.loads(line)["files"]:
+            if hashlib.sha256(files.get(file["path"], b"")).hexdigest() != file["sha256"]:
+                yield f"the record of {file['path']} is of another file"
 
 
-@dataclass
-class Trial:
-    """A command that is ended again and again in one folder."""
-
-    name: str
-    scenes: Path
-    out: Path
-    faults: list[str] = field(default_factory=list)
-    codes: Counter[str] = field(default_factory=Counter)
-    mixed: int = 0  # SIGKILL between two renames: each file whole, but not all new
-
-    def __post_init__(self) -> None:
-        self.command = COMMANDS[self.name]
-        self.words = self.command.words(self.scenes, self.out)
-        self.given = contents(self.scenes)
-        self.earlier: Contents = {}
-        self.set_up(earlier=True)
-        self.earlier = contents(self.out)
-        self.kept = self.out.with_name(f"{self.out.name}-earlier")
-        shutil.rmtree(self.kept, ignore_errors=True)
-        shutil.copytree(self.out, self.kept)
-        self.seconds = min(finish(self.words), self._again())
-        self.new = results(self.out) if self.command.resumes else contents(self.out)
-
-    def _again(self) -> float:
-        """A second undisturbed run: the first one also loads what the disk has."""
-        self.set_up(earlier=True)
-        return finish(self.words)
-
-    def set_up(self, *, earlier: bool) -> None:
-        """The output folder as it is before a run."""
-        shutil.rmtree(self.out, ignore_errors=True)
-        if self.earlier and earlier:
-            shutil.copytree(self.kept, self.out)
-            return
-        self.out.mkdir()
-        if earlier and self.command.prepare is not None:
-            finish(self.command.prepare(self.scenes, self.out))
-
-    def run(self, kills: int, seed: int) -> None:
-        """End the command so often with each signal."""
-        rng = random.Random(f"{seed} {self.name}")
-        for number in range(kills * len(SIGNALS)):
-            name, turn = SIGNALS[number % len(SIGNALS)], number // len(SIGNALS)
-            share = rng.random() if turn % 2 else 1 - WRITES * rng.random()
-            self.set_up(earlier=self.command.needs_earlier or turn % 4 < 2)
-            before = contents(self.out)
-            code, err, seconds = self.end_at(share * self.seconds, name)
-            if code == 0:  # as fast as the machine is now
-                self.seconds = (self.seconds + seconds) / 2
-            self.codes[f"{name} {code}"] += 1
-            for fault in self.check(name, code, err, before, again=turn % 5 == 0):
-                self.faults.append(f"{self.name}, {name} after {share * self.seconds:.3f} s: {fault}")
-                print(self.faults[-1], flush=True)
-            if number % 30 == 29:
-                print(f"{self.name}: {number + 1} of {kills * len(SIGNALS)}", file=sys.stderr, flush=True)
-
-    def end_at(self, seconds: float, name: str) -> tuple[int, str, float]:
-        """Exit code, error text and seconds of a run that gets a signal."""
-        start = time.perf_counter()
-        process = gsmerge(self.words)
-        time.sleep(max(0.0, start + seconds - time.perf_counter()))
-        process.send_signal(signal.Signals[name])
-        try:
-            _, err = process.communicate(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return 1, f"still runs after {PATIENCE} s", PATIENCE
-        return process.returncode, err, time.perf_counter() - start
-
-    def check(self, name: str, code: int, err: str, before: Contents, *, again: bool) -> list[str]:
-        """What is wrong after a run was ended."""
-        number, faults = signal.Signals[name].value, []
-        orderly = (f"gsmerge: error: ended by {name}",) if code == 128 + number else ()
-        if code not in (0, -number, *([128 + number] if name != "SIGKILL" else [])):
-            faults.append(f"exit code {code}: {err.strip()}")
-        elif "Traceback" in err or (orderly and err.splitlines()[-1:] != list(orderly)):
-            faults.append(f"says {err.strip()!r}")
-        if contents(self.scenes) != self.given:
-            faults.append("an input has changed")
-        after = contents(self.out)
-        faults += self.half_written(name, code, before, after)
-        left = {path for path in after if path not in before and path not in self.new}
-        own = {"batch.jsonl", "summary.csv"} | {path for path in left if path.startswith(".batch-")}  # for the next run
-        if orderly and left - own:
-            faults.append(f"left {sorted(left)}")
-        if left or again or self.command.resumes:
-            faults += self.check_next()
-        return faults
-
-    def half_written(self, name: str, code: int, before: Contents, after: Contents) -> list[str]:
-        """Outputs that are neither what was there before nor what the command makes."""
-        faults, states = [], set()
-        for output in self.command.outputs:
-            if after.get(output) == self.new[output]:
-                states.add("new")
-            elif after.get(output) == before.get(output):
-                states.add("old")
-            else:
-                faults.append(f"{output} is {'gone' if output not in after else 'half-written'}")
-        if len(states) > 1 and not self.command.resumes:
-            self.mixed += name == "SIGKILL"
-            if name != "SIGKILL":
-                faults.append("some outputs are new and some are not")
-        if code == 0 and "old" in states and before != self.new:
-            faults.append("exit code 0 without its outputs")
-        return faults + (_record_faults(self.out) if self.command.resumes else [])
-
-    def check_next(self) -> list[str]:
-        """The next run: the whole result, and nothing beside it."""
-        if self.command.needs_earlier and contents(self.out)["a.gsm"] == self.new["a.gsm"]:
-            return []  # it would add the views once more
-        process = gsmerge(self.words)
-        _, err = process.communicate(timeout=PATIENCE)
-        faults = [f"the next run ends with {process.returncode}: {err.strip()}"] if process.returncode else []
-        actual = results(self.out) if self.command.resumes else contents(self.out)
-        if actual != self.new:
-            faults.append(f"after the next run: {sorted(set(actual.items()) ^ set(self.new.items()))}")
-        return faults
+def disks(place: Place, calls: list[list[str]], before: dict[str, os.stat_result]) -> Iterator[dict[str, bytes]]:
+    """Yield the files that a loss of power may leave; ``before``: the files and folders before the run."""
+    written = {x.stat().st_ino: x for folder in (place.keep, place.out) for x in folder.rglob("*") if x.is_file()}
+    synced = {status.st_ino: status.st_size for status in before.values()}
+    lasting = {path: status.st_ino for path, status in before.items()}
+    pending: list[dict[str, int]] = []
+    for kind, number, size, path, target in calls:
+        if kind == "create":
+            pending.append({path: int(number)})
+        elif kind == "rename":
+            pending.append({path: 0, target: int(number)})
+        elif kind == "unlink":
+            pending.append({path: 0})
+        elif kind == "truncate":
+            synced[int(number)] = 0
+        elif kind == "fsync":
+            synced[int(number)] = int(size)
+            for change in [x for x in pending if str(Path(next(iter(x))).parent) == path]:
+                lasting |= change
+                pending.remove(change)
+    everything = range(len(pending))
+    choices = {(), tuple(everything), *((i,) for i in everything)}
+    choices |= {tuple(i for i in everything if i != lost) for lost in everything}
+    for choice in sorted(choices):
+        tree = dict(lasting)
+        for i in choice:
+            tree |= pending[i]
+        yield {
+            path.removeprefix(f"{place.out}/"): written[number].read_bytes()[: synced.get(number, 0)]
+            for path, number in tree.items()
+            if number in written and all(tree.get(str(x)) for x in Path(path).parents if x.is_relative_to(place.out))
+        }
 
 
-def _record_faults(out: Path) -> list[str]:
-    """Records that are not whole, or of files that are not what they say."""
-    path = out / "batch.jsonl"
-    faults = []
-    for line in path.read_bytes().split(b"\n")[:-1] if path.exists() else []:
-        try:
-            record = json.loads(line)
-            for file in record["files"]:
-                if hashlib.sha256((out / file["path"]).read_bytes()).hexdigest() != file["sha256"]:
-                    faults.append(f"the record of {file['path']} is of another file")
-        except (ValueError, KeyError, OSError) as error:
-            faults.append(f"a record is damaged: {error!r}")
-    return faults
+def try_command(name: str, place: Place, most: int | None) -> tuple[Counter[str], int, list[str]]:
+    """End a command before its calls -> kills by kind of call, number of disks, faults."""
+    words, first = COMMANDS[name]
+    place.out.mkdir(parents=True)
+    if first and (done := place.run(first)).code:
+        raise SystemExit(f"an undisturbed run failed: {first}: {done.text}")
+    earlier = place.out.with_name("earlier")
+    shutil.copytree(place.out, earlier)
+    old, inputs = contents(read_files(place.out)), contents(read_files(place.scenes))
+    if (done := place.run(words)).code:
+        raise SystemExit(f"an undisturbed run failed: {words}: {done.text}")
+    new, last = contents(read_files(place.out)), int.from_bytes((place.notes / "count").read_bytes(), "little")
+    chosen = np.unique(np.linspace(1, last, min(last, most or last)).round().astype(int))
+    kinds: Counter[str] = Counter()
+    num_disks, faults = 0, []
+    for at in [*chosen, last + 1]:
+        place.set_up(earlier)
+        before = {str(x): x.stat() for x in (place.out, *place.out.rglob("*"))}
+        ended = place.run(words, at)
+        kind = next((call[3] for call in ended.calls if call[0] == "end"), "the end")
+        kinds[kind] += kind != "the end"
+        codes = (0,) if kind == "the end" else (-9, 0) if name == "batch" else (-9,)  # a batch replaces its worker
+        wrong = [] if ended.code in codes else [f"exit code {ended.code}: {ended.text}"]
+        wrong += faults_of(left := read_files(place.out), old, new)
+        lasting = old if ended.code else old | new  # chunks of the old index may come back
+        for files in disks(place, ended.calls, before):
+            num_disks += 1
+            wrong += [f"after a loss of power, {x}" for x in faults_of(files, lasting, new)]
+        if name != "extend" or contents(left) != new:  # which would add the views once more
+            again = place.run(words)
+            wrong += [f"the next run ends with {again.code}: {again.text}"] if again.code else []
+        if (after := contents(read_files(place.out))) != new:
+            wrong.append(f"after the next run: {sorted(after.items() ^ new.items())}")
+        wrong += ["an input has changed"] if contents(read_files(place.scenes)) != inputs else []
+        faults += [f"{name}, before call {at} of {last} ({kind}): {x}" for x in dict.fromkeys(wrong)]
+    return kinds, num_disks, faults
 
 
 def make_scenes(folder: Path) -> Path:
-    """Two small scenes of one world in a folder."""
+    """Make two small scenes of one world in a folder."""
     sys.path.insert(0, str(ROOT / "examples"))
     make = importlib.import_module("01_make_scene").make_scene
     for num_views, name in ((3, "a"), (4, "b")):
@@ -267,27 +227,33 @@ def make_scenes(folder: Path) -> Path:
     return folder
 
 
-def main() -> None:
+def main() -> int:
+    """Try the commands, and return 1 if there are faults."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--kills", type=int, default=50, help="of each signal and command")
+    parser.add_argument("--calls", type=int, help="calls of each command, at equal distances; default: all")
     parser.add_argument("--commands", nargs="*", choices=list(COMMANDS), default=list(COMMANDS))
-    parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup all runs would ignore it
-    faults = 0
+    if "KILLS_LIBRARY" not in os.environ:
+        with tempfile.TemporaryDirectory() as folder:
+            library = f"{folder}/kills.so"
+            subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, str(ROOT / "benchmarks" / "kills.c")], check=True)
+            env = {**os.environ, "LD_PRELOAD": library, "KILLS_LIBRARY": library}
+            return subprocess.run([sys.executable, *sys.argv], env=env, check=False).returncode
+    num_faults = 0
     with tempfile.TemporaryDirectory() as folder:
         scenes = make_scenes(Path(folder) / "scenes")
         for name in args.commands:
-            trial = Trial(name, scenes, Path(folder) / name)
-            trial.run(args.kills, args.seed)
-            faults += len(trial.faults)
-            codes = ", ".join(f"{key}: {count}" for key, count in sorted(trial.codes.items()))
+            place = Place(scenes, *(Path(folder) / name / part for part in ("out", "keep", "notes")))
+            kinds, num_disks, faults = try_command(name, place, args.calls)
+            counts = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()) if count)
             print(
-                f"{name}: {args.kills * len(SIGNALS)} kills in {trial.seconds:.1f} s each, {len(trial.faults)} faults,"
-                f" {trial.mixed} between renames; {codes}", flush=True,
-            )  # fmt: skip
-    sys.exit(1 if faults else 0)
+                f"{name}: kills before {kinds.total()} calls ({counts}), {num_disks} disks, {len(faults)} faults",
+                flush=True,
+            )
+            print("".join(f"  {fault}\n" for fault in faults), end="", flush=True)
+            num_faults += len(faults)
+    return 1 if num_faults else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

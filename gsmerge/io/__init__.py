@@ -2,6 +2,7 @@
 
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs
+from gsmerge.io.atomic import lock_folder as lock_folder
 from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras

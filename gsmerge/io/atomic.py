@@ -19,11 +19,17 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Protocol
 
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
@@ -59,8 +65,8 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
     """Write several files and rename all of them at the end; if the block fails, none is left.
 
     Yields a function that makes each file, as :func:`atomic_output`. A process that is killed between two renames,
-    or a disk that fails there, leaves each file whole, old or new. Files in deeper folders are renamed first, so that
-    an index above them never names one that is not there.
+    or a disk that fails there, leaves each file whole, old or new. Files in deeper folders are renamed first, and their
+    names are on the disk before others are renamed, so that an index above them never names one that is not there.
     """
     made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
     folders: list[Path] = []
@@ -88,11 +94,10 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
             _refuse(path, overwrite)  # somebody else may have been quicker
         for temporary in made:
             _flush(temporary)
-        deepest_first = sorted(made.items(), key=lambda item: -len(item[1][0].parts))
+        for folder in {folder.parent for folder in folders}:
+            _flush_names(folder)
+        deepest_first = sorted(made.items(), key=lambda item: (-len(item[1][0].parts), item[1][1].parent))
         _rename_all([(temporary, target) for temporary, (_, target) in deepest_first])
-        for folder in {target.parent for _, target in made.values()}:
-            with suppress(OSError):  # not every system can
-                _flush(folder)
     except SceneError as error:
         if error.path not in made:
             raise
@@ -125,13 +130,36 @@ def _make_folder(folder: Path) -> bool:
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
-    """Give each temporary file its name; an interrupt takes effect after the last."""
+    """Give each temporary file its name, folder by folder; an interrupt takes effect after the last."""
     try:
-        for temporary, target in files:
-            os.replace(temporary, target)
+        for folder, group in groupby(files, lambda file: file[1].parent):
+            for temporary, target in group:
+                os.replace(temporary, target)
+            _flush_names(folder)
     except KeyboardInterrupt:
         _rename_all([(temporary, target) for temporary, target in files if os.path.lexists(temporary)])
         raise
+
+
+@contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Let one process at a time into such a block of a folder, and others wait, where the system can lock folders."""
+    descriptor = None
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _flush_names(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk; not every system can."""
+    with suppress(OSError):
+        _flush(folder)
 
 
 def _flush(path: str | Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -16,7 +17,7 @@ from gsmerge.compaction.files import read_input
 from gsmerge.encoded.encoded import Encoded, without_members
 from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_output
+from gsmerge.io import atomic_output, lock_folder
 from gsmerge.networks.options import CORRECTED
 from gsmerge.online.extend import extend
 from gsmerge.online.options import merge_settings
@@ -173,7 +174,8 @@ def extend_file(
     """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
 
     The file is replaced when all is done, and not at all if anything goes wrong or another process
-    has changed it. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
+    has changed it; of processes that end together, the second waits for the first and then sees its
+    change. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
     ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a file
     cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of
     range, or needs what the state or the scene does not have.
@@ -184,13 +186,14 @@ def extend_file(
         options, online = merge_settings(settings, None if state is None else state.about["options"])
     except ValueError as error:
         raise UsageError(str(error)) from error
-    with atomic_output(path, overwrite=identity is not None) as temporary:
+    with ExitStack() as until_renamed, atomic_output(path, overwrite=identity is not None) as temporary:
         loaded = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         state, report = extend(state, load.scene, options, online, progress=progress)
         done = perf_counter()
         save_state(temporary, state, overwrite=True)
+        until_renamed.enter_context(lock_folder(path.resolve().parent))
         if _file_identity(path) != identity:
             raise SceneError(path, "was changed by another process meanwhile", "extend it again; it is as that left it")
     seconds = {**(seconds_before or {}), "load": loaded - start, "read": read - loaded, **report.seconds}

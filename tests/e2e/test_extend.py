@@ -8,16 +8,22 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hostile.gsm_files import Spoil, cut, with_header
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.errors import SceneError
 from gsmerge.online.file import load_state
+from gsmerge.scene.files import find_scene_files
 
 from .conftest import Outcome, Run, assert_refused, listing
 
@@ -294,6 +300,46 @@ def test_a_state_that_another_process_makes_meanwhile(
     monkeypatch.setattr(files, "extend", slowly)
     assert_refused(run("extend", state, walks[0], *SMALL), 3, state, "process")
     assert state.read_bytes() == states[1].read_bytes()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders are locked by POSIX")
+@pytest.mark.parametrize("exists", [False, True])
+def test_two_that_end_together_lose_no_batch(
+    exists: bool, state: Path, walks: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both have read the state before either goes on; whoever may rename waits until the other may as well, or not."""
+    import gsmerge.io.atomic as atomic
+    import gsmerge.online.file as files
+
+    path = state if exists else tmp_path / "new.gsm"
+    before = len(load_state(path).about["batches"]) if exists else 0
+    extended, renamed = files.extend, atomic._rename_all
+    both_read, both_rename = threading.Barrier(2), threading.Barrier(2)
+
+    def extend_together(*arguments: Any, **named: Any) -> Any:
+        both_read.wait(PATIENCE)
+        return extended(*arguments, **named)
+
+    def rename_together(pairs: Any) -> None:
+        with suppress(threading.BrokenBarrierError):
+            both_rename.wait(1)
+        renamed(pairs)
+
+    monkeypatch.setattr(files, "extend", extend_together)
+    monkeypatch.setattr(atomic, "_rename_all", rename_together)
+    settings = {} if exists else {"superpixels": 60}
+    with ThreadPoolExecutor(2) as pool:
+        scenes = [find_scene_files(walk) for walk in walks]
+        ends = [pool.submit(files.extend_file, path, scene, settings) for scene in scenes]
+    refusals = [end.exception() for end in ends if end.exception() is not None]
+    assert [type(refusal) for refusal in refusals] == [SceneError]
+    assert "another process" in str(refusals[0])
+    assert len(load_state(path).about["batches"]) == before + 1
+    monkeypatch.undo()
+    for walk, end in zip(walks, ends, strict=True):
+        if end.exception() is not None:
+            files.extend_file(path, find_scene_files(walk), {})
+    assert len(load_state(path).about["batches"]) == before + 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of files as Linux has them")

@@ -279,6 +279,11 @@ def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pyt
         for name in ("a.txt", "b.txt"):
             add(tmp_path / name).write_text("new")
     assert events == ["file", "file", "rename", "rename", "folder"]
+    events.clear()
+    with atomic_outputs() as add:
+        add(tmp_path / "index").write_text("new")
+        add(tmp_path / "new" / "chunk", make_folder=True).write_text("new")
+    assert events == ["file", "file", "folder", "rename", "folder", "rename", "folder"]  # the chunk before its index
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
