@@ -65,10 +65,8 @@ def compact(args: opt.Args) -> None:
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
-    check_outputs(
-        (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run,
-        made=out.parent if streamed else None,
-    )  # fmt: skip
+    named = (out, *levels, args.report, beside, args.save_cameras)
+    check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, settings.budget, levels=True)
     if args.embed_cameras:
         check_embedding(out, settings.budget)

@@ -73,7 +73,7 @@ def compact_files(
     start, out = perf_counter(), outputs.result
     streamed = output_format(out, outputs.spz_version, levels=True).ending == INDEX
     with atomic_outputs(overwrite=outputs.overwrite) as add:
-        at = {out: add(out, make_folder=streamed)}
+        at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
         load = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(load.scene, outputs.saved_cameras, embed=outputs.embed_cameras)
