@@ -90,7 +90,9 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
         if holder is not None and (scene.images is not None or scene.aligned):
             with suppress(SceneError):  # whose ever it is, results can be measured without it
                 read = read_cameras(holder)
-        if read is None or holder is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
+        if read is None or holder is None or read.names != scene.names:
+            continue
+        if np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
             continue
         cameras[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))

@@ -21,6 +21,7 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import prepare, render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
 from gsmerge.raster.photos import COVERED, NEAR, WHOLE
+from gsmerge.report import html_table
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
@@ -131,6 +132,22 @@ class Evaluation:
     num_views: dict[str, int]
     notes: tuple[str, ...]
     options: EvaluateOptions = EvaluateOptions()
+
+    def __repr__(self) -> str:
+        scores = ", ".join(f"{row[0]} {row[2]} dB" for row in self._rows()[1:])
+        return f"Evaluation({scores}; against {self.reference})"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._rows())
+
+    def _rows(self) -> list[list[str]]:
+        """List the mean scores over the pixels that the input views have seen, of held-out views where there are."""
+        split = "target" if "target" in self.num_views else "context"
+        scores = [(result, vars(result.mean(split)[1])) for result in self.results]
+        names = [name for name in vars(Quality()) if any(quality[name] is not None for _, quality in scores)]
+        head = ["", "Gaussians", *(f"{name}, {self.num_views[split]} {split} views" for name in names)]
+        return [head, *([result.name, f"{result.num_gaussians:,}", *(f"{quality[name]:.4g}" for name in names)]
+                        for result, quality in scores)]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
