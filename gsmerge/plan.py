@@ -124,9 +124,10 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             checkpoint = load_networks(options, input_scene, photos=has_photos)
         segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
-        if clean_options.drop_sky and not prepared.photo_views:
-            note("drop_sky: no photo is used that could say where the sky is, so it stays")
-            clean_options = replace(clean_options, drop_sky=False)
+        if "sky" in clean_options.drops and not prepared.photo_views:
+            note("drop sky: no photo is used that could say where the sky is, so it stays")
+            left = ",".join(name for name in clean_options.drops if name != "sky")
+            clean_options = replace(clean_options, drop=left or None)
         size = measure_size(input_scene if alone else scene, photos=has_photos)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
@@ -256,8 +257,8 @@ def _check_photos(scene: Scene, options: CompactOptions, *, judged: bool) -> Non
     """Refuse settings that need photos where there are none."""
     if scene.images is None and options.budget.quality is not None and not judged:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    if scene.images is None and options.clean.drop_sky:
-        raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+    if scene.images is None and "sky" in options.clean.drops:
+        raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:

@@ -41,7 +41,8 @@ DEBUG = "--debug"
 
 # What other programs call a command, and the number of Gaussians
 OTHER_WORDS = {
-    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run", "convert"),
+    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
+    "convert": ("transform", "export", "join", "crop", "translate"),
     "inspect": ("info", "stats", "describe", "show"),
     "evaluate": ("eval", "measure", "metrics", "score", "report"),
     "check": ("validate", "verify", "lint", "test"),
@@ -55,7 +56,7 @@ BUDGET_WORDS = (
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
-    "Compact": ("compact",),
+    "Compact": ("compact", "convert"),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
     "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
 }

@@ -120,6 +120,7 @@ def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> lis
         "cropped": "outside of the crop",
         "sky": "sky",
         "floaters": "floater(s)",
+        "transparent": "transparent",
         "surplus": "more than the budget",
     }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())

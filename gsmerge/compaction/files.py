@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.convert import find_placement, place
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
@@ -33,6 +34,7 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene
@@ -50,6 +52,7 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     spz_version: int = 3
+    placement: PlacementOptions = field(default_factory=PlacementOptions)  # frame of what is written
 
 
 def compact_files(
@@ -89,6 +92,7 @@ def compact_files(
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+        result = _placed(result, outputs.placement)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
@@ -177,6 +181,17 @@ def _write_results(
             spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
+
+
+def _placed(result: CompactResult, options: PlacementOptions) -> CompactResult:
+    """Move a result, its levels and its cameras into the frame in which they are written."""
+    frame = find_placement(options, result.cameras if len(result.cameras) else None)
+
+    def move(level: CompactResult) -> CompactResult:
+        gaussians, cameras = place(level.gaussians, level.cameras, frame, options.sh_degree)
+        return replace(level, gaussians=gaussians, cameras=cameras, coarser=tuple(map(move, level.coarser)))
+
+    return move(result)
 
 
 def _views_once(scene: Scene) -> list[int]:

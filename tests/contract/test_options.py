@@ -60,7 +60,7 @@ def test_output_is_one_option_everywhere(command: str) -> None:
     ("words", "said"),
     [
         ("compact scene --fit-steps 60", "--set fit_steps=VALUE"),
-        ("batch scene --drop-sky", "--set drop_sky=true"),
+        ("batch scene --require-checkpoint", "--set require_checkpoint=true"),
         ("decode a.gsm --no-normals", "--set normals=false"),
         ("inspect scene --order none", "--hint order=VALUE"),
         ("inspect scene --poses fixed", ": --poses"),
