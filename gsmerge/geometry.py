@@ -112,6 +112,12 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     return out
 
 
+def turn_by(degrees: np.ndarray) -> np.ndarray:
+    """Return the rotation ``[3,3]`` about the axes x, y and z, in this order, by ``degrees [3]``."""
+    about_x, about_y, about_z = motion_matrices(np.pad(np.diag(np.radians(degrees)), ((0, 0), (0, 3))))[:, :3, :3]
+    return matmul(about_z, matmul(about_y, about_x))
+
+
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the rigid motions ``[v,6]`` between viewmats: ``end = start @ motion_matrices(...)``."""
     motions = matmul(invert(start), end)

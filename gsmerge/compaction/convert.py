@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import scene_frame
-from gsmerge.geometry import IDENTITY, Similarity, motion_matrices, normalize
+from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.io import (
     atomic_outputs,
     file_notes,
@@ -39,7 +39,6 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
 from gsmerge.types import Cameras, Gaussians, Scene
 
-
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
 
 
@@ -57,7 +56,6 @@ class ConvertOptions:
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     spz_version: int = 3
     overwrite: bool = False
-    dry_run: bool = False
 
 
 def convert_files(options: ConvertOptions) -> dict[str, Any]:
@@ -83,15 +81,6 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     lost = lost_harmonics(options.output, gaussians.sh_degree, options.spz_version)
-    document = document_head() | {
-        "inputs": [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos],
-        "left_out": left_out,
-        "output": {"path": str(options.output), "num_gaussians": len(gaussians), "format": ending},
-        "viewer_cameras": None,
-        "notes": [*notes, *([lost] if lost else [])],
-    }
-    if options.dry_run:
-        return document
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
@@ -99,18 +88,19 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
         comments += camera_comments(moved, names)
     num_bytes, beside = _write(options, ending, gaussians, moved, names, comments)
-    document["output"]["bytes"], document["viewer_cameras"] = num_bytes, beside
-    return document
+    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
+    read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
+    document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
+    return document | {"notes": [*notes, *([lost] if lost else [])]}
 
 
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line for people."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
     kept = "" if after["num_gaussians"] == before else f" of {before:,}"
-    size = f", {human_bytes(after['bytes'])}" if "bytes" in after else ""
     beside = document["viewer_cameras"]
     cameras = f"; cameras in {Path(beside).name}" if beside else ""
-    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians{size}{cameras}"
+    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians, {human_bytes(after['bytes'])}{cameras}"
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
@@ -133,8 +123,8 @@ def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Simila
         axis[AXES.index(options.up) // 2] = -1 if options.up[0] == "-" else 1
         upward = np.array([0.0, -1.0, 0.0]) if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
         rotation = turn_to(normalize(upward), axis)
-    for turn in np.diag(np.radians(parse_triple("rotate", options.rotate))):
-        rotation = matmul(motion_matrices(np.concatenate([turn, np.zeros(3)])[None])[0, :3, :3], rotation)
+    if options.rotate is not None:
+        rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
     scale = 1.0 if options.scale is None else float(options.scale)
     return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
 

@@ -42,8 +42,10 @@ def parse_triple(name: str, text: str | None) -> tuple[float, float, float]:
         >>> parse_triple("rotate", "90,0,0")
         (90.0, 0.0, 0.0)
     """
+    if text is None:
+        return 0.0, 0.0, 0.0
     try:
-        x, y, z = (float(part) for part in (text or "0,0,0").split(","))
+        x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         x = y = z = math.nan
     if not math.isfinite(x + y + z):

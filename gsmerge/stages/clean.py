@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsmerge.geometry import turn_by
+from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, Scene
-
-if TYPE_CHECKING:
-    pass
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -35,7 +33,10 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
     numbers = np.array(parsed)
     if shape == "sphere":
         return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
-    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:])).all(1))
+    if len(numbers) > 6:
+        middle = (numbers[:3] + numbers[3:6]) / 2
+        means = middle + matmul(means - middle, turn_by(numbers[6:]))  # as seen by the box
+    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:6])).all(1))
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
