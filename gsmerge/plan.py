@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.budget import exact_count
+from gsmerge.budget import FileSize, exact_count, file_size
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
@@ -84,6 +84,7 @@ class Plan:
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
+    size: FileSize | None  # What the output's file may have at most; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
@@ -162,6 +163,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
+        size=file_size(options.budget) if options.budget.in_bytes else None,
         scored_views=_choose_scored_views(prepared, options),
         backend=backend,
         seed=options.seed,

@@ -69,7 +69,7 @@ def compact(args: opt.Args) -> None:
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
     named = (out, *levels, args.report, beside, args.save_cameras)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing, settings.budget, levels=True)
+    check_format(out, writing, levels=True)
     if args.embed_cameras:
         check_embedding(out, settings.budget)
     if args.dry_run:

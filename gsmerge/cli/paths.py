@@ -42,21 +42,17 @@ def is_index(output: Path) -> bool:
     return output.name == INDEX
 
 
-def check_format(
-    output: Path, options: FileOptions, budget: BudgetOptions | None = None, *, levels: bool = False
-) -> None:
-    """Raise UsageError if an output's format cannot be written, or does not fit the options or a budget in bytes.
+def check_format(output: Path, options: FileOptions, *, levels: bool = False) -> None:
+    """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
-    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, a version of
-    ``.spz`` or a size in bytes for another format.
+    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, or a version of
+    ``.spz`` for another format.
     """
     from gsmerge.io import output_format
 
     ending = output_format(output, options.spz_version, levels=levels).ending
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
-    if budget is not None and budget.in_bytes and ending != ".ply":
-        raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
 def check_embedding(output: Path, budget: BudgetOptions) -> None:

@@ -73,7 +73,7 @@ def compact_files(
     Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
-    start, out = perf_counter(), outputs.result
+    start, out, settings = perf_counter(), outputs.result, _sized(settings, outputs)
     streamed = output_format(out, outputs.spz_version, levels=True).ending == INDEX
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
@@ -123,7 +123,7 @@ def compact_files(
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return as a document what :func:`compact_files`, or an encoding, would make of a scene."""
-    scene, out = load.scene, outputs.result
+    scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs.saved_cameras, embed=outputs.embed_cameras)
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
@@ -181,6 +181,12 @@ def _write_results(
             spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
+
+
+def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
+    """Say in the settings whose bytes a budget counts."""
+    budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
+    return replace(settings, budget=budget)
 
 
 def _placed(result: CompactResult, options: PlacementOptions) -> CompactResult:

@@ -20,7 +20,7 @@ from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos
 from gsmerge.report import html_table
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import Record, choose, current_record, note, stage
+from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -166,14 +166,28 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-    if prepared.alone:
-        fidelity = _fidelity(fitted.gaussians, prepared.scene, plan)
-        choose(fidelity={"psnr": fidelity, "views": len(prepared.scene)})
-        return Candidate(count, fitted, gaussians, cameras, fidelity, current_record())
+    psnr = _measure_candidate(gaussians, moved, plan)
+    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
+    """Replace a candidate's Gaussians by some of them, and measure it again."""
+    with record_part() as record:
+        psnr = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
+    choices = candidate.record.choices | record.choices
+    return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
+
+
+def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
+    """Measure the PSNR (dB) of Gaussians on the scored photos, or against the input; None without photos and pixels."""
+    if moved.alone:
+        fidelity = _fidelity(moved.frame.enter(gaussians), moved.scene, plan)
+        choose(fidelity={"psnr": fidelity, "views": len(moved.scene)})
+        return fidelity
     psnr = measure_psnr("score", gaussians, moved.result_views(), moved, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
-    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+    return psnr
 
 
 @stage("score")
