@@ -160,7 +160,7 @@ def _settings_page() -> str:
     lines += [
         "`--set poses=fixed --set min_opacity=0.01`; `decode` takes those of the fit, `render` and `view` those of"
     ]
-    lines += ["superpixels, `compact` and `decode` those of files, `compact` and `convert` those of the frame. In Python they are arguments of `gsmerge.compact`."]
+    lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
     for title, settings in tables.items():

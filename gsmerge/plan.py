@@ -163,7 +163,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
-        size=file_size(options.budget) if options.budget.in_bytes else None,
+        size=file_size(options.budget),
         scored_views=_choose_scored_views(prepared, options),
         backend=backend,
         seed=options.seed,

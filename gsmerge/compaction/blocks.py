@@ -101,9 +101,8 @@ def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -
         result = frame.leave(fit_seams(joined, owners, parts, options.seed))
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
-        if options.budget.in_bytes:
-            asked = file_size(options.budget)
-            result = drop_to_bytes(result, [], asked.finest, asked.file)
+        if asked := file_size(options.budget):
+            result = drop_to_bytes(result, [], asked.num_bytes, asked.file)
         everything = work.share(result)
         views = ((part, everything) for part in parts)
         scores = [score for score, _ in adopt_records(work.run("score", score_part, count, views))]

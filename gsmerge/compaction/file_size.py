@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from gsmerge.budget import LEVEL_FACTOR, FileSize
 from gsmerge.compaction.result import Candidate, shrink
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
@@ -17,7 +18,7 @@ from gsmerge.types import Gaussians
 NEAR, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
 ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
-TRIES = 8
+TRIES, MAX_REBUILDS = 8, 3
 
 Rebuild = Callable[[int], Candidate]
 
@@ -33,18 +34,22 @@ def measure_bytes(levels: Sequence[Gaussians], file: Format) -> int:
 
 
 def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
-    """Make a candidate as large as its file may be: leave out its faintest Gaussians, or build it again.
+    """Make a candidate as large as its file may be: build it again until it is near, and leave out its faintest.
 
-    Of an index of levels this is the finest; see :func:`meet_bytes_of_levels`.
+    Of an index of levels some of its Gaussians stand for coarser ones; see :func:`meet_bytes_of_levels`.
     """
     if plan.size is None or plan.size.file is PLY:
         return candidate
-    most = plan.size.finest
-    size, count = measure_bytes([candidate.gaussians], plan.size.file), len(candidate.gaussians)
-    room = int(SURPLUS * count * most / size)
-    if room < (1 - MOST_DROPPED) * count or (size < NEAR * most and count < plan.limits.max_count):
-        candidate = rebuild(min(room, plan.limits.max_count))
-    return _without_faintest(candidate, [], most, prepared, plan)
+    most = plan.size.num_bytes
+    for _ in range(MAX_REBUILDS):
+        gaussians = candidate.gaussians
+        size, count = measure_bytes(_with_coarser(gaussians, plan.size), plan.size.file), len(gaussians)
+        room = min(int(SURPLUS * count * most / size), prepared.input_scene.num_gaussians)
+        if room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count):
+            break
+        candidate = rebuild(room)
+    coarser = _with_coarser(candidate.gaussians, plan.size)[1:]
+    return _without_faintest(candidate, coarser, prepared, plan)
 
 
 def meet_bytes_of_levels(
@@ -53,8 +58,12 @@ def meet_bytes_of_levels(
     """Leave out the faintest Gaussians of the finest level until all levels of an index are no larger than asked."""
     if plan.size is None or plan.size.levels == 1:
         return candidate
-    others = [level.gaussians for level in coarser]
-    return _without_faintest(candidate, others, plan.size.num_bytes, prepared, plan)
+    return _without_faintest(candidate, [level.gaussians for level in coarser], prepared, plan)
+
+
+def _with_coarser(gaussians: Gaussians, size: FileSize) -> list[Gaussians]:
+    """Return Gaussians, and some of them that stand for the coarser levels of the file."""
+    return [faintest_dropped(gaussians, len(gaussians) // LEVEL_FACTOR**level) for level in range(size.levels)]
 
 
 def drop_to_bytes(gaussians: Gaussians, coarser: Sequence[Gaussians], most: int, file: Format) -> Gaussians:
@@ -74,9 +83,7 @@ def drop_to_bytes(gaussians: Gaussians, coarser: Sequence[Gaussians], most: int,
     return kept
 
 
-def _without_faintest(
-    candidate: Candidate, coarser: Sequence[Gaussians], most: int, prepared: Prepared, plan: Plan
-) -> Candidate:
+def _without_faintest(candidate: Candidate, coarser: Sequence[Gaussians], prepared: Prepared, plan: Plan) -> Candidate:
     assert plan.size is not None
-    kept = drop_to_bytes(candidate.gaussians, coarser, most, plan.size.file)
+    kept = drop_to_bytes(candidate.gaussians, coarser, plan.size.num_bytes, plan.size.file)
     return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)
