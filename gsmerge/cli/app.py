@@ -37,7 +37,7 @@ from gsmerge.settings.setting import flat_settings
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
-DEBUG = "--debug"
+DEBUG, HELP_ALL = "--debug", "--help-all"
 
 # What other programs call a command, and the number of Gaussians
 OTHER_WORDS = {
@@ -133,6 +133,8 @@ def _usage_message(error: Any) -> str:
 
 def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     """Write how to give a command a setting or a hint for which it has no option; None where it is neither."""
+    if option == HELP_ALL:
+        return f"{HELP_ALL}: expected a command before it, such as {PROGRAM} compact {HELP_ALL}"
     name = option.lstrip("-").replace("-", "_")
     names = {parameter.name for parameter in parameters}
     if name in names:

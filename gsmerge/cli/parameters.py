@@ -130,8 +130,8 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = get_close_matches(name, settings, 1, 0)[0]
-            raise UsageError(f"{flag} {name}: unknown, the closest name is {near}; {SETTINGS_PAGE} lists all")
+            near = "".join(f", perhaps {word}" for word in get_close_matches(name, settings, 1))
+            raise UsageError(f"{flag} {name}: unknown{near}; {SETTINGS_PAGE} lists all")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
         readings: list[Any] = [text]
