@@ -70,6 +70,10 @@ def compact(args: opt.Args) -> None:
     named = (out, *levels, args.report, beside, args.save_cameras)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True)
+    if writing.columns == "full" and settings.budget.in_bytes:
+        raise UsageError(
+            f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"
+        )
     if args.embed_cameras:
         check_embedding(out, settings.budget)
     if args.dry_run:
@@ -82,7 +86,7 @@ def compact(args: opt.Args) -> None:
     outputs = Outputs(
         out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,
         embed_cameras=args.embed_cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version, placement=placement,
+        spz_version=writing.spz_version, full_columns=writing.columns == "full", placement=placement,
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:

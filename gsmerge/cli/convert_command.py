@@ -36,7 +36,8 @@ def convert(args: opt.Args) -> None:
 
     options = ConvertOptions(
         inputs, output, args.cameras, args.images, args.opacity, cleaning, placement,
-        normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
+        normals=writing.normals, full_columns=writing.columns == "full", spz_version=writing.spz_version,
+        overwrite=args.overwrite,
     )  # fmt: skip
     document = convert_files(options)
     say_notes(document["notes"], quiet=args.silent)

@@ -39,6 +39,7 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
 from gsmerge.types import Cameras, Gaussians, Scene
 
+NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
 
 
@@ -54,6 +55,7 @@ class ConvertOptions:
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
+    full_columns: bool = False  # pad its harmonics with zeros up to degree 3
     spz_version: int = 3
     overwrite: bool = False
 
@@ -77,6 +79,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
         frame = find_placement(options.placement, cameras)
         gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+    gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
     infos = [file.info for file in files]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
@@ -106,11 +109,13 @@ def conversion_line(document: dict[str, Any]) -> str:
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     """Join Gaussians of one world; missing harmonics are zeros."""
     most = max(part.shN.shape[1] for part in parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
 
-    def pad(part: Gaussians) -> Gaussians:
-        return replace(part, shN=np.pad(part.shN, ((0, 0), (0, most - part.shN.shape[1]), (0, 0))))
 
-    return parts[0] if len(parts) == 1 else Gaussians.concat([pad(part) for part in parts])
+def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
+    """Add zeros to harmonics that are fewer than ``count`` above degree 0."""
+    missing = max(0, count - gaussians.shN.shape[1])
+    return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
 def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:

@@ -10,7 +10,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.convert import find_placement, place
+from gsmerge.compaction.convert import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
@@ -52,6 +52,7 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     spz_version: int = 3
+    full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
     placement: PlacementOptions = field(default_factory=PlacementOptions)  # frame of what is written
 
 
@@ -92,7 +93,7 @@ def compact_files(
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
-        result = _placed(result, outputs.placement)
+        result = _placed(result, outputs)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
@@ -189,12 +190,14 @@ def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     return replace(settings, budget=budget)
 
 
-def _placed(result: CompactResult, options: PlacementOptions) -> CompactResult:
-    """Move a result, its levels and its cameras into the frame in which they are written."""
+def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
+    """Move a result, its levels and its cameras into the frame in which they are written, with all their columns."""
+    options = outputs.placement
     frame = find_placement(options, result.cameras if len(result.cameras) else None)
 
     def move(level: CompactResult) -> CompactResult:
         gaussians, cameras = place(level.gaussians, level.cameras, frame, options.sh_degree)
+        gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.full_columns else gaussians
         return replace(level, gaussians=gaussians, cameras=cameras, coarser=tuple(map(move, level.coarser)))
 
     return move(result)

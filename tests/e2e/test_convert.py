@@ -185,3 +185,15 @@ def test_compact_writes_in_the_same_frames(made_scene: Path, tmp_path: Path, run
 
 def moved(path: Path) -> Cameras:
     return gsmerge.to_cameras(gsmerge.read_cameras(path))
+
+
+def test_all_columns_of_a_ply(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Unity's importer wants 62."""
+    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--set", "columns=full")
+    run("compact", made_scene, "-o", tmp_path / "a.ply", *quick, code=0)
+    run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--sh-degree", 0, "--set", "columns=full", code=0)
+    for name in ("a.ply", "b.ply"):
+        header = (tmp_path / name).read_bytes().split(b"end_header")[0]
+        assert header.count(b"property float") == 62
+        assert not read(tmp_path / name).shN.any()
+    assert run("convert", tmp_path / "a.ply", tmp_path / "b.spz", "--set", "columns=full").code == 2
