@@ -138,6 +138,7 @@ def _settings_page() -> str:
     from gsmerge.cli.paths import FileOptions
     from gsmerge.online.options import OnlineOptions
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.placement import PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
 
@@ -151,11 +152,14 @@ def _settings_page() -> str:
         "Before and after": stages["prepare"] + stages["clean"],
         "The whole run": [one for name, one in whole.items() if name not in stages],
         "Files": flat_settings(FileOptions).values(),
+        "The frame of what is written": flat_settings(PlacementOptions).values(),
         "`gsmerge extend`": flat_settings(OnlineOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
     lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
-    lines += ["`--set poses=fixed --set drop_sky=true`; `decode` takes those of the fit, `render` and `view` those of"]
+    lines += [
+        "`--set poses=fixed --set min_opacity=0.01`; `decode` takes those of the fit, `render` and `view` those of"
+    ]
     lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]

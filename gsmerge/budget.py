@@ -2,17 +2,44 @@
 
 from __future__ import annotations
 
-from gsmerge.io.formats.ply import count_for_bytes
+from dataclasses import dataclass
+
+from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
+
+LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
     """Return the number of Gaussians that a budget or a file size asks for; None without either."""
     if options.budget in (None, AUTO, *DEVICES):
         return None
-    if options.in_bytes:
-        return min(count_for_bytes(parse_bytes(str(options.budget)), sh_degree), num_input)
+    if size := file_size(options):
+        return min(count_for_bytes(size.file, size.finest, sh_degree), num_input)
     return parse_budget(str(options.budget), num_input)
+
+
+@dataclass(frozen=True)
+class FileSize:
+    """A size in bytes that the output may have."""
+
+    num_bytes: int
+    file: Format  # of the output
+    levels: int = 1  # that are in it, each see LEVEL_FACTOR
+
+    @property
+    def finest(self) -> int:
+        """Bytes that the finest level may have, about."""
+        return int(self.num_bytes / sum(LEVEL_FACTOR**-level for level in range(self.levels)))
+
+
+def file_size(options: BudgetOptions) -> FileSize | None:
+    """Return the size that a budget in bytes asks for; None of another budget."""
+    if not options.in_bytes:
+        return None
+    file = output_format(options.output, options.spz_version, levels=True)
+    in_one = file.encode is None and file is not PLY
+    return FileSize(parse_bytes(str(options.budget)), file, options.levels if in_one else 1)
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.types import SH_C0, Array, Cameras
+from gsmerge.types import SH_C0, Array, Cameras, Gaussians
 
 State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
@@ -110,6 +110,12 @@ def motion_matrices(vectors: np.ndarray) -> np.ndarray:
     out[:, :3, :3] = quat_to_rotmat(np.concatenate([cos(angles / 2), shares * vectors[:, :3]], 1))
     out[:, :3, 3] = vectors[:, 3:]
     return out
+
+
+def turn_by(degrees: np.ndarray) -> np.ndarray:
+    """Return the rotation ``[3,3]`` about the axes x, y and z, in this order, by ``degrees [3]``."""
+    about_x, about_y, about_z = motion_matrices(np.pad(np.diag(np.radians(degrees)), ((0, 0), (0, 3))))[:, :3, :3]
+    return matmul(about_z, matmul(about_y, about_x))
 
 
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -305,6 +311,21 @@ class Similarity:
     description: str = ""  # what it is, for people; empty where both frames are the same
     # "same", "scaled", "shifted"; "first", "middle" or "upright" by which camera it was rotated; "other"
     kind: str = "same"
+
+    def move_points(self, points: np.ndarray) -> np.ndarray:
+        """Move points ``[n,3]`` or ``[3]`` into the frame of the Gaussians."""
+        return np.asarray(self.scale * matmul(points, self.rotation.T) + self.shift)
+
+    def move_gaussians(self, g: Gaussians) -> Gaussians:
+        """Move Gaussians from the frame of the cameras into their own, with their harmonics."""
+        return Gaussians(
+            means=self.move_points(g.means).astype(g.means.dtype),
+            quats=multiply_quats(rotmat_to_quat(self.rotation[None])[0], g.quats).astype(g.quats.dtype),
+            scales=(self.scale * g.scales).astype(g.scales.dtype),
+            opacities=g.opacities,
+            sh0=g.sh0,
+            shN=turn_harmonics(g.shN, self.rotation),
+        )
 
     def move_viewmats(self, viewmats: np.ndarray) -> np.ndarray:
         """Move world-to-camera matrices ``[c,4,4]`` into the frame of the Gaussians."""

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.budget import exact_count
+from gsmerge.budget import FileSize, exact_count, file_size
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
@@ -84,6 +84,7 @@ class Plan:
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
+    size: FileSize | None  # What the output's file may have at most; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
@@ -124,9 +125,10 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             checkpoint = load_networks(options, input_scene, photos=has_photos)
         segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
-        if clean_options.drop_sky and not prepared.photo_views:
-            note("drop_sky: no photo is used that could say where the sky is, so it stays")
-            clean_options = replace(clean_options, drop_sky=False)
+        if "sky" in clean_options.drops and not prepared.photo_views:
+            note("drop sky: no photo is used that could say where the sky is, so it stays")
+            left = ",".join(name for name in clean_options.drops if name != "sky")
+            clean_options = replace(clean_options, drop=left or None)
         size = measure_size(input_scene if alone else scene, photos=has_photos)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
@@ -161,6 +163,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
+        size=file_size(options.budget),
         scored_views=_choose_scored_views(prepared, options),
         backend=backend,
         seed=options.seed,
@@ -256,8 +259,8 @@ def _check_photos(scene: Scene, options: CompactOptions, *, judged: bool) -> Non
     """Refuse settings that need photos where there are none."""
     if scene.images is None and options.budget.quality is not None and not judged:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    if scene.images is None and options.clean.drop_sky:
-        raise UsageError("drop_sky: expected photos, which say where the sky is; name them with --images")
+    if scene.images is None and "sky" in options.clean.drops:
+        raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:

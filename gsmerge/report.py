@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import html
 import io
 import json
 import os
@@ -144,6 +145,16 @@ def text_table(rows: Sequence[Sequence[str]], indent: str = "") -> list[str]:
     """Write rows as lines for a terminal: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [indent + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+
+
+def html_table(rows: Sequence[Sequence[str]]) -> str:
+    """Write rows as a table of HTML for notebooks: the first column to the left, the others to the right."""
+
+    def cell(text: str, side: str) -> str:
+        return f'<td style="text-align:{side}">{html.escape(text)}</td>'
+
+    lines = [cell(row[0], "left") + "".join(cell(text, "right") for text in row[1:]) for row in rows]
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:

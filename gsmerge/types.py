@@ -116,6 +116,10 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __repr__(self) -> str:
+        device = "" if self.device is None else f", on {self.device}"
+        return f"Gaussians({len(self):,}, SH degree {self.sh_degree}{device})"
+
     def __getitem__(self, index: Any) -> Gaussians:
         """Return the rows that ``index`` (slice, mask or integer array) selects."""
         return Gaussians(*(getattr(self, f.name)[index] for f in fields(self)))
@@ -180,6 +184,9 @@ class Cameras:
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
+    def __repr__(self) -> str:
+        return f"Cameras({len(self)} of {self.width} x {self.height})"
+
     def __getitem__(self, index: Any) -> Cameras:
         """Return the cameras that ``index`` (slice, mask or integer array) selects."""
         return replace(self, viewmats=self.viewmats[index], Ks=self.Ks[index])
@@ -235,6 +242,9 @@ class Views:
     def __len__(self) -> int:
         """Return v."""
         return len(self.cameras)
+
+    def __repr__(self) -> str:
+        return f"Views({len(self)} of {self.cameras.width} x {self.cameras.height}, images)"
 
     def __getitem__(self, ids: Sequence[int]) -> Views:
         """Select views by their ids."""
@@ -294,6 +304,12 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def __repr__(self) -> str:
+        views = f"{len(self)} views of {self.cameras.width} x {self.cameras.height}" if len(self) else "no views"
+        images = ", images" if self.images is not None else ""
+        pixels = ", aligned" if self.aligned else ""
+        return f"Scene({self.num_gaussians:,} Gaussians, {views}{images}{pixels})"
 
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from string import Formatter
 from typing import Any
 
-from gsmerge.io import OUTPUT_FORMATS, output_format
+from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.scene.content_hash import digest
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -60,9 +60,6 @@ class BatchOptions(Settings):
         ):
             if not is_possible:
                 raise ValueError(f"output: expected {expected}, got {self.output!r}")
-        budget = self.settings.budget
-        if budget.in_bytes and output_format(self.output).ending != ".ply":
-            raise ValueError(f"budget {budget.budget}: expected an output as .ply, got {self.output}; give a number")
         if Engine(self.engine, self.address).name == "ray" and self.max_memory is not None:
             raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
 

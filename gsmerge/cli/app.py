@@ -37,11 +37,12 @@ from gsmerge.settings.setting import flat_settings
 
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
-DEBUG = "--debug"
+DEBUG, HELP_ALL = "--debug", "--help-all"
 
 # What other programs call a command, and the number of Gaussians
 OTHER_WORDS = {
-    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run", "convert"),
+    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
+    "convert": ("transform", "export", "join", "crop", "translate"),
     "inspect": ("info", "stats", "describe", "show"),
     "evaluate": ("eval", "measure", "metrics", "score", "report"),
     "check": ("validate", "verify", "lint", "test"),
@@ -55,7 +56,7 @@ BUDGET_WORDS = (
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
-    "Compact": ("compact",),
+    "Compact": ("compact", "convert"),
     "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
     "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
 }
@@ -132,6 +133,8 @@ def _usage_message(error: Any) -> str:
 
 def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     """Write how to give a command a setting or a hint for which it has no option; None where it is neither."""
+    if option == HELP_ALL:
+        return f"{HELP_ALL}: expected a command before it, such as {PROGRAM} compact {HELP_ALL}"
     name = option.lstrip("-").replace("-", "_")
     names = {parameter.name for parameter in parameters}
     if name in names:

@@ -55,11 +55,11 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """Read the scenes of BEFORE (``files``) and AFTER, and the views of ``--targets``; place views where none are."""
     from gsmerge.facts.place_cameras import add_views
     from gsmerge.io import read_gaussians
-    from gsmerge.io.cameras.embedded import holds_cameras
     from gsmerge.runtime.record import record_run
+    from gsmerge.scene.files import result_cameras
 
     if files.cameras is None:  # a result may know those that its scene has lost
-        files = replace(files, cameras=next(filter(holds_cameras, args.after), None))
+        files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
     load, notes = args.load(files), list[str]()
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
@@ -80,18 +80,19 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
     from gsmerge.facts.prepare import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
-    from gsmerge.io.cameras.embedded import holds_cameras
-    from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.cameras.read import read_cameras
+    from gsmerge.scene.files import result_cameras
 
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
-        holder, read = path if holds_cameras(path) else viewer_cameras_path(path), None
-        if (scene.images is not None or scene.aligned) and holder.is_file():
+        holder, read = result_cameras(path), None
+        if holder is not None and (scene.images is not None or scene.aligned):
             with suppress(SceneError):  # whose ever it is, results can be measured without it
                 read = read_cameras(holder)
-        if read is None or read.names != scene.names or np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
+        if read is None or holder is None or read.names != scene.names:
+            continue
+        if np.allclose(read.viewmats, start, rtol=SAME, atol=SAME):
             continue
         cameras[name] = replace(scene.cameras, viewmats=read.viewmats)
         moves = describe_moves(list_moves(scene.names, start, read.viewmats, scene_depth(scene)))

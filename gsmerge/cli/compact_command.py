@@ -39,10 +39,11 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels blocks",
-    "effort fit exposure device method recipe checkpoint set crop",
+    "effort fit exposure device method recipe checkpoint set crop drop up scale rotate translate",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
-    rare="hint masks levels blocks fit exposure method recipe checkpoint crop strict save_cameras embed_cameras"
+    rare="hint masks levels blocks fit exposure method recipe checkpoint crop drop up scale rotate translate"
+         " strict save_cameras embed_cameras"
          f" engine address json quiet {opt.RUN}",
 )  # fmt: skip
 def compact(args: opt.Args) -> None:
@@ -52,8 +53,9 @@ def compact(args: opt.Args) -> None:
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.placement import PlacementOptions
 
-    settings, writing = args.make(CompactOptions, FileOptions)
+    settings, writing, placement = args.make(CompactOptions, FileOptions, PlacementOptions)
     settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
@@ -65,11 +67,13 @@ def compact(args: opt.Args) -> None:
     cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
-    check_outputs(
-        (out, *levels, args.report, beside, args.save_cameras), inputs, overwrite=args.overwrite or args.dry_run,
-        made=out.parent if streamed else None,
-    )  # fmt: skip
-    check_format(out, writing, settings.budget, levels=True)
+    named = (out, *levels, args.report, beside, args.save_cameras)
+    check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
+    check_format(out, writing, levels=True)
+    if writing.columns == "full" and settings.budget.in_bytes:
+        raise UsageError(
+            f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"
+        )
     if args.embed_cameras:
         check_embedding(out, settings.budget)
     if args.dry_run:
@@ -82,7 +86,7 @@ def compact(args: opt.Args) -> None:
     outputs = Outputs(
         out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,
         embed_cameras=args.embed_cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version,
+        spz_version=writing.spz_version, full_columns=writing.columns == "full", placement=placement,
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:

@@ -139,7 +139,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
                     bars.remove_task(tasks[name])
                 tasks[name] = bars.add_task(name, total=None, count="", detail="")
                 running.append(name)
-            if detail or name not in STAGES:
+            if total and (detail or name not in STAGES):
                 bars.update(tasks[name], completed=done, total=total, count=f"{done}/{total}", detail=detail)
 
         yield move

@@ -97,7 +97,9 @@ def evaluate(args: opt.Args) -> None:
             nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
             **args.given(("photo_side", "zoom", "align")),
         )  # fmt: skip
-    pair = read_before_after(args, files)
+    with stage_progress(quiet=args.silent) as progress:
+        progress("read", 0, 0)
+        pair = read_before_after(args, files)
     notes = [*pair.notes, *missing]
     if len(pair.scene) < len(pair.load.scene):
         notes += [_more_views(name, ply, pair.scene.cameras) for name, ply in pair.plys.items()]

@@ -27,6 +27,7 @@ from gsmerge.errors import UsageError
 from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
+from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
 from gsmerge.settings.stages import Engine
@@ -42,7 +43,7 @@ REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
 SETTINGS = {
-    setting.name: setting for kind in (EvaluateOptions, Engine, OnlineOptions, CompactOptions)
+    setting.name: setting for kind in (EvaluateOptions, Engine, OnlineOptions, PlacementOptions, CompactOptions)
     for setting in flat_settings(kind).values()
 }  # fmt: skip
 
@@ -129,8 +130,8 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = get_close_matches(name, settings, 1, 0)[0]
-            raise UsageError(f"{flag} {name}: unknown, the closest name is {near}; {SETTINGS_PAGE} lists all")
+            near = "".join(f", perhaps {word}" for word in get_close_matches(name, settings, 1))
+            raise UsageError(f"{flag} {name}: unknown{near}; {SETTINGS_PAGE} lists all")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
         readings: list[Any] = [text]
@@ -308,6 +309,8 @@ _TABLE = (
     panel(
         OUTPUT,
         setting_option("crop"),
+        setting_option("drop"),
+        *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
         option("output", Path, "", "--output", "-o"),
         setting_option("antialiased"),
         switch("overwrite", "Replace the output if it exists."),

@@ -23,6 +23,8 @@ class FileOptions(Settings):
 
     normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
+    columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
+        "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
     spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
         "degree 4.",
         "The latter needs `gsmerge[spz4]`.", choices=(3, 4))  # fmt: skip
@@ -42,21 +44,19 @@ def is_index(output: Path) -> bool:
     return output.name == INDEX
 
 
-def check_format(
-    output: Path, options: FileOptions, budget: BudgetOptions | None = None, *, levels: bool = False
-) -> None:
-    """Raise UsageError if an output's format cannot be written, or does not fit the options or a budget in bytes.
+def check_format(output: Path, options: FileOptions, *, levels: bool = False) -> None:
+    """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
-    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, a version of
-    ``.spz`` or a size in bytes for another format.
+    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, or a version of
+    ``.spz`` for another format.
     """
     from gsmerge.io import output_format
 
     ending = output_format(output, options.spz_version, levels=levels).ending
+    if options.columns == "full" and (ending != ".ply" or not options.normals):
+        raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
-    if budget is not None and budget.in_bytes and ending != ".ply":
-        raise UsageError(f"--budget {budget.budget}: expected an output as .ply, got {ending}; give a number")
 
 
 def check_embedding(output: Path, budget: BudgetOptions) -> None:
@@ -69,13 +69,11 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
         )
 
 
-def check_outputs(
-    outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool, made: Path | None = None
-) -> None:
-    """Raise UsageError for an output that is an input, exists without ``overwrite``, comes twice, or has no folder.
+def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
+    """Raise UsageError for an output that is an input, exists without ``overwrite``, or comes twice.
 
-    ``inputs`` are files that are read, and folders of photos: no photo is replaced. ``made``: a folder that is made
-    for the outputs if it is missing.
+    ``inputs`` are files that are read, and folders of photos: no photo is replaced. SceneError where nothing can be
+    written; missing folders are made with the first file in them, so that a run that fails before leaves none.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -85,13 +83,13 @@ def check_outputs(
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, input_paths, overwrite=overwrite, made=made)
+        _check_output(output, input_paths, overwrite=overwrite)
         if os.path.realpath(output) in seen:
             raise UsageError(f"{output}: expected a file of its own for each output, got it twice")
         seen.add(os.path.realpath(output))
 
 
-def _check_output(output: Path, inputs: set[str], *, overwrite: bool, made: Path | None) -> None:
+def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -109,9 +107,19 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, made: Path
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
-    folder = output.parent.parent if output.parent == made and not os.path.lexists(made) else output.parent
-    if not folder.is_dir():
-        raise SceneError(output, f"expected a folder to write to, found no {folder}", "make it first")
+    _check_place(output.parent, output, "a folder to write to")
+
+
+def _check_place(folder: Path, output: Path, expected: str) -> None:
+    """Raise SceneError if a folder, or the nearest one above it that exists, cannot be written to."""
+    try:
+        nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+    except OSError as error:
+        raise SceneError(output, f"cannot be read ({error.strerror})", "name another with --output") from error
+    if not nearest.is_dir():
+        raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another with --output")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise SceneError(output, f"cannot be written: no permission for {nearest}", "name another with --output")
 
 
 def is_camera_file(path: Path) -> bool:
@@ -149,17 +157,12 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
 
     The folder is made with the first file in it, so that a run that fails before leaves none.
     """
+    _check_place(folder, folder, "a folder to write pictures to")
     try:
-        nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
-        if not nearest.is_dir():
-            problem = f"expected a folder to write pictures to, found the file {nearest}"
-            raise SceneError(folder, problem, "name another with --output")
-        occupied = nearest == folder and next(folder.iterdir(), None) is not None
+        occupied = folder.is_dir() and next(folder.iterdir(), None) is not None
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
     if any(os.path.realpath(folder) == os.path.realpath(path) for path in inputs):
         raise UsageError(f"{folder}: expected an output other than the input; name another folder with --output")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise SceneError(folder, f"cannot be written: no permission for {nearest}", "name another with --output")
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")

@@ -38,7 +38,9 @@ def view(args: opt.Args) -> None:
     check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
-    pair = read_before_after(args, files)
+    with stage_progress(quiet=args.silent) as progress:
+        progress("read", 0, 0)
+        pair = read_before_after(args, files)
     if pair.scene.images is not None:
         count_for(segmentation, *pair.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
     say_notes(pair.notes, quiet=args.silent)

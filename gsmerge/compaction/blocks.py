@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.alignment.registration.join import concat_scenes
+from gsmerge.budget import file_size
+from gsmerge.compaction.file_size import drop_to_bytes
 from gsmerge.compaction.result import (
     CompactReport,
     CompactResult,
@@ -99,6 +101,8 @@ def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -
         result = frame.leave(fit_seams(joined, owners, parts, options.seed))
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
+        if asked := file_size(options.budget):
+            result = drop_to_bytes(result, [], asked.num_bytes, asked.file)
         everything = work.share(result)
         views = ((part, everything) for part in parts)
         scores = [score for score, _ in adopt_records(work.run("score", score_part, count, views))]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from gsmerge.compaction.blocks import compact_in_blocks
+from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 from gsmerge.compaction.methods import Build, choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
@@ -63,9 +64,11 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
-    fixed = prepared.with_cameras(search.best.fitted.cameras), plan.with_fixed_cameras()
-    levels = [build_scored(method, *fixed, count) for count in level_counts(len(search.best.gaussians), plan)]
-    return make_result(search.best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
+    best = meet_bytes(search.best, lambda count: build_scored(method, prepared, plan, count), prepared, plan)
+    fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
+    levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
+    best = meet_bytes_of_levels(best, levels, prepared, plan)
+    return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 
 @record_part()
@@ -120,6 +123,7 @@ def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> lis
         "cropped": "outside of the crop",
         "sky": "sky",
         "floaters": "floater(s)",
+        "transparent": "transparent",
         "surplus": "more than the budget",
     }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.convert import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
@@ -33,6 +34,7 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Scene
@@ -50,6 +52,8 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     spz_version: int = 3
+    full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
+    placement: PlacementOptions = field(default_factory=PlacementOptions)  # frame of what is written
 
 
 def compact_files(
@@ -70,10 +74,10 @@ def compact_files(
     Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
-    start, out = perf_counter(), outputs.result
+    start, out, settings = perf_counter(), outputs.result, _sized(settings, outputs)
     streamed = output_format(out, outputs.spz_version, levels=True).ending == INDEX
     with atomic_outputs(overwrite=outputs.overwrite) as add:
-        at = {out: add(out, make_folder=streamed)}
+        at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
         load = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(load.scene, outputs.saved_cameras, embed=outputs.embed_cameras)
@@ -89,6 +93,7 @@ def compact_files(
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+        result = _placed(result, outputs)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
@@ -119,7 +124,7 @@ def compact_files(
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return as a document what :func:`compact_files`, or an encoding, would make of a scene."""
-    scene, out = load.scene, outputs.result
+    scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs.saved_cameras, embed=outputs.embed_cameras)
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
@@ -177,6 +182,25 @@ def _write_results(
             spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
+
+
+def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
+    """Say in the settings whose bytes a budget counts."""
+    budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
+    return replace(settings, budget=budget)
+
+
+def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
+    """Move a result, its levels and its cameras into the frame in which they are written, with all their columns."""
+    options = outputs.placement
+    frame = find_placement(options, result.cameras if len(result.cameras) else None)
+
+    def move(level: CompactResult) -> CompactResult:
+        gaussians, cameras = place(level.gaussians, level.cameras, frame, options.sh_degree)
+        gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.full_columns else gaussians
+        return replace(level, gaussians=gaussians, cameras=cameras, coarser=tuple(map(move, level.coarser)))
+
+    return move(result)
 
 
 def _views_once(scene: Scene) -> list[int]:

@@ -21,7 +21,7 @@ from gsmerge.types import Gaussians, Scene
 Build = Callable[[Prepared, Plan, int | None], Fitted]
 Need = Literal["photos", "pixels"]
 COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
-COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop_floaters", "drop_sky"}  # that every method uses
+COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop"}  # that every method uses
 
 
 @dataclass(frozen=True)

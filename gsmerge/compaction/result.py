@@ -13,11 +13,14 @@ from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import FitBackend, Fitted, run_on
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
+from gsmerge.measure.preview import picture_html, to_picture
 from gsmerge.plan import Plan
+from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos
+from gsmerge.report import html_table
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import Record, choose, current_record, note, stage
+from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -85,6 +88,21 @@ class CompactReport:
     covered: Covered | None = None
     psnr_reference: str | None = None
 
+    def __repr__(self) -> str:
+        return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
+
+    def _repr_html_(self) -> str:
+        notes = [("note", text) for text in self.notes]
+        return html_table([*self._facts(), *notes])
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """List what a reader wants first, by name."""
+        share = 100 * self.num_output / max(1, self.num_input)
+        facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
+        if self.psnr_before is not None and self.psnr_after is not None:
+            facts += [("PSNR of the input views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
+        return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
+
 
 @dataclass(frozen=True)
 class CompactResult:
@@ -107,6 +125,18 @@ class CompactResult:
     report: CompactReport
     cameras: Cameras
     coarser: tuple[CompactResult, ...] = ()
+
+    def __repr__(self) -> str:
+        levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""
+        return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
+
+    def _repr_html_(self) -> str:
+        """Show the report and, where cameras are known, a render of the middle view."""
+        report = self.report._repr_html_()
+        if len(self.cameras) == 0:
+            return report
+        image = render(self.gaussians.numpy(), self.cameras.numpy()[[len(self.cameras) // 2]]).images[0]
+        return picture_html(to_picture(image), "the middle view") + report
 
     def to(self, device: torch.device | str | None) -> CompactResult:
         """Return the same result with tensors on a device; None leaves NumPy arrays."""
@@ -136,14 +166,28 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-    if prepared.alone:
-        fidelity = _fidelity(fitted.gaussians, prepared.scene, plan)
-        choose(fidelity={"psnr": fidelity, "views": len(prepared.scene)})
-        return Candidate(count, fitted, gaussians, cameras, fidelity, current_record())
+    psnr = _measure_candidate(gaussians, moved, plan)
+    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+
+
+def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
+    """Replace a candidate's Gaussians by some of them, and measure it again."""
+    with record_part() as record:
+        psnr = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
+    choices = candidate.record.choices | record.choices
+    return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
+
+
+def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
+    """Measure the PSNR (dB) of Gaussians on the scored photos, or against the input; None without photos and pixels."""
+    if moved.alone:
+        fidelity = _fidelity(moved.frame.enter(gaussians), moved.scene, plan)
+        choose(fidelity={"psnr": fidelity, "views": len(moved.scene)})
+        return fidelity
     psnr = measure_psnr("score", gaussians, moved.result_views(), moved, plan)
     if psnr is not None:
         choose(scored_views=len(plan.scored_views))
-    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+    return psnr
 
 
 @stage("score")

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.budget import LEVEL_FACTOR
 from gsmerge.compaction.result import Candidate
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import FitOptions
@@ -32,7 +33,6 @@ SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to 
 HOLDOUT = 0.1  # share of the photos' blocks
 NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
 PERCEPTUAL_SIDE = 64  # pixels, at least
-LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the one before
 RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
 SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs

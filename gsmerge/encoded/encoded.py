@@ -105,6 +105,9 @@ class Encoded(StoredScene):
     def __len__(self) -> int:
         return len(self.features)
 
+    def __repr__(self) -> str:
+        return f"Encoded({len(self):,} Feature Gaussians, up to {self.max_gaussians:,} Gaussians)"
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics."""

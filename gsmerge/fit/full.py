@@ -66,7 +66,7 @@ def fit_full(
             float(error)  # waits for a GPU
             steps = affordable_steps(time.perf_counter() - started, plan)
         if job.progress and (step % moving.read_every == 0 or step == steps):
-            job.progress(step, steps, decibels(float(error)), after)
+            job.progress(step, steps, decibels(float(error)))
     if not judged:
         before, after = judge(state, start_score, engine, moving)
     if options.judged and after <= before:

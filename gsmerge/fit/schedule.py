@@ -38,7 +38,7 @@ DRAW_MODES = (
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
-Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos and of their held-out blocks
+Progress = Callable[[int, int, float], None]  # step, steps, PSNR of the photos
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ _written: set[str] = set()  # the temporary files of this process
 def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield an empty temporary file beside ``path`` that is renamed to ``path`` when the block succeeds.
 
-    The folder must exist. A link stays a link; the file that it leads to is replaced. Inside an outer block that
+    Missing folders are made. A link stays a link; the file that it leads to is replaced. Inside an outer block that
     yielded ``path``, ``path`` itself is yielded. SceneError if the file exists and ``overwrite`` is False, or cannot be
     written.
     """
@@ -54,9 +54,9 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 class AddOutput(Protocol):
-    """Function that opens one more file of :func:`atomic_outputs`; ``make_folder``: make its folder, too."""
+    """Function that opens one more file of :func:`atomic_outputs`."""
 
-    def __call__(self, path: Path, *, make_folder: bool = False) -> Path:
+    def __call__(self, path: Path) -> Path:
         """Return the temporary file to write."""
 
 
@@ -71,11 +71,10 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
     made: dict[str, tuple[Path, Path]] = {}  # temporary file -> as it was asked for, where it goes
     folders: list[Path] = []
 
-    def add(path: Path, *, make_folder: bool = False) -> Path:
+    def add(path: Path) -> Path:
         if str(path) in _written:
             return path
-        if make_folder and _make_folder(path.parent):
-            folders.append(path.parent)
+        folders.extend(_make_folder(path.parent))
         _refuse(path, overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
@@ -118,15 +117,18 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
         _written.difference_update(made)
 
 
-def _make_folder(folder: Path) -> bool:
-    """Make a folder, and return whether it was missing."""
+def _make_folder(folder: Path) -> Iterator[Path]:
+    """Make a folder and those above it, and yield each that was missing."""
+    if os.path.lexists(folder):
+        return
+    yield from _make_folder(folder.parent)
     try:
         os.mkdir(folder)
-    except FileExistsError:
-        return False
+        yield folder
+    except FileExistsError:  # somebody else was quicker
+        pass
     except OSError as error:
         raise SceneError(folder, f"cannot be made ({error.strerror})", "choose another folder") from error
-    return True
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
@@ -238,6 +240,6 @@ def _refuse(path: Path, overwrite: bool) -> None:
     if status is not None and not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file to write, found a pipe or a device", "name a file")
     if not os.path.isdir(path.parent):
-        raise SceneError(path, f"the folder {path.parent} does not exist", "make it first")
+        raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
     if os.path.lexists(path) and not overwrite:
         raise SceneError(path, "exists already", "choose another name or allow overwriting")

@@ -115,7 +115,10 @@ def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, im
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if source is None and match is not None and (beside := files.ply.with_name(f"{match[1]}.ply")).is_file():
         source = beside
-    return files if source is None else find_scene_files(source, cameras=cameras or files.cameras, images=images)
+    if source is None:
+        return files
+    like = find_scene_files(source, cameras=cameras, images=images)
+    return like if like.cameras is not None else replace(like, cameras=files.cameras)
 
 
 def plan_panel(options: DrawOptions) -> Drawing:

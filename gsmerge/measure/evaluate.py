@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import prepare, render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
 from gsmerge.raster.photos import COVERED, NEAR, WHOLE
+from gsmerge.report import html_table
+from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, Scene, Views, as_array
@@ -31,7 +34,7 @@ MENDED = (
 )
 MIN_SEEN_SHARE = 0.1  # of the held-out pixels, seen by input views; less suggests another world frame
 INPUT = "input"  # name of the scene itself among the results
-Progress = Callable[[str, int, int], None]
+
 OnImage = Callable[[str, str, int, np.ndarray], None]
 
 
@@ -132,6 +135,22 @@ class Evaluation:
     notes: tuple[str, ...]
     options: EvaluateOptions = EvaluateOptions()
 
+    def __repr__(self) -> str:
+        scores = ", ".join(f"{row[0]} {row[2]} dB" for row in self._rows()[1:])
+        return f"Evaluation({scores}; against {self.reference})"
+
+    def _repr_html_(self) -> str:
+        return html_table(self._rows())
+
+    def _rows(self) -> list[list[str]]:
+        """List the mean scores over the pixels that the input views have seen, of held-out views where there are."""
+        split = "target" if "target" in self.num_views else "context"
+        scores = [(result, vars(result.mean(split)[1])) for result in self.results]
+        names = [name for name in vars(Quality()) if any(quality[name] is not None for _, quality in scores)]
+        head = ["", "Gaussians", *(f"{name}, {self.num_views[split]} {split} views" for name in names)]
+        return [head, *([result.name, f"{result.num_gaussians:,}", *(f"{quality[name]:.4g}" for name in names)]
+                        for result, quality in scores)]  # fmt: skip
+
 
 @dataclass(frozen=True, eq=False)
 class _Split:
@@ -180,7 +199,7 @@ def evaluate(
     options: EvaluateOptions | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
     on_image: OnImage = lambda *_: None,
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out views.
@@ -188,8 +207,8 @@ def evaluate(
     ``results`` are Gaussians by name, in the scene's world; without photos they are compared with renders of the scene.
     ``targets`` are held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`; ``cameras``
     those of the input views by name of a result that was made with other poses, as ``CompactResult.cameras``;
-    ``progress`` is called with ("evaluate", done, total) after each result, ``on_image`` with (result, split, number of
-    the view in it, render ``[h,w,3]`` in [0, 1]) for each picture that is scored.
+    ``progress`` is called with (what is done, done, total), for each view and result with ("evaluate: NAME", ...);
+    ``on_image`` with (result, split, number of the view in it, render ``[h,w,3]`` in [0, 1]) for each picture.
 
     Raises:
         UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
@@ -219,18 +238,24 @@ def evaluate(
     with use_threads(options.threads):
         frame = scene_frame(scene)
         renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
+        progress("what the input views see", 0, 0)
         splits, scores = _splits(scene, inputs, targets, renderer), []
         named = {INPUT: inputs, **results} if options.own else results
-        fog = measure_fog(inputs, results, scene.cameras, renderer.near) if options.fog and results else {}
+        fogs = options.fog and bool(results)
+        fog = measure_fog(inputs, results, scene.cameras, renderer.near, progress) if fogs else {}
+        num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count()
+
+        def keep(name: str, kind: str, view: int, image: np.ndarray) -> None:
+            progress(f"evaluate: {name}", next(numbers), num_pictures)
+            on_image(name, kind, view, image)
+
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
-        for i, (name, gaussians) in enumerate(named.items()):
+        for name, gaussians in named.items():
             mine = {kind: part.under(cameras.get(name)) if kind == "context" else part for kind, part in splits.items()}
-            score, opaque = _score_result(name, gaussians, len(inputs), mine, renderer, on_image)
+            score, opaque = _score_result(name, gaussians, len(inputs), mine, renderer, keep)
             if name == INPUT:
                 splits = {kind: part.with_covered(opaque[kind]) for kind, part in splits.items()}
             scores.append(replace(score, fog=fog.get(name, {})))
-            if progress:
-                progress("evaluate", i + 1, len(named))
     counts = {name: len(split.views.names) for name, split in splits.items()}
     stand_in = RENDERS if scene.images is None else ROW_COLORS
     reference = PHOTOS if photos.images is not None else _name_reference(stand_in, counts)

@@ -19,6 +19,7 @@ from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, plan_view, prepare
 from gsmerge.raster.composite import blend
+from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # of the input, evenly spread, that the cameras start from
@@ -47,7 +48,11 @@ class Fog:
 
 
 def measure_fog(
-    reference: Gaussians, results: Mapping[str, Gaussians], cameras: Cameras, near: float = 0.01
+    reference: Gaussians,
+    results: Mapping[str, Gaussians],
+    cameras: Cameras,
+    near: float = 0.01,
+    progress: Progress = lambda *_: None,
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog and holes of results, by name, seen from outside the ``cameras`` of the scene ``reference``.
 
@@ -56,7 +61,9 @@ def measure_fog(
     """
     first, splats = prepare(reference), {name: prepare(result) for name, result in results.items()}
     sums = {name: {kind: np.zeros((3, 2)) for kind in CAMERAS} for name in results}
-    for kind, camera in outside_cameras(reference, cameras):
+    outside = list(outside_cameras(reference, cameras))
+    for number, (kind, camera) in enumerate(outside):
+        progress("views from outside", number, len(outside))
         shown = draw_opacity(first, camera, near)
         for name in results:
             sums[name][kind] += fog_sums(shown, draw_opacity(splats[name], camera, near))

@@ -288,8 +288,8 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
-        " compact --set drop_floaters=true leaves them out",
-        f"sky        in {scene['num_sky_views']} photos; compact --set drop_sky=true leaves it out"
+        " compact --drop floaters leaves them out",
+        f"sky        in {scene['num_sky_views']} photos; compact --drop sky leaves it out"
         if scene["num_sky_views"]
         else "",
         f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -48,6 +50,12 @@ def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool =
     _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
+
+
+def picture_html(picture: Picture, text: str) -> str:
+    """Write a picture as an element of HTML for notebooks; ``text`` says what it shows."""
+    data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
 
 
 def label(picture: Picture, text: str) -> Picture:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.budget import FileSize, file_size
+from gsmerge.compaction.file_size import drop_to_bytes
 from gsmerge.encoded.encoded import Encoded
 from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import SceneError, UsageError
@@ -18,6 +20,7 @@ from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
+from gsmerge.io.formats.table import PLY, count_for_bytes
 from gsmerge.online.batch import BatchPhotos
 from gsmerge.online.file import load_stored
 from gsmerge.online.state import OnlineState, to_encoded
@@ -25,6 +28,7 @@ from gsmerge.plan import resolve_fit
 from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians
 
@@ -129,6 +133,8 @@ def decode_file(
     notes = [lost] if lost else []
     fit_options = resolve_fit(settings) if always_fit or num_photos(stored) else FitOptions(fit="none")
     check_fit(stored, fit_options)
+    size = _file_size(budget, out, spz_version)
+    count = budget if size is None else count_for_bytes(size.file, size.num_bytes, stored.sh_degree)
     document: dict[str, Any] = {
         **document_head(),
         "input": {
@@ -140,16 +146,18 @@ def decode_file(
     }  # fmt: skip
     if dry_run:
         encoded = decodable(stored)
-        plan = plan_decode(encoded, k=k, budget=budget)
+        plan = plan_decode(encoded, k=k, budget=count)
         most = int(plan.counts.sum()) + encoded.num_kept
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
         return document | output | {"notes": [*plan.notes, *notes]}
     with atomic_output(out, overwrite=overwrite) as temporary:
         decoded = decode_stored(
-            stored, k=k, budget=budget, options=fit_options, seed=settings.seed, threads=settings.threads,
+            stored, k=k, budget=count, options=fit_options, seed=settings.seed, threads=settings.threads,
             device=settings.device, progress=progress,
         )  # fmt: skip
         gaussians, done = decoded.gaussians, perf_counter()
+        if size is not None and size.file is not PLY:
+            gaussians = drop_to_bytes(gaussians, [], size.num_bytes, size.file)
         if len(gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "encode the scene again")
         if not all(np.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "quats")):
@@ -166,6 +174,14 @@ def decode_file(
         **seconds_document(seconds),
         "notes": [*decoded.notes, *notes],
     }
+
+
+def _file_size(budget: int | str | None, out: Path, spz_version: int) -> FileSize | None:
+    """Return the size in bytes that a budget asks for; None of another one."""
+    try:
+        return None if budget is None else file_size(BudgetOptions(budget, output=out.name, spz_version=spz_version))
+    except ValueError as error:
+        raise UsageError(str(error)) from error
 
 
 def _comments(stored: Encoded | OnlineState) -> list[str]:

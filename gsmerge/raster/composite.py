@@ -127,6 +127,10 @@ class Rendering:
     alphas: AnyArray
     depths: AnyArray | None
 
+    def __repr__(self) -> str:
+        count, height, width = self.images.shape[:3]
+        return f"Rendering({count} of {width} x {height}{'' if self.depths is None else ', depths'})"
+
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
     """Return splats relative to the cameras' mean centre, and viewmats and intrinsics in float64.

@@ -13,6 +13,7 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.embedded import holds_cameras
+from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
@@ -81,7 +82,7 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names are not searched.
 
-    Cameras inside the ``.ply`` go before others beside it.
+    Cameras inside the ``.ply`` go before others beside it, those of a result, ``NAME.cameras.json``, before any other.
 
     The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/``, ``ply/`` and
     ``gaussians/``, and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``,
@@ -106,7 +107,7 @@ def find_scene_files(
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-    camera_path = _named(cameras) or (ply if holds_cameras(ply) else None)
+    camera_path = _named(cameras) or result_cameras(ply)
     camera_path = camera_path or next((place for place in places if place is not None), None)
     image_path = _named(images)
     if image_path is None and camera_path is not None:
@@ -125,6 +126,12 @@ def find_scene_files(
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=tuple(plys) if len(plys) > 1 else ())
+
+
+def result_cameras(ply: Path) -> Path | None:
+    """Find the cameras that ``compact`` wrote into or beside a result; None without them."""
+    beside = viewer_cameras_path(ply)
+    return ply if holds_cameras(ply) else beside if beside.is_file() else None
 
 
 def _named(path: StrPath | None) -> Path | None:

@@ -24,10 +24,13 @@ class BudgetOptions(Settings):
     budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
         "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
         "scene needs.",
-        "A size is that of the `.ply` and never exceeded.", metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
+        "A size is that of the output's file, a `.ply` in Python, and never exceeded.",
+        metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
         "lose at most so much against the best, such as -0.2dB.",
         "The best is what the scene's own curve reaches.", metavar="30dB|-0.2dB")  # fmt: skip
+    output: str = setting("a.ply", "Name of the file whose bytes a size counts, with its ending.", internal=True)
+    spz_version: int = setting(3, "Version of that file, if it is a `.spz`.", internal=True)
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
         "Each is fitted by itself.", least=1, most=8)  # fmt: skip

@@ -90,7 +90,7 @@ class CompactOptions(Settings):
             raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
-        for name, wanted in {"crop": self.clean.crop is not None, "drop_sky": self.clean.drop_sky}.items():
+        for name, wanted in {"crop": self.clean.crop is not None, "drop sky": "sky" in self.clean.drops}.items():
             if wanted and self.budget.target_psnr is not None:
                 quality = f"quality {self.budget.quality}"
                 raise ValueError(
@@ -109,7 +109,7 @@ class CompactOptions(Settings):
         budget = self.budget
         asked = {f"method {self.method}": self.method != OURS, "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
-        asked |= {"drop_floaters": self.clean.drop_floaters, "drop_sky": self.clean.drop_sky}
+        asked |= {f"drop {name}": True for name in self.clean.drops}
         return [name for name, wanted in asked.items() if wanted]
 
     @property

@@ -24,8 +24,9 @@ MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
 USUAL_K = 1  # what "auto" is unless there are reasons for more
 NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
-CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1"
-CROP_NUMBERS = {"sphere": 4, "box": 6}
+CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
+CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
+DROPS = ("floaters", "sky", "transparent")
 
 
 @dataclass(frozen=True)
@@ -164,27 +165,35 @@ class CleanOptions(Settings):
 
     crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
         "scene's world units; a budget is met after it.",
-        "Their centres have to be inside.", metavar="SHAPE")  # fmt: skip
-    drop_floaters: bool = setting(False, "Leave out Gaussians that are isolated, far beyond the scene, or hang across "
-        "it.",
-        "`gsmerge.stages.clean.floaters` says which these are.")  # fmt: skip
-    drop_sky: bool = setting(False, "Leave out Gaussians that are sky in the photos.",
-        "`gsmerge.stages.sky.sky` says which these are.")  # fmt: skip
+        "Their centres have to be inside. Three more numbers of a box turn it about its middle: degrees about x, y and "
+        "z, in this order.", metavar="SHAPE")  # fmt: skip
+    drop: str | None = setting(None, "Leave out floaters, sky or transparent Gaussians, with commas between.",
+        "`floaters`: isolated, far beyond the scene, or hanging across it (`gsmerge.stages.clean.floaters`); `sky`: "
+        "what is sky in the photos (`gsmerge.stages.sky.sky`); `transparent`: of an opacity below 1/255.",
+        metavar="floaters,sky,...")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.crop is not None:
             parse_crop(self.crop)
+        unknown = [name for name in self.drops if name not in DROPS]
+        if unknown or len(set(self.drops)) < len(self.drops):
+            raise ValueError(f"drop: expected some of {', '.join(DROPS)}, with commas between, got {self.drop!r}")
+
+    @property
+    def drops(self) -> tuple[str, ...]:
+        """Names of what is left out."""
+        return () if self.drop is None else tuple(name.strip() for name in self.drop.split(","))
 
     @property
     def asked(self) -> bool:
         """Whether any clean-up is asked for."""
-        return self.crop is not None or self.drop_floaters or self.drop_sky
+        return self.crop is not None or bool(self.drops)
 
     @property
     def hides(self) -> bool:
         """Whether the clean-up removes things that photos show."""
-        return self.crop is not None or self.drop_sky
+        return self.crop is not None or "sky" in self.drops
 
 
 def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
@@ -199,10 +208,10 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
         numbers = tuple(float(part) for part in match[2].split(",")) if match else ()
     except ValueError:
         numbers = ()
-    if match is None or len(numbers) != CROP_NUMBERS[match[1]] or not all(map(math.isfinite, numbers)):
+    if match is None or len(numbers) not in CROP_NUMBERS[match[1]] or not all(map(math.isfinite, numbers)):
         raise ValueError(f"crop: expected {CROP}, got {text!r}")
     is_sphere = match[1] == "sphere"
-    if numbers[3] <= 0 if is_sphere else any(high <= low for low, high in zip(numbers, numbers[3:], strict=False)):
+    if numbers[3] <= 0 if is_sphere else any(high <= low for low, high in zip(numbers[:3], numbers[3:6], strict=False)):
         expected = "a radius above 0" if is_sphere else "x0 < x1, y0 < y1 and z0 < z1"
         raise ValueError(f"crop: expected {expected}, got {text!r}")
     return match[1], numbers

@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsmerge.geometry import turn_by
+from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
@@ -19,6 +21,7 @@ APART = 3.0  # times the median distance of nearest Gaussians: a floater's own i
 # Second and largest scale, as shares of half the diagonal of the scene's box, from which on a Gaussian hangs across the
 # scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
 CURTAIN, WIDER = (0.1, 0.33), 8.0
+TRANSPARENT = 1 / 255  # opacity below which a Gaussian shows nothing
 MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
 
 ToWorld = Callable[[Gaussians], Gaussians]
@@ -31,7 +34,10 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
     numbers = np.array(parsed)
     if shape == "sphere":
         return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
-    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:])).all(1))
+    if len(numbers) > 6:
+        middle = (numbers[:3] + numbers[3:6]) / 2
+        means = middle + matmul(means - middle, turn_by(numbers[6:]))  # as seen by the box
+    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:6])).all(1))
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
@@ -91,21 +97,27 @@ def floater_share(gaussians: Gaussians) -> float:
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
 
-def clean(gaussians: Gaussians, options: CleanOptions, scene: Scene, to_world: ToWorld) -> tuple[Gaussians, Counts]:
-    """Remove unwanted Gaussians; return the rest and the numbers removed (``cropped``, ``sky``, ``floaters``).
+def clean(
+    gaussians: Gaussians, options: CleanOptions, scene: Scene | None, to_world: ToWorld
+) -> tuple[Gaussians, Counts]:
+    """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and those of ``drop``.
 
     Gaussians and scene are canonical; ``to_world`` leads to the frame of the crop. The sky is found
-    in the scene's photos.
+    in the scene's photos; nothing else needs the scene.
     """
     counts = {}
     if options.crop is not None:
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
-    if options.drop_sky:
-        assert scene.images is not None, "the plan refuses drop_sky without photos"
+    if "transparent" in options.drops:
+        faint = gaussians.opacities < TRANSPARENT
+        gaussians, counts["transparent"] = gaussians[~faint], int(faint.sum())
+    if "sky" in options.drops:
+        assert scene is not None, "sky is dropped where there are photos"
+        assert scene.images is not None, "the plan refuses to drop sky without photos"
         above = sky(gaussians, scene.cameras, scene.images)
         gaussians, counts["sky"] = gaussians[~above], int(above.sum())
-    if options.drop_floaters:
+    if "floaters" in options.drops:
         isolated = floaters(gaussians)
         gaussians, counts["floaters"] = gaussians[~isolated], int(isolated.sum())
     return gaussians, counts

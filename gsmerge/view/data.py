@@ -115,7 +115,7 @@ def collect(
     cameras: Mapping[str, Cameras] | None = None,
     segmentation: SegmentOptions | None = None,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> ViewData:
     """Draw and score a scene, which has at least one view, and its results, if any, in all views.
 
@@ -153,6 +153,7 @@ def collect(
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
+    progress("superpixels and the view from outside", 0, 0)
     with use_threads(threads):
         outside = _outside_view(scene, named, frame, len(views))
         shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())

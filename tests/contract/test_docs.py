@@ -23,6 +23,8 @@ from gsmerge.io.cameras.read import CAMERA_FORMATS
 from gsmerge.io.formats.table import FORMATS
 from gsmerge.report import report_document
 from gsmerge.settings.compact import method_names
+from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.setting import flat_settings
 
 ROOT = Path(__file__).parents[2]
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
@@ -63,7 +65,7 @@ def calls_in(page: str) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    listed = "compact batch encode decode extend inspect check view render evaluate chart generate stress train"
+    listed = "compact convert batch encode decode extend inspect check view render evaluate chart generate stress train"
     assert list(COMMANDS) == listed.split()
 
 
@@ -185,6 +187,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "json",
         "quiet",
     }
+    own |= set(flat_settings(PlacementOptions))  # of what is written, in whose frame nothing else is done
     names = {option.removeprefix("--") for option in options(COMMANDS["compact"])} - own
     assert {name.replace("-", "_") for name in names} - fields == set()
 

@@ -105,7 +105,7 @@ def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Pa
         "--levels",
         "3",
         "--set",
-        "drop_floaters=true",
+        "drop=floaters",
         "--k",
         "2",
     )

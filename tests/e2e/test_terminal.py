@@ -89,7 +89,7 @@ def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("foreground")
 def test_ctrl_c_leaves_no_bar(scene_copy: Path, tmp_path: Path) -> None:
     words = ("compact", scene_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--set", "fit_steps=100000")
-    code, output = in_terminal(*words, interrupt_at=b"held out")
+    code, output = in_terminal(*words, interrupt_at=b"photos")
     assert code == 130
     lines = screen(output)
     assert lines == [f"{ERROR}interrupted"]

@@ -97,3 +97,22 @@ def test_a_second_format_shares_them(scene_copy: Path, run: Run, tmp_path: Path)
 )
 def test_their_name_is_made_of_the_result_s(output: str, expected: str) -> None:
     assert viewer_cameras_path(Path(output)) == Path(expected)
+
+
+def test_a_folder_with_a_result_and_its_cameras_needs_no_options(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+    """The output's folders are made; the cameras beside a result go before others in the folder."""
+    out = tmp_path / "new" / "out"
+    run("compact", scene_copy, "-o", out / "small.ply", *QUICK, "-q", code=0)
+    assert sorted(path.name for path in out.iterdir()) == ["small.cameras.json", "small.ply"]
+    count = len(gsmerge.read_scene(scene_copy))
+    for place in (out, out / "small.ply"):
+        facts = json.loads(run("inspect", place, "--json", code=0).out)
+        assert (facts["cameras"], facts["num_views"]) == (str(out / "small.cameras.json"), count)
+    run("render", out, "--as", "views", "-o", tmp_path / "pictures", code=0)
+    assert len(list((tmp_path / "pictures").iterdir())) == count
+    document = json.loads(run("evaluate", out, "--lpips", "none", "--json", code=0).out)
+    assert document["num_views"]["context"] == count
+    assert not says(run("view", out, "-o", tmp_path / "view.html", code=0).err, "placed")
+    (out / "transforms.json").write_bytes((scene_copy / "transforms.json").read_bytes())
+    facts = json.loads(run("inspect", out / "small.ply", "--json", code=0).out)
+    assert facts["cameras"] == str(out / "small.cameras.json")

@@ -34,7 +34,7 @@ def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("--effort", "draft"), ("--effort", "fast", "--k", 2), ("--fit", "none"), ("--budget", "5%"),
         ("--budget", "20KB"), ("--budget", "auto"), ("--quality", "15dB"), ("--quality", "-1dB"), ("--blocks", 2),
-        ("--recipe", "paper"), ("--set", "drop_sky=true"), ("--exposure", "per-photo"), ("--set", "poses=free"),
+        ("--recipe", "paper"), ("--drop", "sky"), ("--exposure", "per-photo"), ("--set", "poses=free"),
         ("--method", "unmerged-fit"), ("--levels", 2),
     ],
     ids=lambda options: " ".join(map(str, options)),

@@ -209,7 +209,7 @@ CASES |= {
     "no such ply": Case(lambda folder: [folder / "nothing.ply"], says=("nothing.ply", "no such")),
     "no such cameras": Case(given("--cameras", "nowhere.json"), says=("nowhere.json", "no such")),
     "no such images": Case(given("--images", "nowhere"), says=("nowhere", "no such")),
-    "output in no folder": Case(given("-o", "{}/nowhere/a.ply"), says=("a.ply", "nowhere")),
+    "output in a file": Case(given("-o", "{}/scene.ply/a.ply"), says=("a.ply", "scene.ply")),
     "output below a file": Case(given("-o", "{}/transforms.json/a.ply"), says=("a.ply",)),
     "output is a folder": Case(given("-o", "{}/images"), USAGE, says=("images", "folder")),
     "output is the input": Case(

@@ -175,10 +175,10 @@ def test_unaligned_gaussians_without_a_fit(room: Scene) -> None:
 
 def test_sky_stays_where_most_are_wrong(room: Scene) -> None:
     scene = with_photos(room, all_black, aligned=False)
-    whole, same = (compact(scene, **FIT, drop_sky=drop_sky) for drop_sky in (False, True))
+    whole, same = (compact(scene, **FIT, drop=drop) for drop in (None, "sky"))
     assert scenes.identical(whole.gaussians, same.gaussians)
     (note,) = set(same.report.notes) - set(whole.report.notes)
-    assert says(note, "drop_sky", "photo", "sky")
+    assert says(note, "drop sky", "photo", "sky")
     assert "clean" not in same.report.choices
 
 

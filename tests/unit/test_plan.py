@@ -167,7 +167,7 @@ def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
     assert plan_of(hidden, budget=400).unseen is None
 
 
-@pytest.mark.parametrize(("settings", "reason"), [({"quality": "20dB"}, "quality"), ({"drop_sky": True}, "drop_sky")])
+@pytest.mark.parametrize(("settings", "reason"), [({"quality": "20dB"}, "quality"), ({"drop": "sky"}, "drop sky")])
 def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason: str, scene: Scene) -> None:
     """Where no pixel is known, whose colour could stand in."""
     with pytest.raises(UsageError, match=reason):
@@ -178,10 +178,10 @@ def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     noise = replace(scene, images=rng.random(scene.images.shape, np.float32))
     with record_run() as record:
-        plan = plan_of(unaligned_scenes.without_order(noise), drop_sky=True)
+        plan = plan_of(unaligned_scenes.without_order(noise), drop="sky")
     assert plan.fit.fit == "none"
-    assert not plan.clean.drop_sky
-    assert any("drop_sky" in note for note in record.notes)
+    assert plan.clean.drop is None
+    assert any("drop sky" in note for note in record.notes)
 
 
 def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:

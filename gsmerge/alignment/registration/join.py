@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.registration.register import register
-from gsmerge.alignment.registration.similarities import move_points
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, multiply_quats, rotmat_to_quat, turn_harmonics
+from gsmerge.geometry import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, grid_ids
 
@@ -95,19 +94,9 @@ def _facts(path: Path, place: Similarity | None, matches: int) -> dict[str, Any]
 
 def move_scene(scene: Scene, place: Similarity) -> Scene:
     """Move a scene's Gaussians and cameras by a similarity; photos stay."""
-    g = scene.gaussians
     if place.scale == 1 and np.array_equal(place.rotation, np.eye(3)) and not place.shift.any():
         return scene
-    turn = rotmat_to_quat(place.rotation[None])[0]
-    gaussians = Gaussians(
-        means=move_points(place, g.means).astype(g.means.dtype),
-        quats=multiply_quats(turn, g.quats).astype(g.quats.dtype),
-        scales=(place.scale * g.scales).astype(g.scales.dtype),
-        opacities=g.opacities,
-        sh0=g.sh0,
-        shN=turn_harmonics(g.shN, place.rotation),
-    )
-    return replace(scene, gaussians=gaussians, cameras=place.move(scene.cameras))
+    return replace(scene, gaussians=place.move_gaussians(scene.gaussians), cameras=place.move(scene.cameras))
 
 
 def concat_scenes(scenes: Sequence[Scene]) -> Scene:

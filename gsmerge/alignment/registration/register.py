@@ -20,7 +20,6 @@ from gsmerge.alignment.registration.similarities import (
     apply_after,
     fit_similarities,
     invert_place,
-    move_points,
     round_place,
 )
 from gsmerge.geometry import IDENTITY, Schedule, Similarity, camera_depths, descend, lower_median, motion_matrices
@@ -152,7 +151,7 @@ def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: f
     ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
     """
     turns = other.viewmats[:, :3, :3]
-    moved = move_points(place, end.points)
+    moved = place.move_points(end.points)
     camera = _times(turns, moved) + other.viewmats[:, :3, 3]
     z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
     projected = _times(other.Ks, camera)[:, :2] / z[:, None]

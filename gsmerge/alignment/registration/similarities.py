@@ -39,15 +39,10 @@ def _spread(points: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum((share * points**2).sum((1, 2)), 1e-30))
 
 
-def move_points(place: Similarity, points: np.ndarray) -> np.ndarray:
-    """Move points ``[n,3]`` or ``[3]`` by a similarity."""
-    return np.asarray(place.scale * matmul(points, place.rotation.T) + place.shift)
-
-
 def apply_after(second: Similarity, first: Similarity) -> Similarity:
     """Compose two similarities: first ``first``, then ``second``."""
     rotation = matmul(second.rotation, first.rotation)
-    shift = move_points(second, first.shift)
+    shift = second.move_points(first.shift)
     return Similarity(rotation, second.scale * first.scale, shift, kind="other")
 
 

@@ -92,6 +92,9 @@ class CameraFile:
     def __len__(self) -> int:
         return len(self.names)
 
+    def __repr__(self) -> str:
+        return f"CameraFile({len(self)} of {self.path}, {self.source})"
+
 
 class View(NamedTuple):
     """One camera of a file, in the convention of the file."""

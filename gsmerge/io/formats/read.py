@@ -72,6 +72,9 @@ class GaussianFile:
     valid: np.ndarray
     info: FileInfo
 
+    def __repr__(self) -> str:
+        return f"GaussianFile({self.gaussians!r} of {self.info.path})"
+
 
 def kept_comments(info: FileInfo) -> tuple[str, ...]:
     """Return the header comments that tell viewers how to render the Gaussians."""

@@ -24,6 +24,7 @@ class Format:
     max_degree: int  # of the harmonics that there is room for
     version: int | None = None  # where several are written
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
+    each: Sequence[float] = ()  # bytes of a Gaussian by degree: of a .sog or .spz those of results, as measured
 
     def names(self, path: StrPath) -> bool:
         """Return whether a path ends as files of this format do."""
@@ -31,19 +32,39 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
+_SPZ, _SOG = (17.0, 18.5, 18.9, 19.2, 20.0), (13.0, 22.0, 36.5, 56.5)
 PLY = Format(".ply", ply.read_rows, None, ply.MAX_DEGREE)
 FORMATS = (  # of endings that end alike the longest first
-    Format(".compressed.ply", ply.read_rows, compressed.compressed_bytes, compressed.MAX_DEGREE),
+    Format(
+        ".compressed.ply",
+        ply.read_rows,
+        compressed.compressed_bytes,
+        compressed.MAX_DEGREE,
+        each=(16.3, 25.3, 40.4, 61.4),
+    ),
     PLY,
-    Format(".spz", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3),
-    Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard),
-    Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE),
-    Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE),
-    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE),
-    Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE),
+    Format(".spz", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3, each=_SPZ),
+    Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ),
+    Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE, each=_SOG),
+    Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
+    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE, each=(60.1, 96.1, 156.1, 240.2)),
+    Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE, each=_SOG),
 )
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS[:-1]))
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FORMATS[:-1] if row.read is not None))
+
+
+def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
+    """Return how many Gaussians a file of at most ``max_bytes`` has room for; UsageError if for none.
+
+    Exact of a ``.ply``, about right of other formats, whose bytes depend on their content.
+    """
+    if chosen is PLY:
+        return ply.count_for_bytes(max_bytes, sh_degree)
+    each = chosen.each[min(sh_degree, len(chosen.each) - 1)]
+    if max_bytes < each:
+        raise UsageError(f"budget: expected at least {each:.0f} bytes for one Gaussian, got {max_bytes}")
+    return int(max_bytes / each)
 
 
 def input_format(path: StrPath) -> Format:

@@ -96,7 +96,7 @@ def write_levels(
     if path.name != streamed.INDEX:
         raise UsageError(f"{path}: expected the name {streamed.INDEX}, by which viewers recognise the format")
     with atomic_outputs(overwrite=overwrite) as add:
-        add_levels(add, path, add(path, make_folder=True), levels, comments)
+        add_levels(add, path, add(path), levels, comments)
     streamed.remove_unused_chunks(path)
 
 
@@ -117,7 +117,7 @@ def add_levels(
             continue
         target, level = path.parent / name, name.partition("_")[0]
         same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
-        written.setdefault(level, []).append(target if same else add(target, make_folder=True))
+        written.setdefault(level, []).append(target if same else add(target))
         if not same:
             written[level][-1].write_bytes(data)
         if target.name == sog.META:

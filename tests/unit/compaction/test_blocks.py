@@ -134,8 +134,8 @@ def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> 
     ("settings", "problem"),
     [
         ({"quality": "30dB"}, "quality 30dB"), ({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"),
-        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop_sky": True}, "drop_sky"),
-        ({"crop": "sphere:0,0,3,2"}, "crop"), ({"drop_floaters": True}, "drop_floaters"),
+        ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop": "sky"}, "drop sky"),
+        ({"crop": "sphere:0,0,3,2"}, "crop"), ({"drop": "floaters"}, "drop floaters"),
     ],
 )  # fmt: skip
 def test_what_needs_one_piece(scene: Scene, settings: dict[str, Any], problem: str) -> None:

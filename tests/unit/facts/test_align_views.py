@@ -114,7 +114,7 @@ def test_clean_up_keeps_the_poses_of_the_fit(scene: Scene) -> None:
     def method(*_: object) -> Fitted:
         return Fitted(scene.gaussians, moved, None)
 
-    options, prepared = CompactOptions().with_settings({"drop_floaters": True}), prepare(scene)
+    options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(scene)
     assert build_cleaned(method, prepared, make_plan(prepared, options), None).cameras is moved
 
 

@@ -73,9 +73,20 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
     assert target.read_text() == "theirs"
 
 
-def test_a_missing_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match="does not exist"), atomic_output(tmp_path / "no" / "out.txt"):
-        pass
+def test_missing_folders_are_made_and_removed_where_the_block_fails(tmp_path: Path) -> None:
+    with atomic_output(tmp_path / "a" / "b" / "out.txt") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "a" / "b" / "out.txt").read_text() == "new"
+    with pytest.raises(ZeroDivisionError), atomic_output(tmp_path / "a" / "c" / "d" / "out.txt"):
+        raise ZeroDivisionError
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+
+
+def test_a_file_as_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for place, named in (("file/out.txt", "out.txt"), ("file/deeper/out.txt", "deeper")):
+        with refuses(SceneError, named, "Not a directory"), atomic_output(tmp_path / place):
+            pass
     with pytest.raises(SceneError, match="found a folder"), atomic_output(tmp_path, overwrite=True):
         pass
 
@@ -144,8 +155,8 @@ def test_several_files_are_all_there_or_none(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text("old")
     with refuses(SceneError, "b.txt", "No space left"):
         write_both(tmp_path, "b.txt", fail=True)
-    with refuses(SceneError, "b.txt", "folder", "none"):
-        write_both(tmp_path, "none/b.txt")
+    with refuses(SceneError, "b.txt", "No space left"):
+        write_both(tmp_path, "none/b.txt", fail=True)
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"b.txt": "old"}
     write_both(tmp_path, "b.txt")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"a.txt": "new", "b.txt": "new"}

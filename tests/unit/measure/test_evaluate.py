@@ -442,9 +442,15 @@ def test_haze_is_noted(scene: Scene, half: Gaussians) -> None:
 
 
 def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:
+    """A stage before each that takes long, and every view."""
     said: list[tuple[str, int, int]] = []
-    evaluate(scene, {"half": half}, None, PLAIN, progress=lambda *step: said.append(step))
-    assert said == [("evaluate", 1, 2), ("evaluate", 2, 2)]
+    evaluate(scene, {"half": half}, held_out(), PLAIN, progress=lambda *step: said.append(step))
+    names = list(dict.fromkeys(name for name, _, _ in said))
+    assert names[-2:] == ["evaluate: input", "evaluate: half"]
+    count = 2 * (len(scene) + len(held_out()))
+    assert [step[1:] for step in said if step[0] in names[-2:]] == [(done, count) for done in range(count)]
+    outside = [step for step in said if step[0] == "views from outside"]
+    assert [done for _, done, _ in outside] == list(range(outside[0][2]))
 
 
 def test_tensors_give_the_same(scene: Scene, half: Gaussians) -> None:

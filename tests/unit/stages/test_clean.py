@@ -77,7 +77,7 @@ def test_floaters_are_alone_or_far_away(scene: Scene) -> None:
     large = replace(moved, scales=np.full((1600, 3), 4, np.float32))  # which touch across the gap
     assert np.flatnonzero(floaters(large)).tolist() == list(range(6, 16))
     assert not floaters(given[:8]).any()
-    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop_floaters=True), scene, lambda g: g)
+    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop="floaters"), scene, lambda g: g)
     assert (len(left), counts) == (1589, {"cropped": 10, "floaters": 1})
 
 
@@ -128,7 +128,7 @@ def test_the_faintest_go_first() -> None:
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     crop = sphere_in(scene, share)
-    result = compact(scene, **QUICK, crop=crop, drop_floaters=True, budget=150)
+    result = compact(scene, **QUICK, crop=crop, drop="floaters", budget=150)
     assert len(result.gaussians) == 150
     assert inside_crop(result.gaussians.means, crop).all()
     assert result.report.choices["clean"]["cropped"] > 0
@@ -165,6 +165,6 @@ def test_what_cannot_be(scene: Scene) -> None:
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
     assert noted(result.report.notes, "budget", "5,000")
-    assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop_floaters": True}).whole_only == [
-        "crop", "drop_floaters",
+    assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop": "floaters"}).whole_only == [
+        "crop", "drop floaters",
     ]  # fmt: skip

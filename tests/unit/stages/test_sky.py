@@ -79,7 +79,7 @@ def test_a_region_begins_above() -> None:
 
 def test_compact_leaves_it_out_and_counts_it() -> None:
     scene, _ = painted(ZENITH, HAZE, 4.0)
-    whole, without = compact(scene, **QUICK), compact(scene, **QUICK, drop_sky=True)
+    whole, without = compact(scene, **QUICK), compact(scene, **QUICK, drop="sky")
     count = without.report.choices["clean"]["sky"]
     assert count > 0.1 * len(whole.gaussians)  # large ones
     assert len(without.gaussians) == len(whole.gaussians) - count
@@ -88,13 +88,13 @@ def test_compact_leaves_it_out_and_counts_it() -> None:
     shown = render(without.gaussians, scene.cameras).alphas[..., 0]
     assert shown[:, : HORIZON - 4].mean() < 0.3
     assert shown[:, HORIZON + 4 :].mean() > 0.9
-    exact = compact(scene, **QUICK, drop_sky=True, budget=200)
+    exact = compact(scene, **QUICK, drop="sky", budget=200)
     assert len(exact.gaussians) == 200
 
 
 def test_indoors_nothing_changes() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
-    whole, same = compact(scene, **QUICK), compact(scene, **QUICK, drop_sky=True)
+    whole, same = compact(scene, **QUICK), compact(scene, **QUICK, drop="sky")
     np.testing.assert_array_equal(whole.gaussians.means, same.gaussians.means)
     assert same.report.choices["clean"] == {"sky": 0}
 
@@ -108,12 +108,12 @@ def test_views_that_show_it_are_counted() -> None:
 
 def test_what_cannot_be() -> None:
     scene, stages = replace(painted(ZENITH, HAZE)[0], images=None), []
-    with refuses(UsageError, "drop_sky", "photos", "--images"):
+    with refuses(UsageError, "drop sky", "photos", "--images"):
         compact(
-            unaligned_scenes.without_order(scene), **QUICK, drop_sky=True,
+            unaligned_scenes.without_order(scene), **QUICK, drop="sky",
             progress=lambda stage, *_: stages.append(stage),
         )  # fmt: skip
     assert set(stages) == {"prepare"}  # before any other work
-    with refuses(ValueError, "drop_sky", "budget", "quality 30dB"):
-        CompactOptions().with_settings({"drop_sky": True, "quality": "30dB"})
-    assert CompactOptions().with_settings({"drop_sky": True}).whole_only == ["drop_sky"]
+    with refuses(ValueError, "drop sky", "budget", "quality 30dB"):
+        CompactOptions().with_settings({"drop": "sky", "quality": "30dB"})
+    assert CompactOptions().with_settings({"drop": "sky"}).whole_only == ["drop sky"]

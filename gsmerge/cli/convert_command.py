@@ -1,0 +1,44 @@
+"""``gsmerge convert``: Gaussians from format to format, joined, cut and turned, without a fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsmerge.cli import parameters as opt
+from gsmerge.cli.console import print_document, say_notes
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs
+from gsmerge.errors import UsageError
+
+
+@opt.command(
+    opt.argument("paths", list[Path], "IN... OUT",
+                 "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb or lod-meta.json; several of one "
+                 "world are joined. The last is written, as its name says."),
+    opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
+                "those of a result, inside or beside it."),
+    opt.changed("images", help="Photos of the cameras, which --drop sky needs."),
+    opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
+    opt.changed("set", help="Any other setting of the written file, such as normals=false; may be repeated."),
+    "up scale rotate translate sh_degree crop drop overwrite",
+)  # fmt: skip
+def convert(args: opt.Args) -> None:
+    """Write Gaussians in another format, frame or extent, as they are: nothing is merged or fitted."""
+    from gsmerge.settings.placement import PlacementOptions
+    from gsmerge.settings.stages import CleanOptions
+
+    *inputs, output = args.paths
+    if not inputs:
+        raise UsageError(f"expected files to read and one to write, got {output} alone")
+    writing, cleaning, placement = args.make(FileOptions, CleanOptions, PlacementOptions)
+    check_outputs((output,), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
+    check_format(output, writing, levels=True)
+    from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
+
+    options = ConvertOptions(
+        inputs, output, args.cameras, args.images, args.opacity, cleaning, placement,
+        normals=writing.normals, full_columns=writing.columns == "full", spz_version=writing.spz_version,
+        overwrite=args.overwrite,
+    )  # fmt: skip
+    document = convert_files(options)
+    say_notes(document["notes"], quiet=args.silent)
+    print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)

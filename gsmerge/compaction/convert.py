@@ -1,0 +1,214 @@
+"""Convert files of Gaussians from format to format without a fit: joined, cut, turned, and written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.prepare import scene_frame
+from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
+from gsmerge.io import (
+    atomic_outputs,
+    file_notes,
+    lost_harmonics,
+    output_format,
+    read_cameras,
+    read_gaussians,
+    write_gaussians,
+)
+from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
+from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
+from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.read import kept_comments
+from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
+from gsmerge.io.formats.write import add_levels
+from gsmerge.io.photo_files import read_images
+from gsmerge.kernels.matrices import matmul
+from gsmerge.report import document_head, human_bytes
+from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.files import result_cameras
+from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.clean import clean
+from gsmerge.types import Cameras, Gaussians, Scene
+
+NUM_FULL = 15  # harmonics above degree 0 up to degree 3
+NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """Files to convert, how to read them, and what to do with them."""
+
+    inputs: Sequence[Path]  # several are joined in their order
+    output: Path  # its name chooses the format
+    cameras: Path | None = None  # in the frame of the first input; None: those of a result, inside or beside it
+    images: Path | None = None  # photos of these cameras, which say where the sky is
+    opacity: OpacityChoice = "auto"
+    clean: CleanOptions = field(default_factory=CleanOptions)
+    placement: PlacementOptions = field(default_factory=PlacementOptions)
+    normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
+    full_columns: bool = False  # pad its harmonics with zeros up to degree 3
+    spz_version: int = 3
+    overwrite: bool = False
+
+
+def convert_files(options: ConvertOptions) -> dict[str, Any]:
+    """Convert files of Gaussians and write the result, and its cameras where they are known: all files, or none.
+
+    Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
+    UsageError for an ending that is not written, or sky without photos.
+    """
+    ending = output_format(options.output, options.spz_version, levels=True).ending
+    with use_threads():
+        files = [read_gaussians(path, opacity=options.opacity) for path in options.inputs]
+        gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
+        stored = _read_cameras(options)
+        cameras = None if stored is None else to_cameras(stored)
+        count = len(gaussians)
+        gaussians, left_out = _clean(gaussians, options, stored)
+        if len(gaussians) == 0:
+            problem = f"expected Gaussians that are kept, found none of {count:,}"
+            raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
+        frame = find_placement(options.placement, cameras)
+        gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+    gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
+    infos = [file.info for file in files]
+    named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
+    notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
+    lost = lost_harmonics(options.output, gaussians.sh_degree, options.spz_version)
+    comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
+    if any(RESULT_COMMENT in info.comments for info in infos):
+        comments.insert(0, RESULT_COMMENT)
+    names = () if stored is None else stored.names
+    if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
+        comments += camera_comments(moved, names)
+    num_bytes, beside = _write(options, ending, gaussians, moved, names, comments)
+    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
+    read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
+    document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
+    return document | {"notes": [*notes, *([lost] if lost else [])]}
+
+
+def conversion_line(document: dict[str, Any]) -> str:
+    """Describe a conversion in one line for people."""
+    before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
+    kept = "" if after["num_gaussians"] == before else f" of {before:,}"
+    beside = document["viewer_cameras"]
+    cameras = f"; cameras in {Path(beside).name}" if beside else ""
+    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians, {human_bytes(after['bytes'])}{cameras}"
+
+
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+    """Join Gaussians of one world; missing harmonics are zeros."""
+    most = max(part.shN.shape[1] for part in parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
+
+
+def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
+    """Add zeros to harmonics that are fewer than ``count`` above degree 0."""
+    missing = max(0, count - gaussians.shN.shape[1])
+    return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
+
+
+def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:
+    """Find the map from the scene's frame into that of its file; the ``cameras`` say where up is."""
+    if not options.moves:
+        return IDENTITY
+    rotation = np.eye(3)
+    if options.up is not None:
+        axis = np.zeros(3)
+        axis[AXES.index(options.up) // 2] = -1 if options.up[0] == "-" else 1
+        upward = np.array([0.0, -1.0, 0.0]) if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
+        rotation = turn_to(normalize(upward), axis)
+    if options.rotate is not None:
+        rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
+    scale = 1.0 if options.scale is None else float(options.scale)
+    return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
+
+
+def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x between opposite ones.
+
+    Rodrigues' formula, for an axis and angle that the two vectors give.
+    """
+    cosine = float((start * end).sum())
+    if cosine < -1 + 1e-12:
+        about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
+        about = normalize(about - (about * start).sum() * start)
+        return 2 * np.outer(about, about) - np.eye(3)
+    x, y, z = np.cross(start, end)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + cosine))
+
+
+def place(
+    gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
+) -> tuple[Gaussians, Cameras]:
+    """Move Gaussians and cameras into a frame, and leave out harmonics above a degree."""
+    if sh_degree is not None:
+        gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
+    if frame is IDENTITY:
+        return gaussians, cameras
+    wide = replace(gaussians, means=gaussians.means.astype(np.float64))  # until they are written
+    return frame.move_gaussians(wide), frame.move(cameras)
+
+
+def _read_cameras(options: ConvertOptions) -> CameraFile | None:
+    path = options.cameras or result_cameras(options.inputs[0])
+    return None if path is None else read_cameras(path)
+
+
+def _clean(
+    gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
+) -> tuple[Gaussians, dict[str, int]]:
+    """Crop the Gaussians and drop what is not wanted; return the rest, and how many were left out for which reason."""
+    if "sky" not in options.clean.drops:
+        return clean(gaussians, options.clean, None, lambda g: g)
+    if stored is None or options.images is None:
+        raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --images")
+    images = read_images(options.images, stored.names)
+    cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
+    scene = Scene(gaussians, cameras, images, None, stored.names)
+    frame = scene_frame(scene)
+    canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
+    seen = replace(scene, gaussians=canonical, cameras=frame.enter_cameras(cameras))
+    left, counts = clean(canonical, options.clean, seen, frame.leave)
+    return frame.leave(left), counts
+
+
+def _write(
+    options: ConvertOptions,
+    ending: str,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    names: Sequence[str],
+    comments: Sequence[str],
+) -> tuple[int, str | None]:
+    """Write the Gaussians, and the cameras beside them; return the bytes and the path of the cameras."""
+    out, beside = options.output, None
+    with atomic_outputs(overwrite=options.overwrite) as add:
+        first = add(out)
+        if ending == INDEX:
+            ((_, files),) = add_levels(add, out, first, [gaussians], comments)
+            written = [first, *files]
+        else:
+            write_gaussians(
+                first, gaussians, overwrite=True, comments=comments, ending=ending, normals=options.normals,
+                spz_version=options.spz_version,
+            )  # fmt: skip
+            written = [first]
+        if len(cameras):
+            beside = viewer_cameras_path(out)
+            add(beside).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+        num_bytes = sum(path.stat().st_size for path in written)
+    if ending == INDEX:
+        remove_unused_chunks(out)
+    return num_bytes, None if beside is None else str(beside)

@@ -1,0 +1,89 @@
+"""Meet a size in bytes in formats whose files do not have so many bytes for each Gaussian."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from gsmerge.budget import LEVEL_FACTOR, FileSize
+from gsmerge.compaction.result import Candidate, shrink
+from gsmerge.facts.prepare import Prepared
+from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
+from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.streamed import streamed_files
+from gsmerge.io.formats.table import PLY, Format
+from gsmerge.plan import Plan
+from gsmerge.stages.clean import faintest_dropped
+from gsmerge.types import Gaussians
+
+NEAR, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
+ENOUGH = 0.985  # share of the size from which on no further one is put back
+SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
+TRIES, MAX_REBUILDS = 8, 3
+
+Rebuild = Callable[[int], Candidate]
+
+
+def measure_bytes(levels: Sequence[Gaussians], file: Format) -> int:
+    """Count the bytes of a file with some Gaussians, or of all files of an index with several levels."""
+    first = levels[0]
+    if file is PLY:
+        return file_bytes(len(first), first.sh_degree)
+    if file.encode is None:
+        return sum(map(len, streamed_files(levels).values()))
+    return len(file.encode(first, (RESULT_COMMENT, MIP_COMMENT)))
+
+
+def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
+    """Make a candidate as large as its file may be: build it again until it is near, and leave out its faintest.
+
+    Of an index of levels some of its Gaussians stand for coarser ones; see :func:`meet_bytes_of_levels`.
+    """
+    if plan.size is None or plan.size.file is PLY:
+        return candidate
+    most = plan.size.num_bytes
+    for _ in range(MAX_REBUILDS):
+        gaussians = candidate.gaussians
+        size, count = measure_bytes(_with_coarser(gaussians, plan.size), plan.size.file), len(gaussians)
+        room = min(int(SURPLUS * count * most / size), prepared.input_scene.num_gaussians)
+        if room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count):
+            break
+        candidate = rebuild(room)
+    coarser = _with_coarser(candidate.gaussians, plan.size)[1:]
+    return _without_faintest(candidate, coarser, prepared, plan)
+
+
+def meet_bytes_of_levels(
+    candidate: Candidate, coarser: Sequence[Candidate], prepared: Prepared, plan: Plan
+) -> Candidate:
+    """Leave out the faintest Gaussians of the finest level until all levels of an index are no larger than asked."""
+    if plan.size is None or plan.size.levels == 1:
+        return candidate
+    return _without_faintest(candidate, [level.gaussians for level in coarser], prepared, plan)
+
+
+def _with_coarser(gaussians: Gaussians, size: FileSize) -> list[Gaussians]:
+    """Return Gaussians, and some of them that stand for the coarser levels of the file."""
+    return [faintest_dropped(gaussians, len(gaussians) // LEVEL_FACTOR**level) for level in range(size.levels)]
+
+
+def drop_to_bytes(gaussians: Gaussians, coarser: Sequence[Gaussians], most: int, file: Format) -> Gaussians:
+    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; none may fit."""
+    low, high = 0, len(gaussians)
+    kept, count = gaussians[:0], len(gaussians)
+    for _ in range(TRIES):
+        tried = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
+        size = measure_bytes([tried, *coarser], file)
+        if size <= most:
+            low, kept = count, tried
+        else:
+            high = count - 1
+        if low == len(gaussians) or (low and ENOUGH * most <= size <= most) or low >= high:
+            break
+        count = min(max(low + 1, int((1 + ENOUGH) / 2 * count * most / size)), high)
+    return kept
+
+
+def _without_faintest(candidate: Candidate, coarser: Sequence[Gaussians], prepared: Prepared, plan: Plan) -> Candidate:
+    assert plan.size is not None
+    kept = drop_to_bytes(candidate.gaussians, coarser, plan.size.num_bytes, plan.size.file)
+    return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)

@@ -1,0 +1,53 @@
+"""Settings of where a written scene lies: turned, scaled, moved, and with how many harmonics."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gsmerge.settings.setting import Settings, setting
+
+AXES = ("x", "-x", "y", "-y", "z", "-z")
+
+
+@dataclass(frozen=True)
+class PlacementOptions(Settings):
+    """Settings of the frame in which a scene is written, in the order in which they are applied."""
+
+    up: str | None = setting(None, "Turn the scene so that its upward direction is this axis: y for most viewers, z "
+        "for Blender.",
+        "Upward is the mean of the cameras' upward directions, -y where no camera is known.", choices=AXES)  # fmt: skip
+    scale: float | None = setting(None, "Enlarge the scene about the origin by this factor.", above=0, below=1e9)
+    rotate: str | None = setting(None, "Turn the scene about the axes x, y and z, in this order, by so many degrees.",
+        metavar="X,Y,Z")  # fmt: skip
+    translate: str | None = setting(None, "Move the scene along the axes x, y and z, in its new units.",
+        metavar="X,Y,Z")  # fmt: skip
+    sh_degree: int | None = setting(None, "Leave out harmonics above this degree.", least=0, most=4)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("rotate", "translate"):
+            parse_triple(name, getattr(self, name))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the scene is turned, scaled or moved."""
+        return any(value is not None for value in (self.up, self.scale, self.rotate, self.translate))
+
+
+def parse_triple(name: str, text: str | None) -> tuple[float, float, float]:
+    """Parse three numbers of a setting with commas between; zeros for None.
+
+    Example:
+        >>> parse_triple("rotate", "90,0,0")
+        (90.0, 0.0, 0.0)
+    """
+    if text is None:
+        return 0.0, 0.0, 0.0
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise ValueError(f"{name}: expected three numbers X,Y,Z, got {text!r}")
+    return x, y, z

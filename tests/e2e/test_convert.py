@@ -1,0 +1,199 @@
+"""Conversion: other formats, frames and extents of the same Gaussians, with their cameras."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from messages import refuses
+
+import gsmerge
+from gsmerge.compaction.convert import ConvertOptions, convert_files, find_placement, join_gaussians, turn_to
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry import covariances
+from gsmerge.io.formats.ply import header_content
+from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.types import Cameras, Gaussians
+
+from .conftest import Run
+
+FORMATS = ("out.ply", "out.compressed.ply", "out.spz", "out.sog", "out.splat", "out.glb", "lod-meta.json")
+
+
+@pytest.fixture
+def result(made_scene: Path, tmp_path: Path) -> Path:
+    """A result with harmonics, its cameras inside and beside it."""
+    scene = gsmerge.read_scene(made_scene)
+    gaussians = gsmerge.compact(scene, effort="draft", budget=400, fit="none").gaussians
+    random = np.random.default_rng(0)
+    gaussians = replace(gaussians, shN=random.normal(0, 0.1, (400, 15, 3)).astype(np.float32))
+    gsmerge.write_ply(tmp_path / "in.ply", gaussians, comments=["gsmerge result"])
+    from gsmerge.io.cameras.json_files import viewer_cameras
+
+    (tmp_path / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
+    return tmp_path / "in.ply"
+
+
+def read(path: Path) -> Gaussians:
+    return gsmerge.read_gaussians(path).gaussians
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_written_with_the_cameras(result: Path, tmp_path: Path, name: str) -> None:
+    document = convert_files(ConvertOptions([result], tmp_path / "new" / name))
+    written = read(tmp_path / "new" / name)
+    assert document["output"]["num_gaussians"] == len(written) == 400
+    files = [path for path in (tmp_path / "new").rglob("*") if path.is_file()]
+    beside = [path for path in files if path.name.endswith(".cameras.json")]
+    assert document["output"]["bytes"] == sum(path.stat().st_size for path in files if path not in beside)
+    assert [str(path) for path in beside] == [document["viewer_cameras"]]
+    assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
+    again = convert_files(ConvertOptions([tmp_path / "new" / name], tmp_path / "again.ply"))
+    assert again["output"]["num_gaussians"] == 400
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        PlacementOptions(up="y"), PlacementOptions(up="-z"), PlacementOptions(scale=3.0),
+        PlacementOptions(rotate="20,-50,110"), PlacementOptions(translate="1,2,-3"),
+        PlacementOptions(up="z", scale=0.5, rotate="0,0,90", translate="5,0,0"),
+    ],
+)  # fmt: skip
+def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
+    result: Path, tmp_path: Path, options: PlacementOptions
+) -> None:
+    """The harmonics turn with the Gaussians."""
+    convert_files(ConvertOptions([result], tmp_path / "out.ply", placement=options))
+    cameras = [gsmerge.to_cameras(gsmerge.read_cameras(tmp_path / f"{name}.cameras.json")) for name in ("in", "out")]
+    before, after = (
+        gsmerge.render(read(tmp_path / name), cams).images
+        for name, cams in zip(("in.ply", "out.ply"), cameras, strict=True)
+    )
+    assert np.abs(before - after).max() < 2e-3
+    still = gsmerge.render(read(tmp_path / "out.ply"), cameras[0]).images
+    assert np.abs(before - still).max() > 0.1
+
+
+def test_up_is_where_the_cameras_look_up_or_minus_y(result: Path) -> None:
+    cameras = gsmerge.to_cameras(gsmerge.read_cameras(result.with_name("in.cameras.json")))
+    for axis in AXES:
+        expected = np.zeros(3)
+        expected["xyz".index(axis[-1])] = -1 if axis[0] == "-" else 1
+        frame = find_placement(PlacementOptions(up=axis), None)
+        np.testing.assert_allclose(frame.rotation @ [0, -1, 0], expected, atol=1e-12)
+        moved = find_placement(PlacementOptions(up=axis), cameras).move(cameras)
+        upward = -moved.viewmats[:, 1, :3].sum(0)
+        np.testing.assert_allclose(upward / np.linalg.norm(upward), expected, atol=1e-9)
+    np.testing.assert_array_equal(find_placement(PlacementOptions(up="y"), None).rotation, np.diag([1, -1, -1]))
+
+
+def test_turns_are_the_smallest(tmp_path: Path) -> None:
+    for seed in range(20):
+        start, end = np.random.default_rng(seed).normal(size=(2, 3))
+        start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
+        turn = turn_to(start, end)
+        np.testing.assert_allclose(turn @ start, end, atol=1e-9)
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose((np.trace(turn) - 1) / 2, start @ end, atol=1e-9)
+        np.testing.assert_allclose(turn_to(start, -start) @ start, -start, atol=1e-9)
+
+
+def test_several_files_are_joined(result: Path, tmp_path: Path) -> None:
+    flat = replace(read(result), shN=np.zeros((400, 0, 3), np.float32))
+    gsmerge.write_ply(tmp_path / "flat.ply", flat)
+    document = convert_files(ConvertOptions([result, tmp_path / "flat.ply"], tmp_path / "both.ply"))
+    both = read(tmp_path / "both.ply")
+    assert [entry["num_gaussians"] for entry in document["inputs"]] == [400, 400]
+    assert (len(both), both.sh_degree) == (800, 3)
+    np.testing.assert_allclose(both.means[400:], flat.means, atol=1e-6)
+    assert not both.shN[400:].any()
+    assert len(join_gaussians([flat])) == 400
+
+
+def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
+    whole = read(result)
+    low, high = np.percentile(whole.means, (25, 75), axis=0)
+    box = "box:" + ",".join(f"{value:.6f}" for value in (*low, *high))
+    inside = ((whole.means >= low) & (whole.means <= high)).all(1).sum()
+    document = convert_files(ConvertOptions([result], tmp_path / "a.ply", clean=CleanOptions(crop=box)))
+    assert document["left_out"] == {"cropped": 400 - len(read(tmp_path / "a.ply"))}
+    assert abs(len(read(tmp_path / "a.ply")) - inside) <= 2
+    turned = convert_files(ConvertOptions([result], tmp_path / "b.ply", clean=CleanOptions(crop=f"{box},0,0,180")))
+    assert turned["output"]["num_gaussians"] == document["output"]["num_gaussians"]
+    faint = replace(whole, opacities=np.where(np.arange(400) < 30, np.float32(0.002), whole.opacities))
+    gsmerge.write_ply(tmp_path / "faint.ply", faint)
+    clean = CleanOptions(drop="transparent,floaters")
+    document = convert_files(ConvertOptions([tmp_path / "faint.ply"], tmp_path / "c.ply", clean=clean))
+    assert document["left_out"]["transparent"] >= 30
+    assert sum(document["left_out"].values()) == 400 - len(read(tmp_path / "c.ply"))
+    with refuses(SceneError, "in.ply", "400", "inspect"):
+        convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(crop="sphere:99,99,99,0.1")))
+    with refuses(UsageError, "--drop sky", "--images"):
+        convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(drop="sky")))
+    assert not (tmp_path / "d.ply").exists()
+
+
+def test_harmonics_are_left_out_and_results_stay_results(result: Path, tmp_path: Path) -> None:
+    convert_files(ConvertOptions([result], tmp_path / "out.ply", placement=PlacementOptions(sh_degree=1)))
+    assert read(tmp_path / "out.ply").sh_degree == 1
+    np.testing.assert_allclose(read(tmp_path / "out.ply").shN, read(result).shN[:, :3], atol=1e-6)
+    assert header_content(tmp_path / "out.ply") == "result"
+
+
+def test_scales_and_shapes_stay_exact(result: Path, tmp_path: Path) -> None:
+    convert_files(ConvertOptions([result], tmp_path / "out.ply", placement=PlacementOptions(scale=2, rotate="0,0,90")))
+    before, after = read(result), read(tmp_path / "out.ply")
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(after.means, 2 * before.means @ turn.T, atol=1e-5)
+    expected = 4 * turn @ covariances(before.quats, before.scales) @ turn.T
+    np.testing.assert_allclose(covariances(after.quats, after.scales), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,nan", ""])
+def test_triples_are_three_numbers(text: str) -> None:
+    assert parse_triple("rotate", "1, -2,.5") == (1.0, -2.0, 0.5)
+    with refuses(ValueError, "translate", repr(text)):
+        PlacementOptions(translate=text)
+
+
+def test_the_command(made_scene: Path, tmp_path: Path, result: Path, run: Run) -> None:
+    done = run("convert", result, tmp_path / "b.spz", "--up", "y", code=0)
+    assert done.out.startswith(f"{tmp_path / 'b.spz'}: 400 Gaussians")
+    assert "b.cameras.json" in done.out
+    document = json.loads(run("convert", result, tmp_path / "c.ply", "--json", code=0).out)
+    assert (document["output"]["num_gaussians"], document["output"]["format"]) == (400, ".ply")
+    assert run("convert", result).code == 2
+    assert run("convert", result, result, "--overwrite").code == 2
+    assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
+
+
+def test_compact_writes_in_the_same_frames(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q")
+    for name, more in (("a", ()), ("b", ("--up", "y", "--scale", "2"))):
+        run("compact", made_scene, "-o", tmp_path / f"{name}.ply", *quick, *more, code=0)
+    a, b = (
+        gsmerge.render(read(tmp_path / f"{name}.ply"), moved(tmp_path / f"{name}.cameras.json")).images for name in "ab"
+    )
+    assert np.abs(a - b).max() < 0.02
+    assert np.abs(read(tmp_path / "a.ply").means - read(tmp_path / "b.ply").means).max() > 0.5
+
+
+def moved(path: Path) -> Cameras:
+    return gsmerge.to_cameras(gsmerge.read_cameras(path))
+
+
+def test_all_columns_of_a_ply(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Unity's importer wants 62."""
+    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--set", "columns=full")
+    run("compact", made_scene, "-o", tmp_path / "a.ply", *quick, code=0)
+    run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--sh-degree", 0, "--set", "columns=full", code=0)
+    for name in ("a.ply", "b.ply"):
+        header = (tmp_path / name).read_bytes().split(b"end_header")[0]
+        assert header.count(b"property float") == 62
+        assert not read(tmp_path / name).shN.any()
+    assert run("convert", tmp_path / "a.ply", tmp_path / "b.spz", "--set", "columns=full").code == 2

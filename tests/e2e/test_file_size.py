@@ -1,0 +1,65 @@
+"""A budget in bytes is that of the file that is written, whatever its format."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from .conftest import Run
+
+FORMATS = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat", "a.glb", "lod-meta.json")
+QUICK = ("--effort", "draft", "--fit", "none", "-q")
+
+
+def file_bytes(folder: Path) -> int:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return sum(path.stat().st_size for path in files if not path.name.endswith(".cameras.json"))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_compact_meets_it(name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    run("compact", made_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--report", report, code=0)
+    size = 40_000
+    assert 0.97 * size <= file_bytes(out) <= size
+    document = json.loads(report.read_text())
+    levels = [document["output"], *document["levels"]] if name == "lod-meta.json" else [document["output"]]
+    assert sum(level["bytes"] for level in levels) == file_bytes(out)
+
+
+def test_harmonics_count(tmp_path: Path, made_scene: Path, run: Run) -> None:
+    """They take two thirds of a .sog, or nothing: what is built first is far off."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    import gsmerge
+
+    gaussians = gsmerge.read_ply(made_scene / "scene.ply").gaussians
+    for strength in (0.0, 0.2):
+        shN = np.random.default_rng(0).normal(0, strength, (len(gaussians), 15, 3)).astype(np.float32)
+        folder = tmp_path / f"{strength}"
+        folder.mkdir()
+        gsmerge.write_ply(folder / "scene.ply", replace(gaussians, shN=shN))
+        (folder / "transforms.json").write_bytes((made_scene / "transforms.json").read_bytes())
+        run("compact", folder, "-o", folder / "out" / "a.spz", "--budget", "40KB", *QUICK, code=0)
+        assert 0.97 * 40_000 <= file_bytes(folder / "out") <= 40_000
+
+
+@pytest.mark.parametrize(("name", "size"), [("a.ply", 27_000), ("a.spz", 24_000), ("a.sog", 20_000)])
+def test_decode_and_batch_meet_it(name: str, size: int, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    run("encode", made_scene, "-o", tmp_path / "a.gsm", "--superpixels", "2%", "--checkpoint", "none", "-q", code=0)
+    run("decode", tmp_path / "a.gsm", "-o", tmp_path / "out" / name, "--budget", f"{size}B", "-q", code=0)
+    assert 0.97 * size <= file_bytes(tmp_path / "out") <= size
+    folder = tmp_path / "batch"
+    run("batch", made_scene, "-o", folder, "--name", name, "--budget", f"{size}B", *QUICK[:-1], "--quiet", code=0)
+    (written,) = folder.rglob(name)
+    assert 0.97 * size <= written.stat().st_size <= size
+
+
+def test_a_size_that_nothing_fits_into_is_refused(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    done = run("compact", made_scene, "-o", tmp_path / "a.sog", "--budget", "5B", *QUICK)
+    assert done.code == 2
+    assert "13 bytes" in done.err

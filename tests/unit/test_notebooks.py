@@ -1,0 +1,75 @@
+"""What notebooks show of objects: one short line, and reports and results as tables with a picture."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import gsmerge
+
+
+@pytest.fixture(scope="module")
+def scene(made_scene: Path) -> gsmerge.Scene:
+    return gsmerge.read_scene(made_scene)
+
+
+@pytest.fixture(scope="module")
+def result(scene: gsmerge.Scene) -> gsmerge.CompactResult:
+    return gsmerge.compact(scene, effort="draft", budget=300, levels=2)
+
+
+def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.CompactResult, made_scene: Path) -> None:
+    views, size = len(scene), f"{scene.cameras.width} x {scene.cameras.height}"
+    file = gsmerge.read_ply(made_scene / "scene.ply")
+    cameras = gsmerge.read_cameras(made_scene / "transforms.json")
+    options = gsmerge.EvaluateOptions(lpips=(), fog=False)
+    shown = [
+        (scene, (f"{scene.num_gaussians:,} Gaussians", f"{views} views of {size}", "images", "aligned")),
+        (scene.gaussians, (f"{len(scene.gaussians):,}", "degree 0")),
+        (scene.cameras, (str(views), size)),
+        (gsmerge.Views(scene.cameras, scene.images, scene.names), (str(views), size)),
+        (gsmerge.render(scene.gaussians, scene.cameras[[0]], with_depths=True), ("1", size, "depths")),
+        (result, ("300", size, "1 coarser")),
+        (result.report, (f"{scene.num_gaussians:,} -> 300", "dB")),
+        (file, (f"{len(scene.gaussians):,}", str(made_scene / "scene.ply"))),
+        (cameras, (str(views), cameras.path, cameras.source)),
+        (gsmerge.encode_scene(scene, superpixels="2%", checkpoint="none"), ("Feature Gaussians",)),
+        (gsmerge.evaluate(scene, {"small": result.gaussians}, options=options), ("input", "small", "dB", "photos")),
+    ]  # fmt: skip
+    for value, words in shown:
+        text = repr(value)
+        assert text.startswith(type(value).__name__ + "(")
+        assert len(text) < 300
+        assert "\n" not in text
+        assert all(word in text for word in words), text
+    assert "no views" in repr(gsmerge.Scene(scene.gaussians, scene.cameras[[]], None, None, ()))
+
+
+def test_results_show_their_report_and_a_picture(scene: gsmerge.Scene, result: gsmerge.CompactResult) -> None:
+    text = result._repr_html_()
+    assert f"{scene.num_gaussians:,} -&gt; 300" in text
+    packed = re.search(r'src="data:image/png;base64,([^"]+)"', text)
+    assert packed is not None
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(packed[1]), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    photo = 255 * scene.images[len(scene) // 2]
+    assert picture.shape == photo.shape
+    assert np.abs(picture - photo).mean() < 32
+
+
+def test_notes_cannot_leave_their_cells(result: gsmerge.CompactResult) -> None:
+    result.report.notes.append("<script>")
+    assert "<script>" not in result.report._repr_html_()
+    assert "&lt;script&gt;" in result.report._repr_html_()
+
+
+def test_evaluations_are_tables(scene: gsmerge.Scene, result: gsmerge.CompactResult) -> None:
+    options = gsmerge.EvaluateOptions(lpips=(), fog=False)
+    text = gsmerge.evaluate(scene, {"small": result.gaussians}, options=options)._repr_html_()
+    assert text.count("<tr>") == 3
+    assert all(word in text for word in ("input", "small", "psnr", "ssim", f"{scene.num_gaussians:,}"))
+    assert "lpips" not in text
