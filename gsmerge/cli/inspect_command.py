@@ -6,7 +6,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document
 
 
-@opt.command(opt.SCENE, opt.READING, "masks")
+@opt.command(opt.SCENE, opt.READING, "masks threads")
 def inspect(args: opt.Args) -> None:
     """Say what a scene holds, whether its pixels line up, and what compact would make of it."""
     hints = args.hints()
@@ -15,6 +15,6 @@ def inspect(args: opt.Args) -> None:
     from gsmerge.report import document_head
 
     places = {"cameras": args.cameras, "images": args.images, "masks": args.masks}
-    facts = inspect_scene(args.scene, **places, opacity=args.opacity, **vars(hints))
+    facts = inspect_scene(args.scene, **places, opacity=args.opacity, threads=args.threads, **vars(hints))
     document, lines = {**document_head(), **facts}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)
