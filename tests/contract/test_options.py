@@ -41,7 +41,7 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
 
 
 def test_there_are_few_options() -> None:
-    """401 before settings and hints were given by name; the last are ``convert``, what it has, ``inspect --threads``."""
+    """401 before settings and hints were given by name; the last are of ``convert``, and ``inspect --threads``."""
     assert sum(len(command.params) for command in COMMANDS.values()) <= 269
     assert sum(not getattr(p, "hidden", False) for p in COMMANDS["compact"].params) <= 15
 

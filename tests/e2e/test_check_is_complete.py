@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import base64
+import copy
 import random
 import shutil
 import sys
@@ -209,10 +210,10 @@ def test_all_scenes_of_a_chunk_are_read(small_scene: Path, tmp_path: Path) -> No
     folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
 
     def twice(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
-        return [entry, {**entry, "key": "other"}]
+        return [entry, {**copy.deepcopy(entry), "key": "other"}]
 
     def damaged(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
-        return [entry, {**entry, "key": "other", "images": entry["images"][:2]}]
+        return [entry, {**entry, "key": "other", "images": copy.deepcopy(entry["images"][:2])}]
 
     chunks.saved(twice)(folder)
     assert check_content(folder / chunks.NAME).count == 6

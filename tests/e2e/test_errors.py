@@ -72,8 +72,8 @@ def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
     ("file", "reader"),
     [
         ("scene.ply", "gsmerge.io.formats.ply.PlyData.read"),
-        ("scene.sog", "gsmerge.io.formats.sog._read_columns"),
-        ("scene.spz", "gsmerge.io.formats.spz._read_columns"),
+        ("scene.sog", "gsmerge.io.formats.sog._read_packed"),
+        ("scene.spz", "gsmerge.io.formats.spz._unpack"),
         ("views.npz", "numpy.lib.format.read_array"),
     ],
 )

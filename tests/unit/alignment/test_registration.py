@@ -14,12 +14,12 @@ from tiny_scene import rotation
 
 from gsmerge import Cameras, Gaussians, Scene, render
 from gsmerge.alignment.registration import keypoints
-from gsmerge.alignment.registration.join import join_scenes, move_scene, turn_harmonics
+from gsmerge.alignment.registration.join import join_scenes, move_scene
 from gsmerge.alignment.registration.register import register
 from gsmerge.alignment.registration.similarities import DIGITS, fit_similarities
 from gsmerge.errors import SceneError
 from gsmerge.facts.views import subset
-from gsmerge.geometry import Similarity, camera_centres
+from gsmerge.geometry import Similarity, camera_centres, turn_harmonics
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
 from gsmerge.types import grid_ids
 

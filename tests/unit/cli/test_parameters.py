@@ -59,7 +59,7 @@ def test_options_and_set_are_one() -> None:
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
     refuse_all(UsageError, [
         (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "iou", "0 to 1", 2),
-        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "fit_steps"),
+        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "settings.md"),
     ])  # fmt: skip
 
 

@@ -293,7 +293,7 @@ def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pyt
     events.clear()
     with atomic_outputs() as add:
         add(tmp_path / "index").write_text("new")
-        add(tmp_path / "new" / "chunk", make_folder=True).write_text("new")
+        add(tmp_path / "new" / "chunk").write_text("new")
     assert events == ["file", "file", "folder", "rename", "folder", "rename", "folder"]  # the chunk before its index
 
 

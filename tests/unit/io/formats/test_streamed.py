@@ -245,8 +245,6 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=words):
             write_levels(index, levels)
     assert list(tmp_path.iterdir()) == []
-    with refuses(SceneError, "scene", "No such file"):
-        write_levels(tmp_path / "none" / "scene" / "lod-meta.json", [corners()])
     write_levels(index, [corners()])
     before = content(tmp_path)
     with refuses(SceneError, "lod-meta.json", "exists"):
@@ -254,6 +252,8 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path) -> None:
     with refuses(ValueError, "", "finite", 1):
         write_levels(index, [bad], overwrite=True)
     assert content(tmp_path) == before
+    with refuses(SceneError, "scene", "Not a directory"):
+        write_levels(index / "scene" / "lod-meta.json", [corners()])
     with refuses(UsageError, "levels.json", "lod-meta.json"):
         write_levels(tmp_path / "levels.json", [corners()])
 
