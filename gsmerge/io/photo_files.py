@@ -201,7 +201,11 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path, formats=("PNG", *_FORMATS)) as image:
+            data = np.fromfile(path, np.uint8)
+            pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data  # its texts may unpack to 64 MB
+            if pixels is None:
+                raise ValueError("damaged chunks")
+            with Image.open(io.BytesIO(pixels.data), formats=("PNG", *_FORMATS)) as image:
                 channel = choose(image)
                 return None if channel is None else np.asarray(channel)
     except SceneError:
