@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from messages import ERROR, says
 from tiny_scene import edited_json
 
 import gsmerge
-from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 
 Run = Callable[..., Any]
 QUICK = ("--superpixels", 40, "--fit", "none", "--checkpoint", "none")
@@ -30,6 +31,16 @@ def test_the_views_are_written_and_named(scene_copy: Path, run: Run) -> None:
     np.testing.assert_allclose([entry["position"] for entry in entries], scene.cameras.centres, atol=1e-9)
     back = gsmerge.read_cameras(scene_copy / "small.cameras.json")
     np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-9)
+
+
+def test_they_have_a_principal_point_that_is_not_in_the_middle(scene_copy: Path) -> None:
+    cameras = gsmerge.read_scene(scene_copy).cameras
+    Ks = cameras.Ks.copy()
+    Ks[1, :2, 2] += (3.25, -2.5)
+    (scene_copy / "a.json").write_text(viewer_cameras(replace(cameras, Ks=Ks), ["a", "b", "c", "d", "e"]))
+    entries = json.loads((scene_copy / "a.json").read_text())
+    assert ["cx" in entry for entry in entries] == [False, True, False, False, False]
+    np.testing.assert_allclose(gsmerge.read_cameras(scene_copy / "a.json").Ks, Ks, atol=1e-6)
 
 
 def test_they_are_in_the_frame_of_the_gaussians(scene_copy: Path, run: Run) -> None:

@@ -181,7 +181,8 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 def read_inria(source: CameraSource) -> StoredCameras:
     """Read the cameras of a ``cameras.json``; SceneError if a key is missing or not a number.
 
-    It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle.
+    It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle unless ``cx`` and
+    ``cy`` say where.
     """
     views, path = [], source.path
     check_count(path, len(source.json))
@@ -195,7 +196,9 @@ def read_inria(source: CameraSource) -> StoredCameras:
             centre = _array(entry["position"]).reshape(3, 1)
             fx, fy, width, height = (_number(entry[key]) for key in ("fx", "fy", "width", "height"))
             size = round(width), round(height)
-        K = make_pinhole(fx, fy, width / 2, height / 2)
+            middle = {"cx": width / 2, "cy": height / 2}
+            cx, cy = (_number(entry.get(key, half)) for key, half in middle.items())
+        K = make_pinhole(fx, fy, cx, cy)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
     return StoredCameras(views)
 
@@ -346,14 +349,19 @@ def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    :func:`read_inria` reads it. It has no principal point: cameras are written as if theirs were in the middle.
+    :func:`read_inria` reads it. Viewers take the principal point to be in the middle; where it is not, it is added.
     """
+
+    def point(K: np.ndarray) -> dict[str, float]:
+        centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=_CENTRED)
+        return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
+
     rotations, centres = cameras.viewmats[:, :3, :3].transpose(0, 2, 1), cameras.centres
     entries = [
         {
             "id": i, "img_name": name, "width": cameras.width, "height": cameras.height,
             "position": centres[i].tolist(), "rotation": rotations[i].tolist(),
-            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]),
+            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]), **point(cameras.Ks[i]),
         }
         for i, name in enumerate(names)
     ]  # fmt: skip

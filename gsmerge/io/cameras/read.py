@@ -199,7 +199,7 @@ CAMERA_FORMATS = (
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria,
-                 C2W_OPENCV, "pixels; principal point in the middle",
+                 C2W_OPENCV, "pixels; principal point in the middle, or `cx`, `cy`",
                  lambda file: "position" in file.first or "rotation" in file.first),
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),

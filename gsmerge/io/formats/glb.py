@@ -1,7 +1,7 @@
 """Binary glTF 2.0 (``.glb``) with the extension ``KHR_gaussian_splatting`` of github.com/KhronosGroup/glTF.
 
-Its axis y points up, that of a ``.ply`` down: a node turns the Gaussians by half a turn about z, and the reader turns
-them back. Viewers that do not know the extension show points in the base colours. Drafts of the extension are read,
+Its axis y points up, that of a ``.ply`` down: Gaussians are turned by half a turn about z, and the reader turns them
+back. Viewers that do not know the extension show points in the base colours. Drafts of the extension are read,
 too: scales as logarithms, of which some are negative, and ``_ROTATION``, ``_SCALE`` and ``COLOR_0``.
 """
 
@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
-from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
@@ -32,6 +32,7 @@ READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _TYPES.items()}
+_COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -41,33 +42,26 @@ _EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes
 
 
 def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.glb`` file, without comments; ValueError if there is NaN or inf."""
+    """Encode a ``.glb`` file, without comments; ValueError if there is NaN or inf.
+
+    Rotations and opacities are 16-bit numbers, which the extension allows, and all others float32.
+    """
     columns = to_columns(gaussians, MAX_DEGREE)
-    values = {
-        "POSITION": columns.means,
-        f"{NAME}:ROTATION": np.roll(columns.quats, -1, axis=1),  # xyzw
-        f"{NAME}:SCALE": exp(columns.log_scales),
-        f"{NAME}:OPACITY": columns.opacities,
-        f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0,
-    }
-    for i in range(columns.harmonics.shape[1]):
-        degree = int((i + 1) ** 0.5)
-        values[f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"] = columns.harmonics[:, i]
-    attributes = {name: array.astype("<f4") for name, array in values.items()}
-    attributes["COLOR_0"] = to_bytes(255 * np.concatenate([columns.colors, columns.opacities[:, None]], 1))
+    attributes = _attributes(_turn_half(columns))
     at, views = 0, []
     accessors: list[dict[str, Any]] = []
     for array in attributes.values():
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes, "target": _VERTICES})
-        kind = {"componentType": _BYTE, "normalized": True}
-        if array.dtype != np.uint8:
-            kind = {"componentType": _FLOAT}
-        shape = {"count": len(array), "type": _TYPES[array[0].size]}
-        accessors.append({"bufferView": len(accessors), **kind, **shape})
-        at += array.nbytes
+        padded = {"byteStride": 4} if array.strides[0] == 4 and array.shape[1] == 1 else {}
+        size = len(array) * array.strides[0]
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": size, **padded, "target": _VERTICES})
+        kind = {"componentType": _COMPONENTS[array.dtype.str]} | (
+            {} if array.dtype.kind == "f" else {"normalized": True}
+        )
+        accessors.append({"bufferView": len(accessors), **kind, "count": len(array), "type": _TYPES[array.shape[1]]})
+        at += size
     for name, end in (("min", np.min), ("max", np.max)):  # of the positions, which glTF asks for
         accessors[0][name] = end(attributes["POSITION"], axis=0).tolist()
-    content = b"".join(array.tobytes() for array in attributes.values())
+    content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
     places = {name: i for i, name in enumerate(attributes)}
@@ -76,7 +70,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "extensionsUsed": [NAME],
-        "nodes": [{"mesh": 0, "rotation": [0, 0, 1, 0]}],
+        "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": places, "mode": _POINTS, "extensions": {NAME: splats}}]}],
         "accessors": accessors,
         "bufferViews": views,
@@ -85,6 +79,42 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(chunks)) + chunks
+
+
+def _attributes(columns: Columns) -> dict[str, np.ndarray]:
+    """Return the attributes ``[n,width]`` by name; rows of fewer than 4 bytes are part of wider ones, as glTF asks."""
+    wide = np.zeros((len(columns), 2), "<u2")
+    wide[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
+    values = {
+        "POSITION": columns.means.astype("<f4"),
+        f"{NAME}:ROTATION": np.rint(32767 * np.roll(columns.quats, -1, axis=1)).astype("<i2"),  # xyzw
+        f"{NAME}:SCALE": exp(columns.log_scales).astype("<f4"),
+        f"{NAME}:OPACITY": wide[:, :1],
+        f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0.astype("<f4"),
+    }
+    for i in range(columns.harmonics.shape[1]):
+        degree = int((i + 1) ** 0.5)
+        name = f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"
+        values[name] = columns.harmonics[:, i].astype("<f4")
+    shown = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
+    return values | {"COLOR_0": to_bytes(255 * shown)}
+
+
+def _turn_half(columns: Columns) -> Columns:
+    """Turn Gaussians by half a turn about z, by which harmonics of odd order change their signs."""
+    orders = [order for degree in range(1, MAX_DEGREE + 1) for order in range(-degree, degree + 1)]
+    signs = np.array([-1.0 if order % 2 else 1.0 for order in orders[: columns.harmonics.shape[1]]])
+    return replace(
+        columns,
+        means=columns.means * (-1.0, -1.0, 1.0),
+        quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
+        harmonics=columns.harmonics * signs[:, None],
+    )
+
+
+def _to_linear(colors: np.ndarray) -> np.ndarray:
+    """Decode sRGB, 0 to 1, to linear light, which colours of vertices have in glTF (IEC 61966-2-1)."""
+    return np.where(colors <= 0.04045, colors / 12.92, power((colors + 0.055) / 1.055, 2.4))
 
 
 def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
@@ -285,6 +315,8 @@ def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     """Return what moves Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
     if np.array_equal(place, np.eye(4)):
         return lambda columns: columns
+    if np.array_equal(place, _HALF_TURN):
+        return _turn_half
     scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()

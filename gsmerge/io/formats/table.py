@@ -47,7 +47,7 @@ FORMATS = (  # of endings that end alike the longest first
     Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ),
     Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE, each=_SOG),
     Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
-    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE, each=(60.1, 96.1, 156.1, 240.2)),
+    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE, each=(52.1, 88.1, 148.1, 232.2)),
     Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE, each=_SOG),
 )
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS[:-1]))
