@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 from batches import FAST, NAMES, finish, results
+from forked_commands import CommandServer
 from messages import ERROR, says
 
 from gsmerge.cli import main
@@ -24,6 +26,22 @@ class Outcome:
 
 
 Run = Callable[..., Outcome]
+
+
+@pytest.fixture(scope="module")
+def smallest_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of 24 x 16 with cameras and images. Read only."""
+    folder = make_scene(tmp_path_factory.mktemp("smallest") / "scene", num_views=3, width=24, height=16)
+    shutil.rmtree(folder / "targets")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def server(smallest_scene: Path) -> Iterator[CommandServer]:
+    """A process that has imported what the commands need."""
+    ply = smallest_scene / "scene.ply"
+    with CommandServer([("compact", smallest_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
+        yield server
 
 
 @pytest.fixture

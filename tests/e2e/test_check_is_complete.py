@@ -11,7 +11,7 @@ import random
 import shutil
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -148,21 +148,6 @@ KINDS = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views of 24 x 16 with cameras and images. Read only."""
-    folder = make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=3, width=24, height=16)
-    shutil.rmtree(folder / "targets")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def server(small_scene: Path) -> Iterator[CommandServer]:
-    ply = small_scene / "scene.ply"
-    with CommandServer([("compact", small_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
-        yield server
-
-
 def placed(words: tuple[str, ...], folder: Path) -> list[object]:
     return [folder if word == "{}" else folder / word if "." in word else word for word in words]
 
@@ -170,10 +155,10 @@ def placed(words: tuple[str, ...], folder: Path) -> list[object]:
 @pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS)
 def test_what_a_command_refuses_check_refuses(
-    name: str, number: int, small_scene: Path, tmp_path: Path, server: CommandServer
+    name: str, number: int, smallest_scene: Path, tmp_path: Path, server: CommandServer
 ) -> None:
     kind, rng = KINDS[name], random.Random(f"{name} {number}")
-    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+    folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
     kind.make(folder)
     words = placed(kind.words, folder)
     assert server.run(words, LIMITS).code == 0
@@ -192,8 +177,8 @@ def test_what_a_command_refuses_check_refuses(
     assert num_refused or number == 0
 
 
-def test_what_was_not_read_is_said(small_scene: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+def test_what_was_not_read_is_said(smallest_scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
     whole, alone = check_content(folder), check_content(folder / "scene.ply")
     assert (whole.num_views, whole.num_photos, whole.problems, whole.notes) == (3, 3, (), ())
     assert (alone.num_views, alone.count) == (0, whole.count)
@@ -206,8 +191,8 @@ def test_what_was_not_read_is_said(small_scene: Path, tmp_path: Path) -> None:
     assert noted(check_content(folder).notes, "no Gaussians")
 
 
-def test_all_scenes_of_a_chunk_are_read(small_scene: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
+def test_all_scenes_of_a_chunk_are_read(smallest_scene: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
 
     def twice(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
         return [entry, {**copy.deepcopy(entry), "key": "other"}]
@@ -217,6 +202,6 @@ def test_all_scenes_of_a_chunk_are_read(small_scene: Path, tmp_path: Path) -> No
 
     chunks.saved(twice)(folder)
     assert check_content(folder / chunks.NAME).count == 6
-    shutil.copy(small_scene / "transforms.json", folder)
+    shutil.copy(smallest_scene / "transforms.json", folder)
     chunks.saved(damaged)(folder)
     assert says(check_content(folder / chunks.NAME).problems[0], "", "3 images", "found 2")

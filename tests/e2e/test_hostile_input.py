@@ -9,7 +9,6 @@ import json
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -46,25 +45,9 @@ def size_of(folder: Path) -> int:
     return sum(path.lstat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-@pytest.fixture(scope="module")
-def small_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views of 24 x 16 with cameras and images. Read only."""
-    folder = make_scene(tmp_path_factory.mktemp("small") / "scene", num_views=3, width=24, height=16)
-    shutil.rmtree(folder / "targets")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def server(small_scene: Path) -> Iterator[CommandServer]:
-    """A process that has imported what the commands need."""
-    ply = small_scene / "scene.ply"
-    with CommandServer([("compact", small_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
-        yield server
-
-
 @pytest.fixture
-def scene(small_scene: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
+def scene(smallest_scene: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
 
 
 def one_line(err: str) -> None:
