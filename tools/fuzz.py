@@ -129,7 +129,10 @@ def learn(
         return splice(data, random) if random.random() < 0.5 else atheris.Mutate(data, len(data) + 64)
 
     def change(data: bytes, most: int, seed: int) -> bytes:
-        return mutate(data, Random(seed), leaf)[:most]
+        try:
+            return mutate(data, Random(seed), leaf)[:most]
+        except MemoryError:  # of the limit on the reader, in this process
+            return splice(data, Random(seed))[:most]
 
     options = {"max_total_time": seconds, "max_len": max(8192, 3 * max(map(len, seeds))), "timeout": 4 * SECONDS,
                "artifact_prefix": f"{LEARNT}/{reader}.input-", "print_final_stats": 1, "rss_limit_mb": 0}  # fmt: skip
