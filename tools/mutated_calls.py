@@ -99,8 +99,8 @@ def _resize(arguments: Arguments, named: dict[str, Any], size: str, rng: np.rand
     for key, kind in kinds:
         for axis, name in enumerate(kind.shape):
             if name == size:
-                array = named[key] if old else np.zeros([max(n, 1) for n in named[key].shape], kind.code)
-                named[key] = array.take(np.arange(new) % max(old, 1), axis)
+                array = named[key] if named[key].size else np.zeros([max(n, 1) for n in named[key].shape], kind.code)
+                named[key] = array.take(np.arange(new) % array.shape[axis], axis)
     if size in arguments and rng.random() < 0.8:
         named[size] = new
 

@@ -72,7 +72,10 @@ def environment(folder: Path, flags: tuple[str, ...], *preloaded: str) -> dict[s
 def check_memory(folder: Path, runs: tuple[tuple[str, ...], ...]) -> bool:
     """Run tests under the address and undefined-behaviour sanitizers, side by side -> whether all is well."""
     env = environment(folder, MEMORY, "libasan.so", "libubsan.so", "libstdc++.so")
-    env |= {"ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1", "UBSAN_OPTIONS": "print_stacktrace=1"}
+    env |= {
+        "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1:quarantine_size_mb=16",
+        "UBSAN_OPTIONS": "print_stacktrace=1",
+    }
     env["PYTHONMALLOC"] = "malloc"
     pytest = (sys.executable, "-m", "pytest", "-q", "-n0", "--capture=sys")  # reports are seen, not captured
     calls = [subprocess.Popen([*pytest, *run], cwd=ROOT, env=env) for run in runs]
