@@ -37,6 +37,20 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
+def output_file(output: Path) -> Path:
+    """Return the file that an output names: of a folder called ``colmap`` that of a COLMAP model's points."""
+    from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
+
+    return output / PLACE / POINTS if output.name == FOLDER else output
+
+
+def model_files(output: Path) -> tuple[Path, ...]:
+    """List the files that belong to an output if that is a COLMAP model; SceneError if it is another program's."""
+    from gsmerge.io.cameras.colmap_model import POINTS, files_beside
+
+    return files_beside(output) if output.name == POINTS else ()
+
+
 def is_index(output: Path) -> bool:
     """Return whether an output is the index of a Streamed SOG, whose folder is made if missing."""
     from gsmerge.io.formats.streamed import INDEX
@@ -44,15 +58,15 @@ def is_index(output: Path) -> bool:
     return output.name == INDEX
 
 
-def check_format(output: Path, options: FileOptions, *, levels: bool = False) -> None:
+def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
     """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
-    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, or a version of
-    ``.spz`` for another format.
+    ``levels``: it may be an index of levels; ``cameras``: or a COLMAP model. UsageError for an unknown ending, a
+    missing package, or a version of ``.spz`` for another format.
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version, levels=levels).ending
+    ending = output_format(output, options.spz_version, levels=levels, cameras=cameras).ending
     if options.columns == "full" and (ending != ".ply" or not options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":

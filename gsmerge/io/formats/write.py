@@ -9,15 +9,17 @@ from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
 from gsmerge.io.formats import ply, sog, streamed
 from gsmerge.io.formats.arrays import MIP_COMMENT
-from gsmerge.io.formats.table import PLY, output_format
+from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
     """Describe the harmonics that are not written in a format; None if all are. UsageError for an unknown ending."""
-    chosen = output_format(path, spz_version, levels=True)
+    chosen = output_format(path, spz_version, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
+    if chosen is COLMAP:
+        return "points of COLMAP have colours alone: harmonics, sizes and opacities are left out"
     if chosen is PLY:
         return f"harmonics above degree {chosen.max_degree} are left out: few programs read a .ply with them"
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
