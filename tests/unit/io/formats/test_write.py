@@ -123,6 +123,7 @@ def test_harmonics_without_room_are_noted() -> None:
     note = lost_harmonics("a.splat", 1)
     assert note == ".splat has no room for harmonics above degree 0: left out"
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
+    assert "COLMAP" in str(lost_harmonics("colmap/sparse/0/points3D.bin", 1))
 
 
 def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
@@ -141,7 +142,7 @@ def test_names_ask_for_formats(name: str, ending: str) -> None:
 
 @pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
 def test_other_names_are_refused(name: str) -> None:
-    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat or .glb"):
+    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat, .glb, .usdc, .usda or .usdz"):
         output_format(name)
 
 
