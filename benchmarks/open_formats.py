@@ -1,9 +1,9 @@
 """Every format that is written, opened by programs of others, for docs/guide/open-it.md.
 
 gsmerge compact demo -o small.ply
-python benchmarks/open_formats.py small.ply opened --npm packages --gsplat checkout
+python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout
 
-Programs that are not there are named and skipped: of Python usd-core, pycolmap, usd-convert-gsplat and
+Programs that are not there are named and skipped: of Python gsply, usd-core, pycolmap, usd-convert-gsplat and
 omniverse-asset-validator; splat-transform (GSMERGE_SPLAT_TRANSFORM); below --npm the packages three and gltf-validator;
 --gsplat is a checkout of that repository, for the reader of its trainer. Harmonics of degree 3 are drawn at random.
 Compared are all Gaussians, those in another order with the nearest: the largest errors of positions, as a share of the
@@ -43,7 +43,7 @@ NAMES = (
     "a.ply", "a.compressed.ply", "a.spz", "version4/a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json",
     "a.usdc", "a.usda", "a.usdz", f"{FOLDER}/{PLACE}/{POINTS}",
 )  # fmt: skip
-SPLATS = (".ply", ".spz", ".sog", ".splat", ".glb", "lod-meta.json")
+SPLATS = (".ply", ".spz", ".sog", ".splat", "lod-meta.json")
 USD = (".usdc", ".usda", ".usdz")
 NODE_SCRIPT = Path(__file__).with_suffix(".mjs")
 UPRIGHT = np.array([-1, -1, 1, 1, 1, 1, 1])  # what half a turn about z does to values
@@ -145,6 +145,15 @@ def trainer_values(checkout: Path, path: Path) -> Values:
     return np.concatenate([parser.points, parser.points_rgb / 255, opacities], 1)
 
 
+def gsply_values(path: Path) -> Values:
+    """Values of a file by gsply, which leaves opacities as logits."""
+    import gsply
+
+    read = {".spz": gsply.read_spz, ".sog": gsply.sogread}.get(path.suffix, gsply.plyread)(str(path))
+    opacities = 1 / (1 + np.exp(-read.opacities.astype(np.float64)))
+    return np.concatenate([read.means, sh0_to_rgb(read.sh0.reshape(-1, 3)), opacities.reshape(-1, 1)], 1)
+
+
 def find_programs(args: argparse.Namespace) -> Iterator[Program]:
     """Find what is installed, and name what is not."""
 
@@ -168,6 +177,7 @@ def find_programs(args: argparse.Namespace) -> Iterator[Program]:
     makers: dict[str, Callable[[], Program]] = {
         "plyfile": lambda: Program("plyfile", version("plyfile"), ("a.ply",), ply_values),
         "splat-transform": splat_transform,
+        "gsply": lambda: Program("gsply", version("gsply"), (".ply", ".spz", ".sog"), gsply_values),
         "three.js": lambda: Program(
             "three.js", package("three"), ("a.ply", ".splat", ".spz", ".glb"), partial(three_values, args.npm)
         ),
@@ -203,8 +213,8 @@ def write_all(source: Path, folder: Path, photos: Path) -> None:
     shutil.copytree(photos, folder / FOLDER / "images", dirs_exist_ok=True)
 
 
-def compare(expected: Values, actual: Values) -> list[str]:
-    """Cells of the count and the largest errors."""
+def compare(expected: Values, actual: Values) -> np.ndarray:
+    """Return the largest errors of positions, colours and opacities."""
     width = float(np.ptp(expected[:, :3], axis=0).max())
     expected = np.concatenate([expected[:, :3] / width, expected[:, 3:].clip(0, 1)], 1)
     actual = np.concatenate([actual[:, :3] / width, actual[:, 3:].clip(0, 1)], 1)
@@ -213,9 +223,30 @@ def compare(expected: Values, actual: Values) -> list[str]:
     if len(actual) != len(expected) or np.abs(actual[:, :3] - expected[:, :3]).max() > 0.01:
         order = cKDTree(expected[:, columns]).query(actual[:, columns])[1]
     errors = np.abs(actual - expected[order]).max(0)
-    worst = [errors[:3].max(), errors[3:6].max(), errors[6]]
-    cells = [f"{100 * worst[0]:.2g} %", *(f"{error:.2g}" if np.isfinite(error) else "-" for error in worst[1:])]
-    return [f"{len(actual):,} of {len(expected):,}", *cells]
+    return np.array([errors[:3].max(), errors[3:6].max(), errors[6]])
+
+
+def open_with_all(expected: Values, programs: Sequence[Program], file: Path) -> list[str]:
+    """Open a file with every program; return the cells of a row: programs, the largest errors, and what others say."""
+    names, errors, said = [], [], []
+    for program in programs:
+        if not str(file).endswith(program.endings):
+            continue
+        try:
+            read = program.open(file)
+        except (subprocess.CalledProcessError, ValueError, AssertionError) as error:
+            read = f"fails: {error!r}"
+        named = f"{program.name} {program.version}"
+        if isinstance(read, str):
+            said.append(f"{named}: {read}")
+        elif len(read) != len(expected):
+            said.append(f"{named}: {len(read):,} of {len(expected):,} Gaussians")
+        else:
+            names.append(named)
+            errors.append(compare(expected, read))
+    place, color, opacity = np.max(errors, 0)
+    cells = [f"{100 * place:.1g} %", f"{color:.1g}", f"{opacity:.1g}" if np.isfinite(opacity) else ""]
+    return [", ".join(names), *cells, "; ".join(said)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -229,19 +260,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = args.out / "opened"
     os.makedirs(out, exist_ok=True)
     write_all(args.scene, out, args.photos)
-    expected, programs, rows = ply_values(out / "a.ply"), list(find_programs(args)), []
-    for name in NAMES:
-        for program in programs:
-            if not str(out / name).endswith(program.endings):
-                continue
-            try:
-                read = program.open(out / name)
-                cells = [read, "", "", ""] if isinstance(read, str) else compare(expected, read)
-            except (subprocess.CalledProcessError, ValueError, AssertionError) as error:
-                cells = [f"fails: {error}", "", "", ""]
-            rows.append([f"`{name}`", f"{program.name} {program.version}", *cells])
-            print(rows[-1], file=sys.stderr)
-    print(make_table(("format", "program", "Gaussians", "positions", "colours", "opacities"), rows))
+    expected, programs = ply_values(out / "a.ply"), list(find_programs(args))
+    rows = [[f"`{name}`", *open_with_all(expected, programs, out / name)] for name in NAMES]
+    print(f"{len(expected):,} Gaussians")
+    print(make_table(("file", "read by", "positions", "colours", "opacities", "besides"), rows))
 
 
 if __name__ == "__main__":

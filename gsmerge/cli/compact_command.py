@@ -42,7 +42,8 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels blocks",
     "effort fit exposure device method recipe checkpoint set crop drop up scale rotate translate",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
+               "A folder named colmap: a COLMAP model.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
     rare="hint masks levels blocks fit exposure method recipe checkpoint crop drop up scale rotate translate"
          " strict save_cameras embed_cameras"

@@ -1,4 +1,4 @@
-"""The table of formats of Gaussians, by which files are read and written (docs/guide/formats.md, "Adding a format")."""
+"""The table of formats of Gaussians, by which files are read and written (docs/reference/formats.md)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ class Format:
 
 _SPZ, _SOG = (17.0, 18.5, 18.9, 19.2, 20.0), (13.0, 22.0, 36.5, 56.5)
 _USD = (56.0, 92.0, 152.0, 236.0)
-PLY = Format(".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE)
+PLY = Format(
+    ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
+    each=(68.0, 104.0, 164.0, 248.0),
+)  # fmt: skip
 LEVELS = Format(
     streamed.INDEX, "levels of detail in chunks, each a .sog without its zip", streamed.read_rows, None,
     streamed.MAX_DEGREE, each=_SOG,
@@ -50,8 +53,8 @@ FILES = (  # of endings that end alike the longest first
     PLY,
     Format(".spz", "Niantic's format, version 3", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3, each=_SPZ),
     Format(
-        ".spz", "its version 4, compressed with Zstandard", spz.read_rows, partial(spz.spz_bytes, version=4),
-        spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ,
+        ".spz", "Niantic's format, version 4, compressed with Zstandard", spz.read_rows,
+        partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ,
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE,
@@ -67,11 +70,11 @@ FILES = (  # of endings that end alike the longest first
         require=usd.require_usd, each=_USD,
     ),
     Format(
-        ".usda", "the same as text", None, usd.usda_bytes, usd.MAX_DEGREE,
-        require=usd.require_usd, each=(200.0, 330.0, 550.0, 850.0),
+        ".usda", "USD as text", None, usd.usda_bytes, usd.MAX_DEGREE,
+        require=usd.require_usd, each=(176.0, 301.0, 509.0, 801.0),
     ),
     Format(
-        ".usdz", "the same as an archive", None, usd.usdz_bytes, usd.MAX_DEGREE, require=usd.require_usd, each=_USD,
+        ".usdz", "USD, a .usdc in an archive", None, usd.usdz_bytes, usd.MAX_DEGREE, require=usd.require_usd, each=_USD,
     ),
 )  # fmt: skip
 FORMATS = (*FILES, LEVELS, COLMAP)

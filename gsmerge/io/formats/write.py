@@ -37,8 +37,8 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians. Harmonics of degree 4 are
-    left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
+    All but ``.ply`` and USD quantise. ``.glb`` and USD have y upward, so Gaussians are turned by half a turn about z in
+    them. Harmonics of degree 4 are left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
 
     Args:
         path: The file; complete or not there at all.
@@ -51,7 +51,7 @@ def write_gaussians(
             needs ``zstandard``.
 
     Raises:
-        UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
+        UsageError: If the name ends in none of these, or ``zstandard`` or ``usd-core`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is no Gaussian, NaN or inf, a comment is no line of ASCII, or there are half a million
             characters of them, or there is no such version.
