@@ -5,25 +5,29 @@ python benchmarks/open_formats.py small.ply opened --photos demo/images --npm pa
 
 Programs that are not there are named and skipped: of Python gsply, usd-core, pycolmap, usd-convert-gsplat and
 omniverse-asset-validator; splat-transform (GSMERGE_SPLAT_TRANSFORM); below --npm the packages three and gltf-validator;
---gsplat is a checkout of that repository, for the reader of its trainer. Harmonics of degree 3 are drawn at random.
-Compared are all Gaussians, those in another order with the nearest: the largest errors of positions, as a share of the
-scene's width, and of colours and opacities, which are 0 to 1.
+chromium, for Spark; --gsplat is a checkout of that repository, for the reader of its trainer. Harmonics of degree 3 are
+drawn at random. Compared are all Gaussians, those in another order with the nearest: the largest errors of positions,
+as a share of the scene's width, and of colours and opacities, which are 0 to 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import base64
+import gzip
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +42,9 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.research.baselines.simple import find_program
+from gsmerge.view.page import ENGINE
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "e2e"))
 
 NAMES = (
     "a.ply", "a.compressed.ply", "a.spz", "version4/a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json",
@@ -145,6 +152,30 @@ def trainer_values(checkout: Path, path: Path) -> Values:
     return np.concatenate([parser.points, parser.points_rgb / 255, opacities], 1)
 
 
+SPARK = """new Promise(async (resolve, reject) => { try {
+  const fileBytes = Uint8Array.from(atob(document.getElementById("file").textContent), (c) => c.charCodeAt(0));
+  const mesh = new Vendor.SplatMesh({ fileBytes, fileName: "NAME" });
+  await mesh.initialized;
+  const rows = [];
+  mesh.forEachSplat((_, mean, scales, quat, opacity, color) => rows.push(...mean, color.r, color.g, color.b, opacity));
+  resolve(rows);
+} catch (error) { reject(error); } })"""
+
+
+def spark_values(chromium: str, path: Path) -> Values:
+    """Values of a file by Spark, of the release that `gsmerge view` has, in a browser."""
+    from browser import browser
+
+    script = gzip.decompress(files("gsmerge.view").joinpath(ENGINE).read_bytes()).decode()
+    page = path.with_name("spark.html").resolve()
+    data = base64.b64encode(path.read_bytes()).decode()
+    page.write_text(f'<script id="file" type="text/plain">{data}</script><script>{script}</script>')
+    with tempfile.TemporaryDirectory() as profile, browser(chromium, Path(profile)) as tab:
+        tab.open(page)
+        rows = tab.run(SPARK.replace("NAME", path.name))
+    return np.array(rows, np.float64).reshape(-1, 7)
+
+
 def gsply_values(path: Path) -> Values:
     """Values of a file by gsply, which leaves opacities as logits."""
     import gsply
@@ -174,10 +205,19 @@ def find_programs(args: argparse.Namespace) -> Iterator[Program]:
             partial(transformed, program),
         )
 
+    def spark() -> Program:
+        if (chromium := shutil.which("chromium")) is None:
+            raise UsageError("expected chromium, found none")
+        sources = json.loads(files("gsmerge.view").joinpath("vendor/SOURCES.json").read_text())
+        number = sources["packages"]["@sparkjsdev/spark"]["version"]
+        endings = (".ply", "opened/a.spz", ".splat", ".sog")
+        return Program("Spark", number, endings, partial(spark_values, chromium))
+
     makers: dict[str, Callable[[], Program]] = {
         "plyfile": lambda: Program("plyfile", version("plyfile"), ("a.ply",), ply_values),
         "splat-transform": splat_transform,
         "gsply": lambda: Program("gsply", version("gsply"), (".ply", ".spz", ".sog"), gsply_values),
+        "spark": spark,
         "three.js": lambda: Program(
             "three.js", package("three"), ("a.ply", ".splat", ".spz", ".glb"), partial(three_values, args.npm)
         ),
