@@ -2,6 +2,7 @@
 
 python benchmarks/kills.py                                       # every call of six commands; Linux and gcc
 python benchmarks/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
+python benchmarks/kills.py --plant copies --commands encode      # with a fault, which must be reported
 
 A preloaded library (kills.c) counts the calls (opens for writing, writes, syncs, renames, removals, new folders) and
 ends the process by SIGKILL before one of them. Then every file must be what it was or what the command makes, no index
@@ -22,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,12 @@ COMMANDS = {
 }
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
 RECORDS = ("batch.jsonl", "summary.csv")  # of batches, for the next run
+# Faults to show that they would be reported: functions of ``os`` to replace
+PLANTS: dict[str, dict[str, Callable[..., object]]] = {
+    "none": {},
+    "copies": {"replace": shutil.copyfile},
+    "no syncs": {"fsync": lambda descriptor: None},
+}
 
 Contents = dict[str, str]  # name in a folder -> SHA-256
 
@@ -65,6 +72,7 @@ class Place:
     out: Path
     keep: Path  # links to files that were replaced or removed
     notes: Path  # counter, list of calls, and what was printed
+    plant: str = "none"  # fault of the commands
 
     def run(self, words: str, at: int = 0) -> Ended:
         """Run a command in a child with all modules loaded, which ends before one of its calls."""
@@ -81,7 +89,7 @@ class Place:
         env = {"FOLDER": self.out, "KEEP": self.keep, "COUNT": self.notes / "count", "LOG": log, "AT": at}
         if (child := os.fork()) == 0:
             os.environ.update({f"KILLS_{key}": str(value) for key, value in env.items()})
-            os._exit(_main(call, printed))
+            os._exit(_main(call, printed, self.plant))
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         return Ended(code, printed.read_text(), [line.split("\t") for line in log.read_text().splitlines()])
 
@@ -91,10 +99,12 @@ class Place:
         shutil.copytree(earlier, self.out)
 
 
-def _main(call: list[str], printed: Path) -> int:
+def _main(call: list[str], printed: Path, plant: str) -> int:
     """Run a command with its output in a file -> exit code."""
     from gsmerge.cli import main
 
+    for name, function in PLANTS[plant].items():
+        setattr(os, name, function)
     with printed.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -232,6 +242,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--calls", type=int, help="calls of each command, at equal distances; default: all")
     parser.add_argument("--commands", nargs="*", choices=list(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--plant", choices=list(PLANTS), default="none", help="a fault to report")
     args = parser.parse_args()
     if "KILLS_LIBRARY" not in os.environ:
         with tempfile.TemporaryDirectory() as folder:
@@ -243,7 +254,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         scenes = make_scenes(Path(folder) / "scenes")
         for name in args.commands:
-            place = Place(scenes, *(Path(folder) / name / part for part in ("out", "keep", "notes")))
+            place = Place(scenes, *(Path(folder) / name / part for part in ("out", "keep", "notes")), args.plant)
             kinds, num_disks, faults = try_command(name, place, args.calls)
             counts = ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items()) if count)
             print(

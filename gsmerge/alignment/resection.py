@@ -55,8 +55,9 @@ def refine_poses(
 
     def step(state: _Fit, damping: float) -> _Fit:
         current_K, current_poses, (curvature, slope, _) = state
-        change, motions = _step(curvature, slope, damping)
-        return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
+        with np.errstate(all="ignore"):  # a step beyond all numbers has no less error
+            change, motions = _step(curvature, slope, damping)
+            return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
     K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, SCHEDULE)
     return K, poses

@@ -9,12 +9,25 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux" or shutil.which("gcc") is None, reason="preloads a library, with gcc"
+)
 
-@pytest.mark.skipif(sys.platform != "linux" or shutil.which("gcc") is None, reason="preloads a library, with gcc")
+
+def kill(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    tool = [sys.executable, str(root / "benchmarks" / "kills.py")]
+    return subprocess.run([*tool, *words], cwd=root, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.parametrize("command", ["compact", "extend"])
 def test_nothing_is_half_written_and_the_next_run_succeeds(command: str, root: Path) -> None:
-    words = [sys.executable, str(root / "benchmarks" / "kills.py"), "--calls", "6", "--commands", command]
-    done = subprocess.run(words, cwd=root, capture_output=True, text=True, check=False)
+    done = kill(root, "--calls", "6", "--commands", command)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith(f"{command}: kills before 6 calls")
     assert done.stdout.endswith(" 0 faults\n")
+
+
+def test_files_that_are_not_synced_are_reported(root: Path) -> None:
+    done = kill(root, "--calls", "1", "--commands", "encode", "--plant", "no syncs")
+    assert done.returncode == 1, done.stderr
+    assert "after a loss of power, a.gsm is half-written" in done.stdout

@@ -141,3 +141,9 @@ def test_a_few_points_or_one_place_fit_any_camera():
     assert projective_error(rng.normal(size=(10, 3)), rng.uniform(0, 100, (10, 2))) == 0
     error = projective_error(np.ones((50, 3)), rng.uniform(0, 100, (50, 2)))
     assert not error < 10
+
+
+def test_a_step_beyond_all_numbers_is_not_taken():
+    points, pixels = shown(1.0)
+    _, poses = refine_poses([p * [1, 1, 1e58] for p in points], pixels, K, TRUE)
+    assert np.isfinite(poses).all()
