@@ -86,8 +86,9 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or comes twice.
 
-    ``inputs`` are files that are read, and folders of photos: no photo is replaced. SceneError where nothing can be
-    written; missing folders are made with the first file in them, so that a run that fails before leaves none.
+    ``inputs`` are files that are read, and folders of photos and COLMAP models, of which nothing is replaced. SceneError
+    where nothing can be written; missing folders are made with the first file in them, so that a run that fails before
+    leaves none.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -104,6 +105,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    from gsmerge.io.cameras.colmap_model import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -116,8 +118,8 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    is_photo = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
-    if str(target) in inputs or (is_photo and str(target.parent) in inputs):
+    is_read = (target.suffix.lower() in IMAGE_SUFFIXES or target.name in MODEL_NAMES) and target.exists()
+    if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")

@@ -24,7 +24,7 @@ from gsmerge.io import (
 )
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.colmap_model import CAMERAS, IMAGES, POINTS, files_beside, model_files
+from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
@@ -202,7 +202,7 @@ def add_colmap(
     """
     files = [points, *map(add, files_beside(path))]
     contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
-    for file, name in zip(files, (POINTS, CAMERAS, IMAGES), strict=True):
+    for file, name in zip(files, MODEL_NAMES, strict=True):
         file.write_bytes(contents[name])
     return files
 

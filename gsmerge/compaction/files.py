@@ -46,7 +46,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.segment import measure_size
-from gsmerge.types import Scene
+from gsmerge.types import Cameras, Scene
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,8 @@ def compact_files(
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        if ending == COLMAP.ending:
-            photos = name_photos(files.images, names)
-            written = {out: add_colmap(add, out, at[out], result.gaussians, result.cameras[views], photos)}
-        else:
-            written = _write_results(add, outputs, at[out], results, comments)
+        photos = name_photos(files.images, names)
+        written = _write_results(add, outputs, at[out], results, comments, result.cameras[views], photos)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -174,14 +171,23 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _write_results(
-    add: AddOutput, outputs: Outputs, first: Path, results: Sequence[CompactResult], comments: Sequence[Sequence[str]]
+    add: AddOutput,
+    outputs: Outputs,
+    first: Path,
+    results: Sequence[CompactResult],
+    comments: Sequence[Sequence[str]],
+    cameras: Cameras,
+    photos: Sequence[str],
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    Returns the path of each, in their order, with its files as they are before they are renamed.
+    A COLMAP model has the ``cameras``, and the names of their ``photos``, as well. Returns the path of each result, in
+    their order, with its files as they are before they are renamed.
     """
     out = outputs.result
-    ending = output_format(out, outputs.spz_version, levels=True).ending
+    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    if ending == COLMAP.ending:
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
     if ending == INDEX:
         (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
         return {out: [first, *finest], **dict(coarser)}

@@ -16,6 +16,7 @@ from gsmerge.compaction.convert import ConvertOptions, convert_files, find_place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
+from gsmerge.io.cameras.colmap_model import model_files
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
@@ -82,12 +83,23 @@ def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, made_sce
     assert all((made_scene / "images" / name).is_file() for name in cameras.names)
 
 
-def test_a_model_needs_cameras_and_is_one_level(result: Path, tmp_path: Path, made_scene: Path, run: Run) -> None:
+def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
+    result: Path, tmp_path: Path, made_scene: Path, run: Run
+) -> None:
     (tmp_path / "in.cameras.json").unlink()
     with refuses(SceneError, "in.ply", "cameras", "--cameras"):
         convert_files(ConvertOptions([result], tmp_path / "points3D.bin"))
     for option in (("--levels", 2), ("--budget", "1MB")):
         assert_refused(run("compact", made_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", "COLMAP")
+    model = tmp_path / "own" / "colmap" / "sparse" / "0"
+    scene = gsmerge.read_scene(made_scene)
+    gsmerge.write_ply(tmp_path / "own" / "scene.ply", scene.gaussians)
+    model.mkdir(parents=True)
+    seen = [np.zeros(0, np.int64)] * len(scene)
+    for name, data in model_files(scene.gaussians, scene.cameras, scene.names, seen).items():
+        (model / name).write_bytes(data)
+    done = run("compact", tmp_path / "own", "-o", tmp_path / "own" / "colmap", "--overwrite", "-q")
+    assert_refused(done, 2, "points3D.bin", "input")
     gsmerge.write_ply(tmp_path / "lone" / "scene.ply", read(result))
     done = run("compact", tmp_path / "lone" / "scene.ply", "-o", tmp_path / "colmap", "-q")
     assert_refused(done, 2, "points3D.bin", "cameras")

@@ -17,7 +17,7 @@ from gsmerge.geometry import project, rotmat_to_quat, sh0_to_rgb
 from gsmerge.types import Cameras, Gaussians
 
 FOLDER, PLACE = "colmap", "sparse/0"  # a folder of this name holds a model, where trainers look for it
-POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
+MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 _FOREIGN = ("rigs.bin", "frames.bin")  # which COLMAP writes since 3.12, and would read with ours
 _PINHOLE = 1  # the number of the camera model
 _SEEN = np.dtype([("place", "<f8", 2), ("point", "<i8")])
@@ -63,7 +63,11 @@ def _images(
         points["place"] = project(gaussians.means[rows], cameras[[i]])[0][0]
         points["point"] = rows + 1
         parts.append(struct.pack("<i7di", i + 1, *quats[i], *viewmats[i, :3, 3], camera_ids[i]))
-        parts += [name.encode() + b"\0", struct.pack("<Q", len(points)), points.tobytes()]
+        parts += [
+            name.replace("\0", "").encode("utf-8", "replace") + b"\0",
+            struct.pack("<Q", len(points)),
+            points.tobytes(),
+        ]
     return b"".join(parts)
 
 
