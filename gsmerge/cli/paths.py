@@ -86,9 +86,9 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or comes twice.
 
-    ``inputs`` are files that are read, and folders of photos and COLMAP models, of which nothing is replaced. SceneError
-    where nothing can be written; missing folders are made with the first file in them, so that a run that fails before
-    leaves none.
+    ``inputs`` are files that are read, and folders of photos and COLMAP models, of which nothing is replaced.
+    SceneError where nothing can be written; missing folders are made with the first file in them, so that a run that
+    fails before leaves none.
     """
     from gsmerge.io.cameras.read import find_cameras
 
