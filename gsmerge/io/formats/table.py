@@ -109,6 +109,9 @@ def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, 
     rows = [row for row in FORMATS if row.names(path)]
     if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):
         rows = []
+    if not rows and not cameras and Path(path).name in (colmap_model.FOLDER, colmap_model.POINTS):
+        problem = "expected a format without cameras, got a COLMAP model"
+        raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if not rows:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {streamed.INDEX}" if levels else ""

@@ -146,6 +146,13 @@ def test_other_names_are_refused(name: str) -> None:
         output_format(name)
 
 
+@pytest.mark.parametrize("name", ["colmap", "colmap/sparse/0/points3D.bin"])
+def test_models_need_cameras(name: str, tmp_path: Path) -> None:
+    with refuses(UsageError, name, "COLMAP", "--cameras"):
+        write_gaussians(tmp_path / name, corners())
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
 def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: Path) -> None:
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
