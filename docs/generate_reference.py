@@ -17,7 +17,7 @@ from api_page import api_page
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
-EXPORTERS = "exporters.md"  # whose prose is written by hand, and whose tables are made
+EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
 
@@ -60,6 +60,7 @@ def make_pages() -> dict[str, str]:
     pages[SETTINGS], pages[TRAINING] = _settings_page(), _training_page()
     pages[API] = f"{NOTICE}\n\n{api_page()}"
     pages[EXPORTERS] = _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8"))
+    pages[FORMATS] = _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8"))
     return pages
 
 
@@ -191,6 +192,22 @@ def _exporters_page(page: str) -> str:
     )
 
 
+def _formats_page(page: str) -> str:
+    """Renew the tables of formats, of Gaussians and of cameras."""
+    from gsmerge.io.cameras.read import CAMERA_FORMATS
+    from gsmerge.io.formats.table import FORMATS as ROWS
+
+    rows = [
+        (f"`{row.ending}`", "no" if row.read is None else "yes", str(row.max_degree),
+         *(f"{row.each[i]:.0f}" if i < len(row.each) else "" for i in (0, 3)), row.about)
+        for row in ROWS
+    ]  # fmt: skip
+    head = ("ending or name", "read", "written harmonics, up to degree", "bytes each", "of degree 3", "what it is")
+    page = _renew(page, "formats", head, rows)
+    cameras = ((row.files, " ".join(row.convention), row.intrinsics) for row in CAMERA_FORMATS)
+    return _renew(page, "cameras", ("file", "poses, axes", "intrinsics"), cameras)
+
+
 def _columns(exporter: Any) -> str:
     """What a file has besides the 14 columns of all."""
     normals = "normals as bytes" if exporter.byte_columns else "normals" if exporter.normals else ""
@@ -205,7 +222,7 @@ def _renew(page: str, name: str, head: Sequence[str], rows: Iterable[Sequence[st
     before, _, rest = page.partition(start)
     _, found, after = rest.partition(end)
     if not found:
-        raise ValueError(f"{EXPORTERS}: expected a table {name!r} between {start.strip()} and {end.strip()}")
+        raise ValueError(f"expected a table {name!r} between {start.strip()} and {end.strip()}")
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 

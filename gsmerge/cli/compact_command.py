@@ -22,6 +22,8 @@ from gsmerge.cli.paths import (
     input_files,
     is_camera_file,
     is_index,
+    model_files,
+    output_file,
 )
 from gsmerge.errors import TargetError, UsageError
 
@@ -40,7 +42,8 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks k superpixels budget quality levels blocks",
     "effort fit exposure device method recipe checkpoint set crop drop up scale rotate translate",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
+               "A folder named colmap: a COLMAP model.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
     rare="hint masks levels blocks fit exposure method recipe checkpoint crop drop up scale rotate translate"
          " strict save_cameras embed_cameras"
@@ -59,17 +62,19 @@ def compact(args: opt.Args) -> None:
     settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = args.output or default_output(files.base)
-    streamed = is_index(out)
+    out = output_file(args.output or default_output(files.base))
+    streamed, model = is_index(out), model_files(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
+    if model and (settings.budget.in_bytes or settings.budget.levels > 1):
+        raise UsageError(f"{out}: expected a --budget in Gaussians and no --levels for a COLMAP model")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras else None
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
-    named = (out, *levels, args.report, beside, args.save_cameras)
+    named = (out, *model, *levels, args.report, beside, args.save_cameras)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing, levels=True)
+    check_format(out, writing, levels=True, cameras=True)
     if writing.columns == "full" and settings.budget.in_bytes:
         raise UsageError(
             f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"

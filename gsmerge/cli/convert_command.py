@@ -6,17 +6,18 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, model_files, output_file
 from gsmerge.errors import UsageError
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb or lod-meta.json; several of one "
-                 "world are joined. The last is written, as its name says."),
+                 "world are joined. The last is written, as its name says: one of these, .usdc, .usda, .usdz, or a "
+                 "folder named colmap."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "those of a result, inside or beside it."),
-    opt.changed("images", help="Photos of the cameras, which --drop sky needs."),
+    opt.changed("images", help="Photos of the cameras, which --drop sky needs, and whose names a COLMAP model has."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
     opt.changed("set", help="Any other setting of the written file, such as normals=false; may be repeated."),
     "up scale rotate translate sh_degree crop drop overwrite",
@@ -30,8 +31,9 @@ def convert(args: opt.Args) -> None:
     if not inputs:
         raise UsageError(f"expected files to read and one to write, got {output} alone")
     writing, cleaning, placement = args.make(FileOptions, CleanOptions, PlacementOptions)
-    check_outputs((output,), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
-    check_format(output, writing, levels=True)
+    output = output_file(output)
+    check_outputs((output, *model_files(output)), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
+    check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
 

@@ -37,6 +37,20 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
+def output_file(output: Path) -> Path:
+    """Return the file that an output names: of a folder called ``colmap`` that of a COLMAP model's points."""
+    from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
+
+    return output / PLACE / POINTS if output.name == FOLDER else output
+
+
+def model_files(output: Path) -> tuple[Path, ...]:
+    """List the files that belong to an output if that is a COLMAP model; SceneError if it is another program's."""
+    from gsmerge.io.cameras.colmap_model import POINTS, files_beside
+
+    return files_beside(output) if output.name == POINTS else ()
+
+
 def is_index(output: Path) -> bool:
     """Return whether an output is the index of a Streamed SOG, whose folder is made if missing."""
     from gsmerge.io.formats.streamed import INDEX
@@ -44,15 +58,15 @@ def is_index(output: Path) -> bool:
     return output.name == INDEX
 
 
-def check_format(output: Path, options: FileOptions, *, levels: bool = False) -> None:
+def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
     """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
-    ``levels``: it may be an index of levels. UsageError for an unknown ending, a missing package, or a version of
-    ``.spz`` for another format.
+    ``levels``: it may be an index of levels; ``cameras``: or a COLMAP model. UsageError for an unknown ending, a
+    missing package, or a version of ``.spz`` for another format.
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version, levels=levels).ending
+    ending = output_format(output, options.spz_version, levels=levels, cameras=cameras).ending
     if options.columns == "full" and (ending != ".ply" or not options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":
@@ -72,8 +86,9 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
     """Raise UsageError for an output that is an input, exists without ``overwrite``, or comes twice.
 
-    ``inputs`` are files that are read, and folders of photos: no photo is replaced. SceneError where nothing can be
-    written; missing folders are made with the first file in them, so that a run that fails before leaves none.
+    ``inputs`` are files that are read, and folders of photos and COLMAP models, of which nothing is replaced.
+    SceneError where nothing can be written; missing folders are made with the first file in them, so that a run that
+    fails before leaves none.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -90,6 +105,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    from gsmerge.io.cameras.colmap_model import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:
@@ -102,8 +118,8 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if output.is_dir():
         raise UsageError(f"{output}: expected a file to write, found a folder; name a file in it")
     target = Path(os.path.realpath(output))
-    is_photo = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
-    if str(target) in inputs or (is_photo and str(target.parent) in inputs):
+    is_read = (target.suffix.lower() in IMAGE_SUFFIXES or target.name in MODEL_NAMES) and target.exists()
+    if str(target) in inputs or (is_read and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,20 @@ from gsmerge.io import (
     read_gaussians,
     write_gaussians,
 )
+from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
+from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
+from gsmerge.io.formats.table import COLMAP
 from gsmerge.io.formats.write import add_levels
+from gsmerge.io.image_names import match_images
 from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
+from gsmerge.measure.visibility import front_rows
 from gsmerge.report import document_head, human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
@@ -68,7 +74,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
     UsageError for an ending that is not written, or sky without photos.
     """
-    ending = output_format(options.output, options.spz_version, levels=True).ending
+    ending = output_format(options.output, options.spz_version, levels=True, cameras=True).ending
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -77,6 +83,9 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
+        if cameras is None and ending == COLMAP.ending:
+            problem = "expected cameras beside it for a COLMAP model, found none"
+            raise SceneError(options.inputs[0], problem, "name them with --cameras")
         count = len(gaussians)
         gaussians, left_out = _clean(gaussians, options, stored)
         if len(gaussians) == 0:
@@ -88,7 +97,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     infos = [file.info for file in files]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
-    lost = lost_harmonics(options.output, gaussians.sh_degree, options.spz_version)
+    notes += output_notes(options.output, gaussians.sh_degree, options.spz_version, options.images)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
@@ -100,7 +109,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
-    return document | {"notes": [*notes, *([lost] if lost else [])]}
+    return document | {"notes": notes}
 
 
 def conversion_line(document: dict[str, Any]) -> str:
@@ -190,6 +199,38 @@ def _clean(
     return frame.leave(left), counts
 
 
+def add_colmap(
+    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, names: Sequence[str]
+) -> list[Path]:
+    """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
+
+    Returns the present paths of all its files.
+    """
+    files = [points, *map(add, files_beside(path))]
+    contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
+    for file, name in zip(files, MODEL_NAMES, strict=True):
+        file.write_bytes(contents[name])
+    return files
+
+
+def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
+    """Name views by their files in a folder of photos, as COLMAP does; where it has others, by the cameras' file."""
+    if photos is not None and photos.is_dir():
+        with suppress(SceneError):
+            return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]
+    return [name.removeprefix("./").removeprefix("images/") for name in names]  # as a transforms.json has them
+
+
+def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
+    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
+    lost = lost_harmonics(out, sh_degree, spz_version)
+    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
+    if COLMAP.names(out) and not place.is_dir():
+        files = "the photos" if photos is None or not photos.is_dir() else photos
+        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
+    return notes
+
+
 def _write(
     options: ConvertOptions,
     ending: str,
@@ -202,7 +243,9 @@ def _write(
     out, beside = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
         first = add(out)
-        if ending == INDEX:
+        if ending == COLMAP.ending:
+            written = add_colmap(add, out, first, gaussians, cameras, name_photos(options.images, names))
+        elif ending == INDEX:
             ((_, files),) = add_levels(add, out, first, [gaussians], comments)
             written = [first, *files]
         else:
@@ -211,7 +254,7 @@ def _write(
                 spz_version=options.spz_version,
             )  # fmt: skip
             written = [first]
-        if len(cameras):
+        if len(cameras) and ending != COLMAP.ending:
             beside = viewer_cameras_path(out)
             add(beside).write_text(viewer_cameras(cameras, names), encoding="utf-8")
         num_bytes = sum(path.stat().st_size for path in written)

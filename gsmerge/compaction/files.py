@@ -10,13 +10,21 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.convert import NUM_FULL, find_placement, pad_harmonics, place
+from gsmerge.compaction.convert import (
+    NUM_FULL,
+    add_colmap,
+    find_placement,
+    name_photos,
+    output_notes,
+    pad_harmonics,
+    place,
+)
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.fit.gpu import choose_backend
-from gsmerge.io import atomic_outputs, lost_harmonics, output_format, write_gaussians
+from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
@@ -24,6 +32,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
+from gsmerge.io.formats.table import COLMAP
 from gsmerge.io.formats.write import add_levels
 from gsmerge.measure.inspect import estimate, estimate_lines
 from gsmerge.plan import load_networks
@@ -37,7 +46,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.segment import measure_size
-from gsmerge.types import Scene
+from gsmerge.types import Cameras, Scene
 
 
 @dataclass(frozen=True)
@@ -75,12 +84,12 @@ def compact_files(
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, _sized(settings, outputs)
-    streamed = output_format(out, outputs.spz_version, levels=True).ending == INDEX
+    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
         load = read_input(files, opacity=opacity, hints=hints)
-        check_saved_cameras(load.scene, outputs.saved_cameras, embed=outputs.embed_cameras)
+        check_saved_cameras(load.scene, outputs)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras
@@ -97,7 +106,8 @@ def compact_files(
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        written = _write_results(add, outputs, at[out], results, comments)
+        photos = name_photos(files.images, names)
+        written = _write_results(add, outputs, at[out], results, comments, result.cameras[views], photos)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -106,18 +116,18 @@ def compact_files(
                 raise _other_cameras(cameras_path)
         if outputs.saved_cameras is not None:
             write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
-        lost = lost_harmonics(out, result.gaussians.sh_degree, outputs.spz_version)
+        notes = output_notes(out, result.gaussians.sh_degree, outputs.spz_version, files.images)
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
             coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
-            recognised=load.recognised, notes=[*load.notes, *([lost] if lost else [])], hashed=hashed,
+            recognised=load.recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
         if outputs.report is not None:
             at[outputs.report].write_text(to_json(document), encoding="utf-8", errors="replace")
-    if streamed:
+    if ending == INDEX:
         remove_unused_chunks(out)
     return document
 
@@ -125,7 +135,7 @@ def compact_files(
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return as a document what :func:`compact_files`, or an encoding, would make of a scene."""
     scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
-    check_saved_cameras(scene, outputs.saved_cameras, embed=outputs.embed_cameras)
+    check_saved_cameras(scene, outputs)
     _, unused = check_method(settings, scene)
     backend, problem = choose_backend(settings.device, scene.num_gaussians)
     settings = replace(settings, device=backend.device)
@@ -161,14 +171,23 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _write_results(
-    add: AddOutput, outputs: Outputs, first: Path, results: Sequence[CompactResult], comments: Sequence[Sequence[str]]
+    add: AddOutput,
+    outputs: Outputs,
+    first: Path,
+    results: Sequence[CompactResult],
+    comments: Sequence[Sequence[str]],
+    cameras: Cameras,
+    photos: Sequence[str],
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    Returns the path of each, in their order, with its files as they are before they are renamed.
+    A COLMAP model has the ``cameras``, and the names of their ``photos``, as well. Returns the path of each result, in
+    their order, with its files as they are before they are renamed.
     """
     out = outputs.result
-    ending = output_format(out, outputs.spz_version, levels=True).ending
+    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    if ending == COLMAP.ending:
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
     if ending == INDEX:
         (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
         return {out: [first, *finest], **dict(coarser)}
@@ -223,12 +242,17 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
-def check_saved_cameras(scene: Scene, path: Path | None, *, embed: bool = False) -> None:
+def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:
     """Raise UsageError if cameras are to be written and the scene has none, or too many to embed."""
-    if len(scene) == 0 and (path is not None or embed):
-        option = "--embed-cameras" if path is None else f"--save-cameras {path}"
-        raise UsageError(f"{option}: expected a scene with cameras, got none")
-    if embed:
+    options = {
+        f"--save-cameras {outputs.saved_cameras}": outputs.saved_cameras is not None,
+        "--embed-cameras": outputs.embed_cameras,
+        f"{outputs.result}": COLMAP.names(outputs.result),
+    }
+    wanted = next((option for option, is_chosen in options.items() if is_chosen), None)
+    if len(scene) == 0 and wanted is not None:
+        raise UsageError(f"{wanted}: expected a scene with cameras, got none")
+    if outputs.embed_cameras:
         views = _views_once(scene)
         camera_comments(scene.cameras[views], [scene.names[view] for view in views])  # refuses too many before the work
 

@@ -16,6 +16,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
+_NEAR, _BEHIND = 0.01, 1.05  # times the median depth of a view; times a surface's depth, from which on it hides
 MAX_SAMPLES = 200_000  # Gaussians that a share is measured on
 _CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take too much memory
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
@@ -73,6 +74,22 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
         return _DILATION
     focals = [np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64))]  # pixels
     return max(_DILATION, 2 * round((_DILATION * float(focals[0] / np.median(focals[1])) - 1) / 2) + 1)
+
+
+def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
+    """Return for each view the rows whose centres it shows: inside its picture, and not behind a surface."""
+    rows = []
+    for view in range(len(cameras)):
+        (pixels,), (depths,) = project(gaussians.means, cameras[[view]])
+        inside = (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+        near = _NEAR * float(np.median(depths[inside])) if inside.any() else 1.0
+        drawn = render(gaussians, cameras[[view]], near=near, with_depths=True)
+        assert drawn.depths is not None
+        chosen = np.flatnonzero(inside)
+        x, y = pixels[chosen].astype(np.int64).T
+        surface = np.where(drawn.alphas[0, y, x, 0] > _OPAQUE, drawn.depths[0, y, x, 0], np.inf)
+        rows.append(chosen[depths[chosen] <= _BEHIND * surface])
+    return rows
 
 
 def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:

@@ -92,7 +92,7 @@ def find_scene_files(
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
-            scene if they are numbered views or parts, see ``docs/guide/formats.md``.
+            scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
     path = Path(path)
     plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]

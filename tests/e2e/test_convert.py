@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from messages import refuses
+from messages import noted, refuses
 
 import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, find_placement, join_gaussians, turn_to
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
+from gsmerge.io import CameraFile
+from gsmerge.io.cameras.colmap_model import model_files
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Cameras, Gaussians
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 FORMATS = ("out.ply", "out.compressed.ply", "out.spz", "out.sog", "out.splat", "out.glb", "lod-meta.json")
 
@@ -54,6 +57,53 @@ def test_every_format_is_written_with_the_cameras(result: Path, tmp_path: Path, 
     assert gsmerge.read_cameras(beside[0]).names == gsmerge.read_cameras(tmp_path / "in.cameras.json").names
     again = convert_files(ConvertOptions([tmp_path / "new" / name], tmp_path / "again.ply"))
     assert again["output"]["num_gaussians"] == 400
+
+
+def read_model(folder: Path) -> tuple[CameraFile, int]:
+    """Read the cameras of a COLMAP model, and the number of its points."""
+    (count,) = struct.unpack("<Q", (folder / "points3D.bin").read_bytes()[:8])
+    return gsmerge.read_cameras(folder), count
+
+
+def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, made_scene: Path, run: Run) -> None:
+    """Its views have the names of their photos below images/, where trainers look for them."""
+    model, before = tmp_path / "colmap" / "sparse" / "0", gsmerge.read_cameras(tmp_path / "in.cameras.json")
+    done = run("convert", result, f"{tmp_path / 'colmap'}/", code=0)
+    assert noted([done.err], tmp_path / "colmap" / "images")
+    cameras, count = read_model(model)
+    assert (count, cameras.names) == (400, tuple(name.removeprefix("images/") for name in before.names))
+    np.testing.assert_allclose(cameras.viewmats, before.viewmats, atol=1e-6)
+    assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "in.cameras.json", "colmap"}
+    assert run("convert", result, tmp_path / "colmap").code == 2
+    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--overwrite")
+    run("compact", made_scene, "-o", tmp_path / "colmap", *quick, code=0)
+    cameras, count = read_model(model)
+    assert (count, len(cameras)) == (200, len(before))
+    assert sorted(path.name for path in model.iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
+    assert all((made_scene / "images" / name).is_file() for name in cameras.names)
+
+
+def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
+    result: Path, tmp_path: Path, made_scene: Path, run: Run
+) -> None:
+    (tmp_path / "in.cameras.json").unlink()
+    with refuses(SceneError, "in.ply", "cameras", "--cameras"):
+        convert_files(ConvertOptions([result], tmp_path / "points3D.bin"))
+    for option in (("--levels", 2), ("--budget", "1MB")):
+        assert_refused(run("compact", made_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", "COLMAP")
+    model = tmp_path / "own" / "colmap" / "sparse" / "0"
+    scene = gsmerge.read_scene(made_scene)
+    gsmerge.write_ply(tmp_path / "own" / "scene.ply", scene.gaussians)
+    model.mkdir(parents=True)
+    seen = [np.zeros(0, np.int64)] * len(scene)
+    for name, data in model_files(scene.gaussians, scene.cameras, scene.names, seen).items():
+        (model / name).write_bytes(data)
+    done = run("compact", tmp_path / "own", "-o", tmp_path / "own" / "colmap", "--overwrite", "-q")
+    assert_refused(done, 2, "points3D.bin", "input")
+    gsmerge.write_ply(tmp_path / "lone" / "scene.ply", read(result))
+    done = run("compact", tmp_path / "lone" / "scene.ply", "-o", tmp_path / "colmap", "-q")
+    assert_refused(done, 2, "points3D.bin", "cameras")
+    assert not (tmp_path / "colmap").exists()
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from .conftest import Run
 
-FORMATS = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat", "a.glb", "lod-meta.json")
+FORMATS = ("a.ply", "a.compressed.ply", "a.spz", "a.sog", "a.splat", "a.glb", "a.usdc", "lod-meta.json")
 QUICK = ("--effort", "draft", "--fit", "none", "-q")
 
 

@@ -80,7 +80,7 @@ def _holds_cameras(path: Path) -> bool:
 def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None = None) -> CameraFile:
     """Read cameras from a file, or from a folder that holds one of the known kinds.
 
-    The formats are those of docs/guide/formats.md. Poses become world-to-camera with OpenCV axes.
+    The formats are those of docs/reference/formats.md. Poses become world-to-camera with OpenCV axes.
 
     Args:
         path: The file, a COLMAP folder, or a folder that has the cameras in one of the usual places.
@@ -211,7 +211,7 @@ CAMERA_FORMATS = (
     CameraFormat("npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3,
                  W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     _RE10K,
-    CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-for-viewers))", ".ply", read_embedded,
+    CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-inside-a-ply))", ".ply", read_embedded,
                  C2W_OPENGL, "pixels", lambda file: bool(camera_lines(file.path))),
     _SHARP,
 )  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gsmerge.geometry import morton_codes, sh0_to_rgb
+from gsmerge.geometry import morton_codes, multiply_quats, sh0_to_rgb
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Array, Gaussians, as_array
@@ -206,6 +206,19 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
         opacities=array(gaussians.opacities),
         sh0=array(gaussians.sh0)[:, 0],
         harmonics=array(gaussians.shN)[:, : (degree + 1) ** 2 - 1],
+    )
+
+
+def turn_half(columns: Columns) -> Columns:
+    """Turn Gaussians by half a turn about z, from y down to y up: harmonics of odd order change their signs."""
+    degrees = range(1, sh_degree(columns.harmonics.shape[1]) + 1)
+    orders = [order for degree in degrees for order in range(-degree, degree + 1)]
+    signs = np.array([-1.0 if order % 2 else 1.0 for order in orders])
+    return replace(
+        columns,
+        means=columns.means * (-1.0, -1.0, 1.0),
+        quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
+        harmonics=columns.harmonics * signs[:, None],
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored, turn_half
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
@@ -47,7 +47,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     Rotations and opacities are 16-bit numbers, which the extension allows, and all others float32.
     """
     columns = to_columns(gaussians, MAX_DEGREE)
-    attributes = _attributes(_turn_half(columns))
+    attributes = _attributes(turn_half(columns))
     at, views = 0, []
     accessors: list[dict[str, Any]] = []
     for array in attributes.values():
@@ -98,18 +98,6 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
         values[name] = columns.harmonics[:, i].astype("<f4")
     shown = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
     return values | {"COLOR_0": to_bytes(255 * shown)}
-
-
-def _turn_half(columns: Columns) -> Columns:
-    """Turn Gaussians by half a turn about z, by which harmonics of odd order change their signs."""
-    orders = [order for degree in range(1, MAX_DEGREE + 1) for order in range(-degree, degree + 1)]
-    signs = np.array([-1.0 if order % 2 else 1.0 for order in orders[: columns.harmonics.shape[1]]])
-    return replace(
-        columns,
-        means=columns.means * (-1.0, -1.0, 1.0),
-        quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
-        harmonics=columns.harmonics * signs[:, None],
-    )
 
 
 def _to_linear(colors: np.ndarray) -> np.ndarray:
@@ -316,7 +304,7 @@ def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     if np.array_equal(place, np.eye(4)):
         return lambda columns: columns
     if np.array_equal(place, _HALF_TURN):
-        return _turn_half
+        return turn_half
     scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()

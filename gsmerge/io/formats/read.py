@@ -13,7 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays, ply, streamed
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import PLY, input_format
+from gsmerge.io.formats.table import PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
@@ -146,10 +146,13 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
         >>> len(gsmerge.read_gaussians("demo/small.spz").gaussians)
         7680
     """
-    path, read = Path(path), input_format(path).read
-    if read is None or read is ply.read_rows:
+    path, chosen = Path(path), input_format(path)
+    if chosen.read is None:
+        problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {chosen.ending}, which is written and not read"
+        raise SceneError(path, problem, "name the file that it was made of")
+    if chosen.read is ply.read_rows:
         return read_ply(path, opacity=opacity)
-    return _convert_files([path], [read(path)], "auto")
+    return _convert_files([path], [chosen.read(path)], "auto")
 
 
 def read_level(path: Path, level: int, index: streamed.StreamedIndex | None = None) -> GaussianFile:

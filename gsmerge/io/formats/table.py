@@ -1,4 +1,4 @@
-"""The table of formats of Gaussians, by which files are read and written (docs/guide/formats.md, "Adding a format")."""
+"""The table of formats of Gaussians, by which files are read and written (docs/reference/formats.md)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from gsmerge.errors import UsageError
-from gsmerge.io.formats import compressed, glb, ply, sog, splat, spz, streamed
+from gsmerge.io.cameras import colmap_model
+from gsmerge.io.formats import compressed, glb, ply, sog, splat, spz, streamed, usd
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.types import Gaussians, StrPath
 
@@ -17,7 +18,8 @@ from gsmerge.types import Gaussians, StrPath
 class Format:
     """A format of files of Gaussians: its ending and how to read and write it."""
 
-    ending: str  # of files' names, in lower case; without a dot, the whole name of an index
+    ending: str  # of files' names, in lower case; without a dot at its start, the whole name of a folder's main file
+    about: str  # what it is, for people
     read: Callable[[Path], StoredRows] | None  # None: it is only written
     # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
@@ -33,25 +35,51 @@ class Format:
 
 
 _SPZ, _SOG = (17.0, 18.5, 18.9, 19.2, 20.0), (13.0, 22.0, 36.5, 56.5)
-PLY = Format(".ply", ply.read_rows, None, ply.MAX_DEGREE)
-FORMATS = (  # of endings that end alike the longest first
+_USD = (56.0, 92.0, 152.0, 236.0)
+PLY = Format(
+    ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
+    each=(68.0, 104.0, 164.0, 248.0),
+)  # fmt: skip
+LEVELS = Format(
+    streamed.INDEX, "levels of detail in chunks, each a .sog without its zip", streamed.read_rows, None,
+    streamed.MAX_DEGREE, each=_SOG,
+)  # fmt: skip
+COLMAP = Format(colmap_model.POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
+FILES = (  # of endings that end alike the longest first
     Format(
-        ".compressed.ply",
-        ply.read_rows,
-        compressed.compressed_bytes,
-        compressed.MAX_DEGREE,
-        each=(16.3, 25.3, 40.4, 61.4),
+        ".compressed.ply", "ranges for every 256 neighbours; rows in another order", ply.read_rows,
+        compressed.compressed_bytes, compressed.MAX_DEGREE, each=(16.3, 25.3, 40.4, 61.4),
     ),
     PLY,
-    Format(".spz", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3, each=_SPZ),
-    Format(".spz", spz.read_rows, partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ),
-    Format(".sog", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE, each=_SOG),
-    Format(".splat", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
-    Format(".glb", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE, each=(52.1, 88.1, 148.1, 232.2)),
-    Format(streamed.INDEX, streamed.read_rows, None, streamed.MAX_DEGREE, each=_SOG),
-)
-OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FORMATS[:-1]))
-SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FORMATS[:-1] if row.read is not None))
+    Format(".spz", "Niantic's format, version 3", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3, each=_SPZ),
+    Format(
+        ".spz", "Niantic's format, version 4, compressed with Zstandard", spz.read_rows,
+        partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ,
+    ),
+    Format(
+        ".sog", "WebP textures in a zip; rows in another order", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE,
+        each=_SOG,
+    ),
+    Format(".splat", "antimatter15's format", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
+    Format(
+        ".glb", "binary glTF with KHR_gaussian_splatting", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE,
+        each=(52.1, 88.1, 148.1, 232.2),
+    ),
+    Format(
+        ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, usd.usdc_bytes, usd.MAX_DEGREE,
+        require=usd.require_usd, each=_USD,
+    ),
+    Format(
+        ".usda", "USD as text", None, usd.usda_bytes, usd.MAX_DEGREE,
+        require=usd.require_usd, each=(176.0, 301.0, 509.0, 801.0),
+    ),
+    Format(
+        ".usdz", "USD, a .usdc in an archive", None, usd.usdz_bytes, usd.MAX_DEGREE, require=usd.require_usd, each=_USD,
+    ),
+)  # fmt: skip
+FORMATS = (*FILES, LEVELS, COLMAP)
+OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FILES))
+SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
 
 
 def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
@@ -68,20 +96,27 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
 
 
 def input_format(path: StrPath) -> Format:
-    """Return the format in which to read a path; PLY for unknown endings."""
-    return next((row for row in FORMATS if row.read is not None and row.names(path)), PLY)
+    """Return the format of a path to read; PLY for unknown endings."""
+    return next((row for row in FORMATS if row.names(path)), PLY)
 
 
-def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False) -> Format:
+def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: the name may be that of an index of levels of detail. ValueError if there is no such version.
+    ``levels``: the name may be that of an index of levels of detail; ``cameras``: or that of a COLMAP model, which
+    holds cameras. ValueError if there is no such version.
     """
-    rows = [row for row in (FORMATS if levels else FORMATS[:-1]) if row.names(path)]
+    rows = [row for row in FORMATS if row.names(path)]
+    if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):
+        rows = []
+    if not rows and not cameras and Path(path).name in (colmap_model.FOLDER, colmap_model.POINTS):
+        problem = "expected a format without cameras, got a COLMAP model"
+        raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if not rows:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {streamed.INDEX}" if levels else ""
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}")
+        folder = f", or a folder named {colmap_model.FOLDER}" if cameras else ""
+        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
     chosen = next((row for row in rows if row.version in (None, spz_version)), None)
     if chosen is None:
         raise ValueError(f"spz_version: expected {' or '.join(str(row.version) for row in rows)}, got {spz_version}")

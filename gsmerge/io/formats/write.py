@@ -9,15 +9,17 @@ from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
 from gsmerge.io.formats import ply, sog, streamed
 from gsmerge.io.formats.arrays import MIP_COMMENT
-from gsmerge.io.formats.table import PLY, output_format
+from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
     """Describe the harmonics that are not written in a format; None if all are. UsageError for an unknown ending."""
-    chosen = output_format(path, spz_version, levels=True)
+    chosen = output_format(path, spz_version, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
+    if chosen is COLMAP:
+        return "points of COLMAP have colours alone: harmonics, sizes and opacities are left out"
     if chosen is PLY:
         return f"harmonics above degree {chosen.max_degree} are left out: few programs read a .ply with them"
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
@@ -35,8 +37,8 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
-    All but ``.ply`` and ``.glb`` quantise; none of them changes the frame of the Gaussians. Harmonics of degree 4 are
-    left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
+    All but ``.ply`` and USD quantise. ``.glb`` and USD have y upward, so Gaussians are turned by half a turn about z in
+    them. Harmonics of degree 4 are left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
 
     Args:
         path: The file; complete or not there at all.
@@ -49,7 +51,7 @@ def write_gaussians(
             needs ``zstandard``.
 
     Raises:
-        UsageError: If the name ends in none of these, or ``zstandard`` is needed and not installed.
+        UsageError: If the name ends in none of these, or ``zstandard`` or ``usd-core`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is no Gaussian, NaN or inf, a comment is no line of ASCII, or there are half a million
             characters of them, or there is no such version.

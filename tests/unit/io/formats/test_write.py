@@ -123,6 +123,7 @@ def test_harmonics_without_room_are_noted() -> None:
     note = lost_harmonics("a.splat", 1)
     assert note == ".splat has no room for harmonics above degree 0: left out"
     assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
+    assert "COLMAP" in str(lost_harmonics("colmap/sparse/0/points3D.bin", 1))
 
 
 def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
@@ -141,8 +142,15 @@ def test_names_ask_for_formats(name: str, ending: str) -> None:
 
 @pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
 def test_other_names_are_refused(name: str) -> None:
-    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat or .glb"):
+    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat, .glb, .usdc, .usda or .usdz"):
         output_format(name)
+
+
+@pytest.mark.parametrize("name", ["colmap", "colmap/sparse/0/points3D.bin"])
+def test_models_need_cameras(name: str, tmp_path: Path) -> None:
+    with refuses(UsageError, name, "COLMAP", "--cameras"):
+        write_gaussians(tmp_path / name, corners())
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("ending", OUTPUT_FORMATS)
