@@ -30,7 +30,7 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
-from gsmerge.settings.stages import Engine
+from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
@@ -78,7 +78,12 @@ class Args(SimpleNamespace):
         chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
         for name in options.keys() & chosen.keys():
             raise UsageError(f"--set {name}: expected it once, got --{name.replace('_', '-')} too")
-        return options | chosen
+        values = options | chosen
+        if Path(values.get("crop") or "").suffix.lower() in CROP_FILES:
+            from gsmerge.io.crop_file import read_crop
+
+            values["crop"] = read_crop(Path(values["crop"]))
+        return values
 
     def settings(self, **changes: Any) -> CompactOptions:
         """Make the options of :func:`gsmerge.compact`, as :meth:`make` does."""
@@ -296,8 +301,8 @@ _TABLE = (
     ),
     panel(
         METHOD,
-        *map(setting_option, ("effort", "fit", "exposure", "device", "method", "recipe", "checkpoint")),
-        option("set", list[str], f"Any other setting, such as poses=fixed; may be repeated. {SETTINGS_PAGE} lists "
+        *map(setting_option, ("effort", "fit", "exposure", "poses", "device", "method", "recipe", "checkpoint")),
+        option("set", list[str], f"Any other setting, such as match=aabb; may be repeated. {SETTINGS_PAGE} lists "
                "them.", metavar="NAME=VALUE"),
     ),
     panel(
