@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
 )  # fmt: skip
+METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}  # in the help, of plain values
 REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
@@ -173,6 +174,8 @@ def option(
     it; ``more`` goes to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
+    if more.get("metavar") is None:
+        more["metavar"] = METAVARS.get(kind)
     if isinstance(kind, tuple):
         choice: Any = Enum  # which mypy knows with literal names alone
         kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
@@ -234,6 +237,9 @@ def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[
             listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
     for name in rare.split():
         listed[name] = _change(listed[name], hidden=True)
+    if rare:
+        hidden = ", ".join(f"--{name.replace('_', '-')}" for name in listed if name in rare.split())
+        listed["help_all"] = _change(listed["help_all"], help=f"Show all options and exit, also {hidden}.")
 
     def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
         @wraps(function)
@@ -338,7 +344,7 @@ _TABLE = (
         setting_option("threads"),
         switch("quiet", "Print errors only.", "-q"),
     ),
-    panel("Options", switch("help_all", "Show all options and exit.", is_eager=True, callback=_show_all,
+    panel("Options", switch("help_all", "", is_eager=True, callback=_show_all,
                             expose_value=False)),
 )  # fmt: skip
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}

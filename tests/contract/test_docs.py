@@ -118,7 +118,9 @@ def test_guides_are_read_in_five_minutes(page: str) -> None:
 
 
 def test_questions_are_answered_in_five_lines_with_a_command() -> None:
-    answers = re.findall(r"^\*\*(.+?\?)\*\* (.+?)\n(?:\n|\Z)", read("docs/guide/faq.md") + "\n", re.MULTILINE | re.DOTALL)
+    answers = re.findall(
+        r"^\*\*(.+?\?)\*\* (.+?)\n(?:\n|\Z)", read("docs/guide/faq.md") + "\n", re.MULTILINE | re.DOTALL
+    )
     assert len(answers) >= 12
     for question, answer in answers:
         assert len(answer.splitlines()) <= 5, question

@@ -97,6 +97,9 @@ def test_the_command_line_reads_crops_from_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="the standard library reads TOML from 3.11 on")
-def test_toml(tmp_path: Path) -> None:
+def test_toml(tmp_path: Path, root: Path) -> None:
+    page = (root / "docs" / "guide" / "convert.md").read_text()
+    (tmp_path / "guide.toml").write_text(page.partition("```toml\n")[2].partition("```")[0])
+    assert read_crop(tmp_path / "guide.toml") == "box:-1.0,-1.0,0.0,1.0,1.0,4.0,0.0,30.0,0.0"
     (tmp_path / "crop.TOML").write_text('shape = "box"\nmin = [0, 0, 0]\nmax = [1, 1, 2.5]')
     assert read_crop(tmp_path / "crop.TOML") == "box:0.0,0.0,0.0,1.0,1.0,2.5,0.0,0.0,0.0"
