@@ -74,7 +74,7 @@ class Command(TyperCommand):
         for param in self.params:
             if param.param_type_name == "argument":
                 name = param.metavar or str(param.name).upper()
-                pieces.append(name + "..." * (param.nargs == -1 and "..." not in name))
+                pieces.append(f"{name}..." if param.nargs == -1 and "..." not in name else name)
         return [*pieces, "[OPTIONS]"]
 
 

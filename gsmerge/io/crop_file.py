@@ -28,7 +28,7 @@ def read_crop(path: Path) -> str:
         shape = table.get("shape")
         if shape not in tuple(FORMS):  # it may be a list
             raise ValueError(f"shape: expected {' or '.join(FORMS)}, found {shape!r:.40}")
-        numbers = _box(table) if shape == "box" else _sphere(table)
+        numbers = _list_box(table) if shape == "box" else _list_sphere(table)
         text = f"{shape}:{','.join(repr(float(number)) for number in numbers)}"
         parse_crop(text)
     except ValueError as error:
@@ -36,9 +36,9 @@ def read_crop(path: Path) -> str:
     return text
 
 
-def _box(table: Mapping[str, Any]) -> list[float]:
+def _list_box(table: Mapping[str, Any]) -> list[float]:
     """List the corners of a box and the degrees by which it is turned about its middle."""
-    keys = _keys(table)
+    keys = _check_keys(table)
     if "matrix" in keys:
         middle, halves, rotation = _parse_matrix(table)
         return [*(middle - halves), *(middle + halves), *angles_of(rotation)]
@@ -49,9 +49,9 @@ def _box(table: Mapping[str, Any]) -> list[float]:
     return [*(middle - halves), *(middle + halves), *rotate]
 
 
-def _sphere(table: Mapping[str, Any]) -> list[float]:
+def _list_sphere(table: Mapping[str, Any]) -> list[float]:
     """List the middle of a sphere and its radius."""
-    if "matrix" not in _keys(table):
+    if "matrix" not in _check_keys(table):
         return [*_parse_numbers(table, "center"), *_parse_numbers({"radius": [table["radius"]]}, "radius", (1,))]
     middle, radii, _ = _parse_matrix(table)
     if radii.max() > (1 + SHEAR) * radii.min():
@@ -59,7 +59,7 @@ def _sphere(table: Mapping[str, Any]) -> list[float]:
     return [*middle, radii.max()]
 
 
-def _keys(table: Mapping[str, Any]) -> set[str]:
+def _check_keys(table: Mapping[str, Any]) -> set[str]:
     """Return the keys that say where a shape lies; ValueError if they are not those of one form."""
     keys, forms = table.keys() - {"shape"}, FORMS[table["shape"]]
     turned = {"rotate"} if table["shape"] == "box" and "matrix" not in keys else set[str]()
