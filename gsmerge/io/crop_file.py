@@ -15,6 +15,7 @@ from gsmerge.settings.stages import parse_crop
 
 # Keys that say where a shape lies; each but the last may have ``rotate``, of a box
 FORMS = {"box": ({"min", "max"}, {"center", "size"}, {"matrix"}), "sphere": ({"center", "radius"}, {"matrix"})}
+MAX_NUMBER = 1e15  # whose squares and products are far from overflow
 SHEAR = 1e-3  # cosine of the angle between two axes of a matrix from which on they are not taken for perpendicular
 
 
@@ -86,11 +87,11 @@ def _parse_matrix(table: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.
 
 def _parse_numbers(table: Mapping[str, Any], name: str, shape: tuple[int, ...] = (3,)) -> np.ndarray:
     """Return an entry as numbers of a shape; ValueError if it is anything else."""
-    expected = f"{name}: expected {' x '.join(map(str, shape))} number(s)"
+    expected = f"{name}: expected {' x '.join(map(str, shape))} number(s) below {MAX_NUMBER:g}"
     try:
         numbers = np.array(table[name])
     except ValueError as error:  # lists of different lengths
         raise ValueError(f"{expected}, found lists of different lengths") from error
-    if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not np.isfinite(numbers).all():
+    if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not (abs(numbers) < MAX_NUMBER).all():
         raise ValueError(f"{expected}, found {table[name]!r:.60}")
     return numbers.astype(np.float64)

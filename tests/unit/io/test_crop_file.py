@@ -73,6 +73,7 @@ def test_angles_are_those_of_the_turn(degrees: tuple[float, ...]) -> None:
         ({"shape": "box", "min": [1, 0, 0], "max": [1, 1, 1]}, "x0 < x1"),
         ({"shape": "sphere", "center": [0, 0, 0], "radius": 0}, "radius above 0"),
         ({"shape": "sphere", "center": [0, 0, 0], "radius": True}, "radius: expected 1"),
+        ({"shape": "sphere", "center": [0, 0, 0], "radius": 1e300}, "below 1e+15"),
         ({"shape": "box", "matrix": np.eye(3).tolist()}, "matrix: expected 4 x 4"),
         ({"shape": "box", "matrix": np.diag([1, 1, 0, 1]).tolist()}, "matrix: "),
         ({"shape": "box", "matrix": np.ones((4, 4)).tolist()}, "matrix: "),
