@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
 
@@ -110,8 +109,6 @@ def _values(param: Any) -> str:
         return f"`{_cell(param.metavar)}`"
     kind = param.type_descriptor.annotation
     kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
-    if issubclass(kind, Enum):
-        return ", ".join(f"`{choice.value}`" for choice in kind)
     bounds = [("from", param.min), ("to", param.max)]
     return " ".join([KINDS.get(kind, "text"), *(f"{word} {bound:g}" for word, bound in bounds if bound is not None)])
 

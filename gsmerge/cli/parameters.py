@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
 )  # fmt: skip
-METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}  # in the help, of plain values
+# In the help, of plain values
+METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
 REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
@@ -176,7 +177,7 @@ def option(
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if more.get("metavar") is None:
-        more["metavar"] = METAVARS.get(kind)
+        more["metavar"] = "|".join(kind) if isinstance(kind, tuple) else METAVARS.get(kind)
     if isinstance(kind, tuple):
         choice: Any = Enum  # which mypy knows with literal names alone
         kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
