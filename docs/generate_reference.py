@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any, get_args
 
 import typer.main
 from api_page import api_page
+
+from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
@@ -72,7 +73,7 @@ def _index(commands: dict[str, Any]) -> str:
 def command_page(name: str, command: Any) -> str:
     """The page of one command: usage, arguments, and a table of options for each panel of its help."""
     arguments = [p for p in command.params if p.param_type_name == "argument"]
-    usage = " ".join(["gsmerge", name, *(_usage(p) for p in arguments), "[OPTIONS]"])
+    usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
     lines = [NOTICE, "", f"# gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```"]
     if arguments:
         lines += ["", "| argument | what it is |", "|---|---|"]
@@ -85,11 +86,6 @@ def command_page(name: str, command: Any) -> str:
         lines += ["", f"## {panel}", "", "| option | value | default | what it does |", "|---|---|---|---|"]
         lines += [_option_row(param) for param in params]
     return "\n".join([*lines, ""])
-
-
-def _usage(param: Any) -> str:
-    name = _metavar(param) + ("..." if param.nargs == -1 and "..." not in _metavar(param) else "")
-    return name if param.required else f"[{name}]"
 
 
 def _metavar(param: Any) -> str:
@@ -110,12 +106,10 @@ def _values(param: Any) -> str:
     """What an option takes: nothing, one of some words, a number, a path."""
     if param.is_flag:
         return ""
-    if param.metavar:
+    if param.metavar and param.metavar not in METAVARS.values():
         return f"`{_cell(param.metavar)}`"
     kind = param.type_descriptor.annotation
     kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
-    if issubclass(kind, Enum):
-        return ", ".join(f"`{choice.value}`" for choice in kind)
     bounds = [("from", param.min), ("to", param.max)]
     return " ".join([KINDS.get(kind, "text"), *(f"{word} {bound:g}" for word, bound in bounds if bound is not None)])
 

@@ -118,6 +118,16 @@ def turn_by(degrees: np.ndarray) -> np.ndarray:
     return matmul(about_z, matmul(about_y, about_x))
 
 
+def angles_of(rotation: np.ndarray) -> np.ndarray:
+    """Return the ``degrees [3]`` about the axes x, y and z with which :func:`turn_by` makes ``rotation [3,3]``."""
+    cosine = np.sqrt(np.square(rotation[:2, 0]).sum())  # of the angle about y: near 0 the others turn about one axis
+    about_y = arctan2(-rotation[2, 0], cosine)
+    if cosine < 1e-9:
+        return np.asarray(np.degrees([arctan2(-rotation[1, 2], rotation[1, 1]), about_y, 0.0]))
+    about_x, about_z = arctan2(rotation[2, 1], rotation[2, 2]), arctan2(rotation[1, 0], rotation[0, 0])
+    return np.asarray(np.degrees([about_x, about_y, about_z]))
+
+
 def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the rigid motions ``[v,6]`` between viewmats: ``end = start @ motion_matrices(...)``."""
     motions = matmul(invert(start), end)

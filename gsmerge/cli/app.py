@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
@@ -64,6 +65,19 @@ OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
 RESEARCH, ADDED = "Research", "Added by other packages"
 
 
+class Command(TyperCommand):
+    """A command whose usage begins with its arguments, each as its help names it."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """List what the line of usage holds after the command's name."""
+        pieces = []
+        for param in self.params:
+            if param.param_type_name == "argument":
+                name = param.metavar or str(param.name).upper()
+                pieces.append(f"{name}..." if param.nargs == -1 and "..." not in name else name)
+        return [*pieces, "[OPTIONS]"]
+
+
 def make_app(only: str | None = None) -> typer.Typer:
     """Make the application with all commands, or with ``only`` one, which imports no other."""
     made = typer.Typer(
@@ -74,7 +88,7 @@ def make_app(only: str | None = None) -> typer.Typer:
         for name in names:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
-                made.command(rich_help_panel=panel)(function)
+                made.command(cls=Command, rich_help_panel=panel)(function)
     if only in OWN_COMMANDS:
         return made
     for name, entry in find_plugins(PLUGINS).items():
@@ -85,7 +99,7 @@ def make_app(only: str | None = None) -> typer.Typer:
                 say(f"{PROGRAM}: warning: {error}")
                 continue
             panel = RESEARCH if entry.module.startswith("gsmerge.") else ADDED
-            made.command(name, rich_help_panel=panel)(function)
+            made.command(name, cls=Command, rich_help_panel=panel)(function)
     return made
 
 

@@ -18,7 +18,9 @@ from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_
                 "5MB; at least one per group. auto: up to the knee of the superpixels' distortion."),
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
-    "effort device set",
+    "effort device",
+    opt.changed("set", help="Any other setting of the fit or of the written file, such as normals=false; may be "
+                "repeated."),
     opt.output(opt.COMPACT_SCENE, "ENCODED.compact.ply"),
     f"overwrite dry_run {opt.RUN}",
 )  # fmt: skip

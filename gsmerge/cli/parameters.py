@@ -31,7 +31,7 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
-from gsmerge.settings.stages import Engine
+from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
     "Input", "How many Gaussians", "Method", "Measuring", "Output", "General"
 )  # fmt: skip
+# In the help, of plain values
+METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
 REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
@@ -79,7 +81,12 @@ class Args(SimpleNamespace):
         chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
         for name in options.keys() & chosen.keys():
             raise UsageError(f"--set {name}: expected it once, got --{name.replace('_', '-')} too")
-        return options | chosen
+        values = options | chosen
+        if Path(values.get("crop") or "").suffix.lower() in CROP_FILES:
+            from gsmerge.io.crop_file import read_crop
+
+            values["crop"] = read_crop(Path(values["crop"]))
+        return values
 
     def settings(self, **changes: Any) -> CompactOptions:
         """Make the options of :func:`gsmerge.compact`, as :meth:`make` does."""
@@ -169,6 +176,8 @@ def option(
     it; ``more`` goes to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
+    if more.get("metavar") is None:
+        more["metavar"] = "|".join(kind) if isinstance(kind, tuple) else METAVARS.get(kind)
     if isinstance(kind, tuple):
         choice: Any = Enum  # which mypy knows with literal names alone
         kind = choice(f"{name}_choice", {value: value for value in kind}, type=str)
@@ -230,6 +239,9 @@ def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[
             listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
     for name in rare.split():
         listed[name] = _change(listed[name], hidden=True)
+    if rare:
+        hidden = ", ".join(f"--{name.replace('_', '-')}" for name in listed if name in rare.split())
+        listed["help_all"] = _change(listed["help_all"], help=f"Show all options and exit, also {hidden}.")
 
     def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
         @wraps(function)
@@ -301,8 +313,8 @@ _TABLE = (
     ),
     panel(
         METHOD,
-        *map(setting_option, ("effort", "fit", "exposure", "device", "method", "recipe", "checkpoint")),
-        option("set", list[str], f"Any other setting, such as poses=fixed; may be repeated. {SETTINGS_PAGE} lists "
+        *map(setting_option, ("effort", "fit", "exposure", "poses", "device", "method", "recipe", "checkpoint")),
+        option("set", list[str], f"Any other setting, such as match=aabb; may be repeated. {SETTINGS_PAGE} lists "
                "them.", metavar="NAME=VALUE"),
     ),
     panel(
@@ -338,7 +350,7 @@ _TABLE = (
         setting_option("threads"),
         switch("quiet", "Print errors only.", "-q"),
     ),
-    panel("Options", switch("help_all", "Show all options and exit.", is_eager=True, callback=_show_all,
+    panel("Options", switch("help_all", "", is_eager=True, callback=_show_all,
                             expose_value=False)),
 )  # fmt: skip
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}

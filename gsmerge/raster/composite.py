@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,7 +14,9 @@ from gsmerge.kernels.raster import sh
 from gsmerge.raster.view_plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, as_array
+
+SHOWN = 4  # views of a rendering that a notebook shows
 
 
 def background_color(background: ArrayLike) -> Array:
@@ -130,6 +133,13 @@ class Rendering:
     def __repr__(self) -> str:
         count, height, width = self.images.shape[:3]
         return f"Rendering({count} of {width} x {height}{'' if self.depths is None else ', depths'})"
+
+    def _repr_png_(self) -> bytes | None:
+        """Encode the first views, side by side, as the picture that a notebook shows."""
+        if len(self.images) == 0:
+            return None
+        row = np.concatenate(list(as_array(self.images[:SHOWN])), 1)[..., ::-1]
+        return cv2.imencode(".png", (row.clip(0, 1) * 255).round().astype(np.uint8))[1].tobytes()
 
 
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:

@@ -59,9 +59,10 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
-    method: str = setting(OURS, "gsmerge, or a baseline to compare it with.",
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/guide/baselines.md "
+        "lists them.",
         "Packages add methods by entry points (`gsmerge.compaction.methods.Method`); for all but `gsmerge` the number "
-        "of Gaussians has to be settled beforehand.", choices=method_names)  # fmt: skip
+        "of Gaussians has to be settled beforehand.", choices=method_names, metavar="NAME")  # fmt: skip
     effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     device: str = setting("cpu", "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: a GPU where there "

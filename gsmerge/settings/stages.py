@@ -25,6 +25,7 @@ MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and it
 USUAL_K = 1  # what "auto" is unless there are reasons for more
 NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
 CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
+CROP_FILES = (".json", ".toml")  # endings of files that hold a crop, which the command line reads
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
 DROPS = ("floaters", "sky", "transparent")
 
@@ -164,9 +165,9 @@ class CleanOptions(Settings):
     """Settings of clean-up: what to leave out of the result."""
 
     crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
-        "scene's world units; a budget is met after it.",
+        "scene's world units, or inside the shape that a .json or .toml file describes; a budget is met after it.",
         "Their centres have to be inside. Three more numbers of a box turn it about its middle: degrees about x, y and "
-        "z, in this order.", metavar="SHAPE")  # fmt: skip
+        "z, in this order. The command line alone reads files.", metavar="SHAPE")  # fmt: skip
     drop: str | None = setting(None, "Leave out floaters, sky or transparent Gaussians, with commas between.",
         "`floaters`: isolated, far beyond the scene, or hanging across it (`gsmerge.stages.clean.floaters`); `sky`: "
         "what is sky in the photos (`gsmerge.stages.sky.sky`); `transparent`: of an opacity below 1/255.",

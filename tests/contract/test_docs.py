@@ -108,6 +108,34 @@ def test_calls_parse(page: str) -> None:
             COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
 
 
+GUIDES = [page for page in PAGES if page.startswith("docs/guide/")]
+
+
+@pytest.mark.parametrize("page", GUIDES)
+def test_guides_are_read_in_five_minutes(page: str) -> None:
+    assert len(read(page).split()) < 1000
+
+
+def test_questions_are_answered_in_five_lines_with_a_command() -> None:
+    answers = re.findall(
+        r"^\*\*(.+?\?)\*\* (.+?)\n(?:\n|\Z)", read("docs/guide/faq.md") + "\n", re.MULTILINE | re.DOTALL
+    )
+    assert len(answers) >= 12
+    for question, answer in answers:
+        assert len(answer.splitlines()) <= 5, question
+        calls = re.findall(r"`gsmerge ([^`]+)`", answer)
+        assert calls or question == "Is anything sent anywhere?", question
+        for call in calls:
+            name, *arguments = shlex.split(call)
+            COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
+
+
+def test_settings_that_many_guides_need_are_options() -> None:
+    pages = [(name, page) for page in GUIDES for name in set(re.findall(r"--set\s+(\w+)=", read(page)))]
+    named = [name for name, _ in pages]
+    assert {name for name in named if named.count(name) >= 3} == set()
+
+
 @pytest.mark.parametrize("page", [page for page in WRITTEN if "```python" in read(page)])
 def test_python_uses_public_names(page: str) -> None:
     for block in re.findall(r"```python\n(.*?)```", read(page), re.DOTALL):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 
 def run_example(root: Path, name: str, *arguments: object) -> str:
@@ -43,6 +48,30 @@ def test_examples_run_one_after_the_other(root: Path, tmp_path: Path) -> None:
     assert all(10 < value < 60 for value in values)
     arrived = run_example(root, "05_views_in_batches.py", scene / "scene.ply", scene / "so_far.ply")
     assert 0 < int(re.search(r"13824 -> (\d+) Gaussians", arrived).group(1)) < 13824 / 5  # type: ignore[union-attr]
+
+
+def show(value: Any) -> str:
+    """What a notebook shows of a cell's last value."""
+    picture = getattr(value, "_repr_png_", lambda: None)()
+    return "png" if picture else getattr(value, "_repr_html_", value.__repr__)()
+
+
+def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cells, one after the other in one namespace, as Jupyter runs them; it is stored without outputs."""
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((root / "examples" / "notebook.ipynb").read_text(encoding="utf-8"))
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert [(cell["outputs"], cell["execution_count"]) for cell in cells] == [([], None)] * len(cells)
+    namespace: dict[str, Any] = {}
+    shown = []
+    for cell in cells:
+        *body, last = ast.parse("".join(cell["source"])).body
+        assert isinstance(last, ast.Expr)
+        exec(compile(ast.Module(body, []), "notebook.ipynb", "exec"), namespace)
+        shown.append(show(eval(compile(ast.Expression(last.value), "notebook.ipynb", "eval"), namespace)))
+    texts = ("Scene(24,576", "data:image/png;base64,", "fit", "3 target views", "png", "png", "GaussianFile(")
+    assert len(shown) == len(texts)
+    assert all(text in value for text, value in zip(texts, shown, strict=True)), shown
 
 
 def test_the_same_seed_makes_the_same_scene(make_scene, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -41,8 +41,8 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
 
 
 def test_there_are_few_options() -> None:
-    """401 before settings and hints were given by name; the last are of ``convert``, and ``inspect --threads``."""
-    assert sum(len(command.params) for command in COMMANDS.values()) <= 269
+    """401 before settings and hints were given by name; 248 before ``convert``, which 20 more are for."""
+    assert sum(len(command.params) for command in COMMANDS.values()) <= 268
     assert sum(not getattr(p, "hidden", False) for p in COMMANDS["compact"].params) <= 15
 
 
@@ -96,8 +96,23 @@ def test_short_help_and_all_of_it(capsys: pytest.CaptureFixture[str], monkeypatc
     assert len(listed[0] - {"--help"}) == 14  # and the argument SCENE
     every = {p.opts[0] for p in COMMANDS["compact"].params if p.opts[0].startswith("--")}
     assert listed[1] - {"--help"} == every
+    named = set(re.findall(r"--[a-z-]+", brief.partition("─ Input ─")[0]))
+    assert named - {"--help", "--help-all"} == every - listed[0]  # what the short help leaves out is named in it
     assert all(title in brief for title in ("─ Input ─", "─ How many Gaussians ─", "─ Method ─", "─ Output ─"))
     assert help_of(capsys, "compact", "--help") == brief
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_help_fits_a_terminal(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = help_of(capsys, command, "--help")
+    assert max(map(len, text.splitlines())) <= 80
+    usage = next(line.split() for line in text.splitlines() if "Usage:" in line)
+    assert usage[-1] == "[OPTIONS]"
+    assert "{" not in " ".join(usage)
+    assert re.findall(r"<\w[^>]*>?", text.partition("─ Options ─")[2].replace("<=x<=", "")) == ["<bool>"]  # of --help
 
 
 def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,6 +36,7 @@ from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.crop_file import read_crop
 from gsmerge.io.photo_files import decode_alpha, decode_mask
 from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
@@ -355,6 +356,9 @@ TARGETS: dict[str, Target] = {
     "checkpoint": Target("a.safetensors", checkpoint, load_checkpoint),
     "settings-json": Target("a.json", texts(TRAINING), check_settings),
     "settings-toml": Target("a.toml", texts(b"steps = 100\nrate = 1e-3\n[network]\nwidth = 32\n"), check_settings),
+    "crop": Target(
+        "a.json", texts(b'{"shape": "box", "center": [0, 1, 2], "size": [1, 2, 3], "rotate": [0, 30, 0]}'), read_crop
+    ),
     "photo": Target("a.png", photos, check_photo),
     "mask": Target("a.png", photos, check_mask),
     "list": Target("list.txt", texts(b"a.ply\n# b\nscene c\n\nd.spz\n"), check_list),

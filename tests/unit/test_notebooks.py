@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 import gsmerge
 
@@ -73,3 +75,13 @@ def test_evaluations_are_tables(scene: gsmerge.Scene, result: gsmerge.CompactRes
     assert text.count("<tr>") == 3
     assert all(word in text for word in ("input", "small", "psnr", "ssim", f"{scene.num_gaussians:,}"))
     assert "lpips" not in text
+
+
+def test_renderings_show_their_first_views(scene: gsmerge.Scene) -> None:
+    drawn = gsmerge.render(scene.gaussians, scene.cameras[[0, 1]])
+    for rendering in (drawn, replace(drawn, images=torch.from_numpy(drawn.images))):
+        packed = rendering._repr_png_()
+        assert packed is not None
+        picture = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        np.testing.assert_allclose(picture, 255 * np.concatenate(list(drawn.images.clip(0, 1)), 1), atol=0.51)
+    assert gsmerge.render(scene.gaussians, scene.cameras[[]])._repr_png_() is None

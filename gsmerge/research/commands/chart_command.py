@@ -30,8 +30,8 @@ def _list(name: str, help: str, wording: str) -> Parameter:
 
 
 @opt.command(
-    opt.argument("scenes", list[str] | None, "SCENES", "Folders to search for scenes, patterns, .ply files, or text "
-                 "files with one of these per line.", default=None),
+    opt.argument("scenes", list[str] | None, "[SCENE]...", "Folders to search for scenes, patterns, .ply files, or "
+                 "text files with one of these per line.", default=None),
     *opt.panel(
         GRID,
         _list("methods", "Methods: gsmerge and baselines.", "gsmerge"),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.TARGETS} budget effort set",
+    f"{opt.READING} {opt.TARGETS} set",
     *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", wording="all", metavar="NAME,...")),
     "report overwrite threads",
 )
