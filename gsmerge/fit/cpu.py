@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from gsmerge.fit.fit_state import State
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import fog_gradients
 from gsmerge.fit.photo_sizes import holdout_psnr
+from gsmerge.fit.prepared_step import StepTables, is_prepared
 from gsmerge.fit.report import FitResult
 from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
 from gsmerge.fit.survey import Survey, survey_photos
@@ -25,7 +26,8 @@ from gsmerge.raster import composite, plan_view, splat_adjoint
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, photo_errors, render_photos, score_photos
-from gsmerge.runtime.threads import in_turn, parallel_map
+from gsmerge.raster.view_plan import camera_numbers
+from gsmerge.runtime.threads import in_turn, parallel_map, use_threads
 from gsmerge.settings.fit import Tuning
 from gsmerge.types import Gaussians
 
@@ -41,6 +43,7 @@ class _CpuEngine:
     photos: tuple[Photos, ...]  # Those of the plan's job, at the poses of the moment
     poses: PoseState | None = None  # The motions of the cameras; None where they are fixed
     read_every: int = 1
+    tables: dict[str, StepTables] = field(default_factory=dict)  # of the state that took the last step
 
     @property
     def viewmats(self) -> np.ndarray | None:
@@ -68,6 +71,9 @@ class _CpuEngine:
         if step.kept is not None:
             fuller = state.splats.opacities / np.float32(1 - self.plan.dropout)
             opacities = step.kept * np.minimum(fuller, MAX_ALPHA)
+        error = self._take_prepared(state, step, weight, opacities)
+        if error is not None:
+            return error / max(3 * float(weight.sum()), 1)
         camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
         drawn = plan_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
@@ -83,27 +89,55 @@ class _CpuEngine:
         self._move(state, g, step)
         return error / max(3 * float(weight.sum()), 1)
 
+    def _take_prepared(
+        self, state: State, step: Step, weight: np.ndarray, opacities: np.ndarray | None
+    ) -> float | None:
+        """Take a step in few calls and return its error; None where it has to be taken by single ones."""
+        if self.poses is not None or not is_prepared(state):
+            return None
+        with use_threads() as threads:
+            tables = self.tables.get("of the state")
+            if tables is None or tables.state is not state or tables.threads != threads:
+                tables = self.tables["of the state"] = StepTables(state, threads)
+            mode, photos = step.mode, self.photos[step.mode.size]
+            camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
+            rates = self.plan.job.options.tuning
+            numbers = self._constants(state, step) | {
+                "camera": camera_numbers(**camera),
+                "background": step.background,
+                "loss_weights": np.array(loss_weights(rates, step.progress), np.float32),
+            }
+            drawn = state.splats.opacities if opacities is None else opacities
+            return tables.take(step.number, photos.image(step.view), weight, drawn, numbers)
+
+    def _constants(self, state: State, step: Step) -> dict[str, np.ndarray]:
+        """Return the optimiser's constants at a step."""
+        options, count = self.plan.job.options, max(len(state.x), 1)
+        rates = options.tuning
+        return {
+            "rates": step_sizes(rates, step.progress, options.steps),
+            "limits": np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32),
+            "betas": np.array([rates.beta1, rates.beta2], np.float32),
+            "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
+        }
+
     def clear_fog(self, state: State, step: Step, view: int) -> None:
         assert self.plan.job.outside is not None
         self._move(state, fog_gradients(state.splats, self.plan.job.outside, view), step)
 
     def _move(self, state: State, g: Gradients, step: Step) -> None:
         """Take one Adam step along gradients."""
-        s, options, count = state.splats, self.plan.job.options, max(len(state.x), 1)
+        s = state.splats
         if state.fixed.any():
             g = g[~state.fixed[g.ids]]
-        rates = options.tuning
-        steps = step_sizes(rates, step.progress, options.steps)
-        limits = np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32)
-        betas = np.array([rates.beta1, rates.beta2], np.float32)
-        regs = np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32)
+        constants = tuple(self._constants(state, step).values())
 
         def update(first: int) -> None:
             last = min(first + ROWS, len(g.ids))
             kernels.adam(
                 state.x, state.x0, state.m, state.v, state.units, state.box_shares, state.min_sizes, g.ids,
-                g.means, g.quats, g.scales, g.opacities, g.colors, steps, limits, betas, regs, step.number,
-                first, last, s.means, s.quats, s.scales, s.opacities, state.colors,
+                g.means, g.quats, g.scales, g.opacities, g.colors, *constants, step.number, first, last,
+                s.means, s.quats, s.scales, s.opacities, state.colors,
             )  # fmt: skip
 
         parallel_map(update, range(0, len(g.ids), ROWS))

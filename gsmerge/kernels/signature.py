@@ -141,8 +141,57 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
             raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
         return None if returns is STATUS else result
 
+    def prepare(*values: Any) -> Callable[[], None]:
+        """Check arguments once, and return a function that calls with them: what they point to must live as long."""
+        sizes: dict[str, int] = {}
+        passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
+        passed += [sizes.get(key, 0) for key in names]
+        entry = _entry(load_library(), name, returns, arguments)
+
+        def call_again() -> None:
+            if entry(*passed):
+                raise ValueError(f"{name}: expected indices inside their arrays, found one outside")
+
+        return call_again
+
+    call.prepare = prepare  # type: ignore[attr-defined]
     PROTOTYPES[name] = _prototype(name, returns, arguments)
     return call
+
+
+class Table:
+    """A struct of the native library: addresses of arrays, then their sizes by name, then numbers, 8 bytes each."""
+
+    def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
+        self.name, self.arrays = name, arrays
+        self.places = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
+
+    def fill(self, arrays: dict[str, np.ndarray[Any, Any]]) -> FilledTable:
+        """Check all arrays and write their addresses and sizes; the numbers are zero."""
+        return FilledTable(self, arrays)
+
+
+class FilledTable:
+    """Values of a :class:`Table`, with the arrays that it points to, which live as long."""
+
+    def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+        self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
+        self.values = np.zeros(len(table.places), np.int64)
+        for key in table.arrays:
+            self.point(key, arrays[key])
+        for key, size in self._sizes.items():
+            self[key] = size
+
+    def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
+        """Let an address be that of another array of the same sizes; ValueError if it does not fit."""
+        self[key] = _pass(self.table.name, key, self.table.arrays[key], array, self._sizes)
+        self.arrays[key] = array
+
+    def __getitem__(self, key: str) -> int:
+        return int(self.values[self.table.places[key]])
+
+    def __setitem__(self, key: str, value: int) -> None:
+        self.values[self.table.places[key]] = value
 
 
 def size_names(arguments: dict[str, Argument]) -> list[str]:

@@ -21,6 +21,7 @@ Array = NDArray[Any]
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
 MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
+NEAR, FAR = 0.01, 1e10  # depths, world units
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +112,11 @@ def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[
     return list(pairwise(edges.tolist()))
 
 
-def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool) -> Array:
-    """Return the numbers of a camera in the kernels' order, without the depth range."""
+def camera_numbers(
+    viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
+    near: float = NEAR, far: float = FAR,
+) -> Array:  # fmt: skip
+    """Return the numbers of a camera in the kernels' order."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     # Directions are clamped 15 % of the image outside it, where the first-order projection breaks down (gsplat).
     spare_x, spare_y = 0.15 * width / fx, 0.15 * height / fy
@@ -124,6 +128,7 @@ def _camera(viewmat: Array, K: Array, width: int, height: int, eps2d: float, ant
     camera[projection.LIMIT_X : projection.LIMIT_Y] = (width - cx) / fx + spare_x, -cx / fx - spare_x
     camera[projection.LIMIT_Y : projection.ANTIALIASED] = (height - cy) / fy + spare_y, -cy / fy - spare_y
     camera[projection.ANTIALIASED] = antialiased
+    camera[projection.NEAR], camera[projection.FAR] = near, far
     return camera
 
 
@@ -150,7 +155,7 @@ def _visible(
     return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
 
 
-def _aligned_rows(count: int, width: int) -> Array:
+def aligned_rows(count: int, width: int) -> Array:
     """Return ``[count,width]`` float32 starting at a cache line, so that no short row lies across two."""
     line = 16
     buffer = np.empty(count * width + line, np.float32)
@@ -161,7 +166,7 @@ def _aligned_rows(count: int, width: int) -> Array:
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
     """Return conics, depths and tile boxes of the listed Gaussians."""
     m = len(ids)
-    conics, depths = _aligned_rows(m, projection.CONIC), np.empty(m, np.float32)
+    conics, depths = aligned_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:
@@ -243,8 +248,8 @@ def plan_view(
     *,
     eps2d: float = EPS2D,
     antialiased: bool = False,
-    near: float = 0.01,
-    far: float = 1e10,
+    near: float = NEAR,
+    far: float = FAR,
     opacities: Array | None = None,
     keep: Array | None = None,
     tiles: Array | None = None,
@@ -272,8 +277,7 @@ def plan_view(
 
     local = viewmat.copy()
     local[:3, 3] += matmul(local[:3, :3], splats.origin)
-    camera = _camera(local, K, width, height, eps2d, antialiased)
-    camera[projection.NEAR], camera[projection.FAR] = near, far
+    camera = camera_numbers(local, K, width, height, eps2d, antialiased, near, far)
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
     first, last = band or (0, tile_height)
     if band is not None:

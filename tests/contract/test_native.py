@@ -6,6 +6,7 @@ import re
 
 import gsmerge.kernels
 from gsmerge.kernels.build import FOLDER
+from gsmerge.kernels.raster.step import STEP
 from gsmerge.kernels.signature import PROTOTYPES
 
 
@@ -31,3 +32,14 @@ def test_declarations_are_those_of_the_sources():
 def test_every_function_of_the_library_is_declared():
     names = set(re.findall(r"API [\w ]+?\*? ?(\w+)\(", sources()))
     assert names - {"processor_level"} == set(prototypes())
+
+
+def test_the_table_of_a_step_is_the_struct_of_its_source():
+    """The same fields in the same order, addresses first."""
+    text = (FOLDER / "raster" / "step.c").read_text()
+    (body,) = re.findall(r"typedef struct \{\n([^}]*)\} Step;", text)
+    fields = [(kind, name) for kind, names in re.findall(r"(\w+) ([^;]*);", body) for name in re.split(r",\s*", names)]
+    assert [name.lstrip("*") for _, name in fields] == list(STEP.places)
+    for (kind, name), argument in zip(fields, STEP.arrays.values(), strict=False):
+        assert f"{kind} *" == argument.c.removeprefix("const "), name
+    assert all(kind == "int64_t" and name[0] != "*" for kind, name in fields[len(STEP.arrays) :])

@@ -4,6 +4,7 @@ from messages import refuses
 
 from gsmerge.kernels.raster.binning import MOST_TILES, count_boxes, deal_tiles, sort_bits
 from gsmerge.kernels.raster.project import CAMERA, cull
+from gsmerge.kernels.signature import Table, f4
 
 
 def arrays(m=3):
@@ -83,3 +84,31 @@ def test_a_cursor_outside_the_list_is_refused(cursor):
     cursors, flatten_ids = np.full(4, cursor), np.zeros(1, np.int32)
     with refuses(ValueError, "deal_tiles", "indices"):
         deal_tiles(np.zeros(1, np.int32), np.array([[0, 1, 0, 1]], np.int16), 2, cursors, flatten_ids)
+
+
+def test_a_prepared_call_works_on_the_arrays_that_it_was_given():
+    values = arrays()
+    values[0][:] = [2, 1, 0]
+    call = sort_bits.prepare(*values)
+    call()
+    assert values[1].tolist() == [2, 1, 0]
+    values[0][:] = [0, 2, 1]
+    call()
+    assert values[1].tolist() == [0, 2, 1]
+    with refuses(ValueError, "sort_bits: order"):
+        sort_bits.prepare(values[0], values[1].astype(np.int64), *values[2:])
+
+
+def test_tables_check_what_they_point_to():
+    table = Table("Pair", ("count",), first=f4("n", 2), second=f4("n", out=True))
+    arrays = {"first": np.zeros((3, 2), np.float32), "second": np.zeros(3, np.float32)}
+    filled = table.fill(arrays)
+    assert filled["n"] == 3
+    assert filled["count"] == 0
+    assert filled["second"] == arrays["second"].ctypes.data
+    filled["count"] = 7
+    assert filled.values[-1] == 7
+    with refuses(ValueError, "Pair: second", "n = 3"):
+        filled.point("second", np.zeros(4, np.float32))
+    with refuses(ValueError, "Pair: second"):
+        table.fill(arrays | {"second": np.zeros(4, np.float32)})

@@ -28,6 +28,11 @@ _loss_gradient = declare(
 )  # fmt: skip
 
 
+def room_of(width):
+    """Return the values that a buffer of a row of ``width`` pixels holds."""
+    return -(-3 * width // CHUNK) * CHUNK + PAD
+
+
 def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
@@ -45,7 +50,7 @@ def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, 
         gradient: ``[h,3w]`` float32, the rows are written, divided by the number of pixels.
         errors: ``[h]`` float32, weighted squared error of each row, written.
     """
-    room = -(-image.shape[1] // CHUNK) * CHUNK + PAD
+    room = room_of(image.shape[1] // 3)
     terms = np.empty((ROWS, TERMS, room), np.float32)
     rows = np.empty((EDGE_ROWS, room), np.float32)
     _loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows)

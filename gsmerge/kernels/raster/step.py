@@ -1,0 +1,45 @@
+"""One step of a fit, from projection to the optimiser, as a table of buffers and phases that work through it.
+
+The kernels are those of the modules beside this one, and so are the bits. What a step needs is checked once, when the
+table is filled; then a phase is a call without arguments on every thread, see ``gsmerge/kernels/raster/step.c``.
+"""
+
+from __future__ import annotations
+
+from gsmerge.kernels.gaussians.optimise import COLUMNS
+from gsmerge.kernels.raster.image_loss import EDGE_ROWS, ROWS, TERMS
+from gsmerge.kernels.raster.project import CAMERA, CONIC, SUMS
+from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u8
+
+PHASES = ("cull", "project", "count", "deal", "blend", "loss", "backward", "update")
+PIECE = 1 << 13  # Gaussians that are culled or projected by one thread at a time
+
+# State of the fit, buffers over its n Gaussians, over tiles, over intersections and over pixels, then what a step sets
+STEP = Table(
+    "Step",
+    ("step", "num_visible", "num_intersections", "next", "arrived", "failed"),
+    means=f4("n", 3, out=True), quats=f4("n", 4, out=True), scales=f4("n", 3, out=True), opacities=f4("n", out=True),
+    colors=f4("n", 3, out=True), x=f4("n", COLUMNS, out=True), x0=f4("n", COLUMNS), m=f4("n", COLUMNS, out=True),
+    v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), drawn=f4("n"),
+    ids=i4("n", out=True), num_kept=i8("pieces", out=True), conics=f4("n", CONIC, out=True),
+    depths=f4("n", out=True), tints=f4("n", 3, out=True), boxes=i2("n", 4, out=True), order=i4("n", out=True),
+    keys=u8("n", out=True), spare=u8("n", out=True), ordered_boxes=i2("n", 4, out=True),
+    sums=f4("n", SUMS, out=True), g_means=f4("n", 3, out=True), g_quats=f4("n", 4, out=True),
+    g_scales=f4("n", 3, out=True), g_opacities=f4("n", out=True), g_colors=f4("n", 3, out=True),
+    corners=i8("spans", "num_corners", out=True), counts=i8("spans", "tiles", out=True),
+    offsets=i8("ends", out=True), flatten_ids=i4("room", out=True), slots=f4("room", SUMS, out=True),
+    image=f4("height", "width", 3, out=True), transmittance=f4("height", "width", out=True),
+    gradient=f4("height", "width", 3, out=True), errors=f4("height", out=True),
+    terms=f4("threads", ROWS, TERMS, "line", out=True), rows=f4("threads", EDGE_ROWS, "line", out=True),
+    photo=f4("height", "width", 3), weight=f4("height", "width"), camera=f4(CAMERA), background=f4(3),
+    loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(3), betas=f4(2), regs=f4(2),
+)  # fmt: skip
+
+
+@native(STATUS, table=i8("fields", out=True), phase=i8(least=0, below=len(PHASES)))
+def fit_phase(table, phase):
+    """Work on a phase of a step until nothing is left of it; every one of its ``threads`` makes one such call.
+
+    Phases follow in their order, each once all calls of the one before have ended. After "count" the table says how
+    many intersections there are; the buffers must have room for them before it goes on.
+    """
