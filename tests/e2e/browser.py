@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
     "--disable-background-networking", "--disable-sync", "--hide-scrollbars", "--remote-debugging-pipe",
@@ -20,6 +22,9 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 PATIENCE = 60.0  # seconds
+SKIPPED = "no Chromium on the PATH"
+# Skipped only where nobody relies on it, and the last lines of the run say so (tests/conftest.py)
+NEEDS_BROWSER = pytest.mark.skipif(CHROMIUM is None and not os.environ.get("CI"), reason=SKIPPED)
 
 
 class Browser:
@@ -65,9 +70,10 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def press(self, key: str, code: int) -> None:
-        for kind in ("rawKeyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+    def press(self, key: str, *, shift: bool = False, release: bool = True) -> None:
+        code = f"Key{key.upper()}" if key.isalpha() and len(key) == 1 else key
+        for kind in ("rawKeyDown", "keyUp")[: 1 + release]:
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=8 * shift)
 
     def requests(self) -> list[str]:
         """Addresses that the page asked for."""
@@ -81,8 +87,9 @@ class Browser:
 
 
 @contextmanager
-def browser(executable: str, profile: Path, *flags: str) -> Iterator[Browser]:
+def browser(executable: str | None, profile: Path, *flags: str) -> Iterator[Browser]:
     """A browser with a profile and further flags of its own, ended with the block."""
+    assert executable is not None, f"{SKIPPED}: .ci/chromium installs it"
     to_browser, from_browser = os.pipe(), os.pipe()
 
     def connect() -> None:  # Chromium reads commands from descriptor 3 and answers on 4
