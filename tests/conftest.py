@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from browser import NO_BROWSER
 from floors import NUDGE, at_least_the_floor, nudged
 from scripts import load_script
 
@@ -37,6 +38,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "floor" in getattr(item, "fixturenames", ()):
             item.add_marker("floor")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """End with a line that nobody overlooks where the pages were not tried in a browser."""
+    skipped = [one for one in terminalreporter.stats.get("skipped", ()) if NO_BROWSER in str(one.longrepr)]
+    if skipped:
+        files = " and ".join(sorted({one.nodeid.partition("::")[0] for one in skipped}))
+        terminalreporter.section("the pages were NOT tested", red=True, bold=True)
+        terminalreporter.line(f"{len(skipped)} tests were skipped, {NO_BROWSER}: run .ci/chromium, then {files}", red=True)
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from browser import CHROMIUM, Browser, browser, needs_browser
 
-from .browser import CHROMIUM, NEEDS_BROWSER, Browser, browser
-
-pytestmark = NEEDS_BROWSER
+pytestmark = needs_browser()
 FIRST = "document.querySelector('.compare')"
 
 

@@ -159,6 +159,7 @@ function listenToPointers() {
     if (event.timeStamp - pressed > TWICE) before = state.at;
     pressed = event.timeStamp;
     const whole = !state.solid && state.zoom === 1;
+    if (swiping && pointers.size > 1) swipeTo(before);
     swiping = stage.dataset.mode === "swipe" && pointers.size === 1 && (event.target === id("handle") || whole);
     if (swiping) swipeTo(toShare(event));
   });

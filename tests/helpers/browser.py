@@ -22,9 +22,14 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 PATIENCE = 60.0  # seconds
-SKIPPED = "no Chromium on the PATH"
-# Skipped only where nobody relies on it, and the last lines of the run say so (tests/conftest.py)
-NEEDS_BROWSER = pytest.mark.skipif(CHROMIUM is None and not os.environ.get("CI"), reason=SKIPPED)
+NO_BROWSER = "no Chromium on the PATH"
+
+
+def needs_browser(executable: str | None = CHROMIUM) -> pytest.MarkDecorator:
+    """A mark that skips tests without a browser, which the end of the run says; in CI that is an error."""
+    if executable is None and os.environ.get("CI"):
+        raise RuntimeError(f"{NO_BROWSER}: .ci/chromium installs it")
+    return pytest.mark.skipif(executable is None, reason=NO_BROWSER)
 
 
 class Browser:
@@ -89,7 +94,7 @@ class Browser:
 @contextmanager
 def browser(executable: str | None, profile: Path, *flags: str) -> Iterator[Browser]:
     """A browser with a profile and further flags of its own, ended with the block."""
-    assert executable is not None, f"{SKIPPED}: .ci/chromium installs it"
+    assert executable is not None
     to_browser, from_browser = os.pipe(), os.pipe()
 
     def connect() -> None:  # Chromium reads commands from descriptor 3 and answers on 4
