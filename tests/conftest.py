@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -40,13 +40,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("floor")
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None, None, None]:
     """End with a line that nobody overlooks where the pages were not tried in a browser."""
+    yield
     skipped = [one for one in terminalreporter.stats.get("skipped", ()) if NO_BROWSER in str(one.longrepr)]
     if skipped:
         files = " and ".join(sorted({one.nodeid.partition("::")[0] for one in skipped}))
         terminalreporter.section("the pages were NOT tested", red=True, bold=True)
-        terminalreporter.line(f"{len(skipped)} tests were skipped, {NO_BROWSER}: run .ci/chromium, then {files}", red=True)
+        terminalreporter.line(
+            f"{len(skipped)} tests were skipped, {NO_BROWSER}: run .ci/chromium, then {files}", red=True
+        )
 
 
 @pytest.fixture(scope="session")

@@ -54,10 +54,8 @@ def view_page(data: ViewData) -> str:
     opened[left] = opened[right] = None
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
-    results = [
-        {"headline": _unbroken(headline(data, place)), "figures": figures(data, place)}
-        for place in range(min(len(data.sides) - 1, 1), len(data.sides))
-    ]
+    places = range(min(len(data.sides) - 1, 1), len(data.sides))
+    results = [(_unbroken(headline(data, place)), figures(data, place)) for place in places]
     return render_template(
         "view.html",
         policy=SOLID,
@@ -74,8 +72,7 @@ def view_page(data: ViewData) -> str:
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [
-                {"headline": one["headline"], "figures": [[figure.new, figure.better] for figure in one["figures"]]}
-                for one in results
+                {"headline": line, "figures": [[figure.new, figure.better] for figure in row]} for line, row in results
             ],
             "views": [_view(view) for view in data.shown],
         },
@@ -156,7 +153,10 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
     ]
     views = "held-out photos" if data.held_out else "input photos" if data.reference == PHOTOS else data.reference
-    qualities = [(f"PSNR, {views}", "psnr", before.mean, after.mean), (f"SSIM, {views}", "ssim", before.mean, after.mean)]
+    qualities = [
+        (f"PSNR, {views}", "psnr", before.mean, after.mean),
+        (f"SSIM, {views}", "ssim", before.mean, after.mean),
+    ]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
         qualities.append((label, "psnr", before.covered, after.covered))

@@ -127,16 +127,20 @@ def test_without_a_browser_tests_are_skipped_aloud_and_fail_in_ci(monkeypatch: p
 
 def test_the_end_of_a_run_says_what_was_not_tried_in_a_browser() -> None:
     said: list[str] = []
-    skipped = [SimpleNamespace(longrepr=("a.py", 1, f"Skipped: {why}"), nodeid="tests/a.py::b") for why in (NO_BROWSER, "slow")]
+    skipped = [
+        SimpleNamespace(longrepr=("a.py", 1, f"Skipped: {why}"), nodeid="tests/a.py::b") for why in (NO_BROWSER, "slow")
+    ]
     reporter = SimpleNamespace(
-        stats={"skipped": skipped}, section=lambda line, **_: said.append(line), line=lambda line, **_: said.append(line)
+        stats={"skipped": skipped},
+        section=lambda line, **_: said.append(line),
+        line=lambda line, **_: said.append(line),
     )
     conftest = load_script(ROOT / "tests" / "conftest.py")
-    conftest.pytest_terminal_summary(reporter)
+    list(conftest.pytest_terminal_summary(reporter))
     assert "NOT tested" in said[0]
     assert said[1].startswith("1 tests were skipped")
     assert said[1].endswith("tests/a.py")
-    conftest.pytest_terminal_summary(SimpleNamespace(stats={}))
+    list(conftest.pytest_terminal_summary(SimpleNamespace(stats={})))
     assert len(said) == 2
 
 

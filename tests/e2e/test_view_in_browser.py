@@ -257,9 +257,7 @@ def test_full_screen(opened: tuple[Browser, Any]) -> None:
 
 
 def resize(tab: Browser, width: int, height: int) -> None:
-    tab.call(
-        "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 640
-    )
+    tab.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 640)
     wait(tab, f"innerWidth === {width}")
 
 

@@ -271,4 +271,5 @@ function start() {
   listen();
   show();
   showNumbers();
+  markResult();
 }

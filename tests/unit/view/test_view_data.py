@@ -89,7 +89,7 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
     values = [view.scores[1].psnr or 0 for view in inputs.views]
     assert values[inputs.start] == np.median(values)
     assert replace(inputs, views=inputs.views[:1]).start == 0
-    assert [place for place, view in enumerate(actual.views) if view.held_out][0] == actual.start
+    assert actual.start == next(place for place, view in enumerate(actual.views) if view.held_out)
     best = max((view for view in actual.views if view.held_out), key=lambda view: view.scores[1].psnr or 0)
     assert replace(actual, views=(*inputs.views, best)).start == 3
 

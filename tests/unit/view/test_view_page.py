@@ -121,13 +121,18 @@ def with_three_results(data: ViewData) -> ViewData:
 
 def test_a_table_over_all_results(data: ViewData) -> None:
     three = with_three_results(data)
-    three = replace(three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:]))
+    three = replace(
+        three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:])
+    )
     head, rows = results_table(three)
     assert head == ["", "Gaussians", "Share", "File", "PSNR (dB)", "SSIM", "LPIPS", "Near fog", "Far fog", "Holes"]
     assert rows[0] == ["input", "1,000", "100.0 %", "2.0 MB", "20.00", "0.500", "-", "-", "-", "-"]
     assert rows[1][:8] == ["half", "500", "50.0 %", "2.0 kB", "25.00", "0.750", "-", "0.250"]
     assert rows[1][-1] == "0.013"
-    assert [row[:3] + row[6:7] for row in rows[2:]] == [["tenth", "100", "10.0 %", "0.250"], ["least", "10", "1.0 %", "0.250"]]
+    assert [row[:3] + row[6:7] for row in rows[2:]] == [
+        ["tenth", "100", "10.0 %", "0.250"],
+        ["least", "10", "1.0 %", "0.250"],
+    ]
     page = view_page(three)
     assert re.findall(r'<tr data-result="(\d)">', page) == ["2", "3", "4"]
     assert page.count('<button class="link"') == 3
@@ -164,6 +169,7 @@ def test_colours_are_readable_in_both_schemes(page: str) -> None:
 
 def contrast(*colors: str) -> float:
     """The ratio of two colours' luminances, as WCAG 2 has it."""
+
     def luminance(color: str) -> float:
         digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
         values = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
