@@ -260,6 +260,6 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters |= {"bytes": human_bytes, "number": _number}
+    made.filters |= {"bytes": human_bytes, "number": _number, "unbroken": _unbroken}
     made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
     return made

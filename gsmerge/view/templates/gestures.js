@@ -107,7 +107,7 @@ function onKey(event) {
   };
   if (FLIGHT[letter] && state.solid) takeOff(letter, event.shiftKey);
   else if (MODES[key] && data.sources.length > 1) set("mode", MODES[key]);
-  else if (actions[key] && !(key === " " && event.target.tagName === "BUTTON")) actions[key]();
+  else if (actions[key] && !(key === " " && ["BUTTON", "SUMMARY"].includes(event.target.tagName))) actions[key]();
   else return;
   event.preventDefault();
 }

@@ -1,5 +1,6 @@
 "use strict";
-// What is shown, and where. Results (results.js) and gestures (gestures.js) change it; 3D (scene.js) draws it and may never come.
+// What is shown, and where. Results (results.js) and gestures (gestures.js) change it; 3D (scene.js), which may never
+// come, draws it.
 
 const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
@@ -86,8 +87,8 @@ function showZoom() {
 function lay(layer, address, opacity) {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
-  if (layer.dataset.view !== String(state.view)) layer.style.backgroundImage = `url("${address}")`;
-  layer.dataset.view = state.view;
+  if (layer.dataset.shown !== String(state.view)) layer.style.backgroundImage = `url("${address}")`;
+  layer.dataset.shown = state.view;
   layer.style.opacity = opacity;
 }
 
@@ -180,7 +181,8 @@ function set(name, value) {
   if (name === "order") orderStrip();
   if (name === "scheme") document.documentElement.className = value;
   if (name === "left" || name === "right") {
-    if (value >= FIRST_RESULT && state.result !== value) showResult(value);
+    const result = [state.right, state.left].find((source) => source >= FIRST_RESULT);
+    if (result !== undefined && result !== state.result) showResult(result);
     if (solid) load(solid).then(show);
   }
   show();
