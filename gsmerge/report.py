@@ -7,6 +7,7 @@ import hashlib
 import html
 import io
 import json
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -159,7 +160,7 @@ def html_table(rows: Sequence[Sequence[str]]) -> str:
 
 def summary_lines(document: Mapping[str, Any]) -> list[str]:
     """Return the closing lines of ``compact``: the result, each coarser level, and the curve if it was measured."""
-    return [summary_line(document), *level_lines(document), *curve_lines(document["choices"].get("curve", []))]
+    return [summary_line(document), *level_lines(document), *curve_lines(document)]
 
 
 def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
@@ -183,7 +184,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
     table = [f"  {name:9}  {old:>12}  {new:>12}  {remark}".rstrip() for name, old, new, remark in rows]
-    curve = curve_lines(document["choices"].get("curve", []))
+    curve = curve_lines(document)
     cameras = document.get("viewer_cameras")
     last = [] if cameras is None else [f"  cameras    {cameras}"]
     last += [] if next_step is None else [f"  next       {next_step}"]
@@ -204,14 +205,21 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def curve_lines(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the scene's curve as a small table: quality of short fits on held-out parts of the photos."""
+def curve_lines(document: Mapping[str, Any]) -> list[str]:
+    """Return the scene's curve as a small table: quality of short fits on held-out parts of the photos.
+
+    The row nearest the number of Gaussians in the result is marked; the result may lie between two rows.
+    """
+    points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
         return []
     perceptual = points[0]["lpips"] is not None
     head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}" + ("  LPIPS (AlexNet)" if perceptual else "")
+    nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(count, 1))))
     rows = [
-        f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}" + (f"  {p['lpips']:5.3f}" if perceptual else "")
+        f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}"
+        + (f"  {p['lpips']:5.3f}" if perceptual else "")
+        + (f"  <- the result has {count:,}" if p is nearest else "")
         for p in points
     ]
     return ["after short fits, on parts of the photos that they left out:", head, *rows]

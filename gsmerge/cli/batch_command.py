@@ -140,12 +140,11 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
                 print("\n".join(map(one_line, summary_lines(totals, path))))
     worse = ""
     if totals.worse:
-        scene, why = totals.worse[0]
-        worse = f"{totals.num_worse} of {totals.total} results show their photos worse than the input; the first:"
-        worse = f"{worse} {scene}: {why}"
+        worse = f"{totals.num_worse} of {totals.total} results show their photos worse than the input"
+        worse += _first(totals.worse, listed=not args.silent)
     if worse and not args.strict:
         say_warning(worse, quiet=args.silent)
-    check_failures(totals, "scenes")
+    check_failures(totals, "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
     if worse and args.strict:
@@ -173,17 +172,21 @@ def run_jobs(
             totals.add(record)
             if lines is not None:
                 print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
-            failed = f", {totals.counts['failed']} failed" if totals.counts["failed"] else ""
-            why = f": {record['error']}" if record["error"] else ""
-            progress(f"{record[totals.name]} {record['status']}{why}{failed}", totals.ended, totals.total)
+            why, num_failed = record["error"] or "", totals.counts["failed"]
+            failed = f", {num_failed} failed" if num_failed and not why else ""
+            progress(f"{record[totals.name]} {record['status']}{failed}", totals.ended, why)
 
 
-def check_failures(totals: Totals, unit: str) -> None:
-    """Raise BatchError, with the first reason, if a job failed."""
+def check_failures(totals: Totals, unit: str, *, listed: bool = False) -> None:
+    """Raise BatchError if a job failed, with the first reason unless the failures were ``listed``."""
     num_failed = totals.counts["failed"]
     if num_failed:
-        scene, why = totals.failures[0]
-        raise BatchError(f"{num_failed} of {totals.total} {unit} failed; the first: {scene}: {why}")
+        raise BatchError(f"{num_failed} of {totals.total} {unit} failed{_first(totals.failures, listed=listed)}")
+
+
+def _first(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
+    scene, why = reasons[0]
+    return "" if listed else f"; the first: {scene}: {why}"
 
 
 def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say_notes
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.errors import SceneError
 
 
@@ -17,10 +17,14 @@ from gsmerge.errors import SceneError
 )  # fmt: skip
 def check(args: opt.Args) -> None:
     """Read files to their ends and say what is wrong: counts, NaN, ranges, checksums."""
-    from gsmerge.file_checks import check_content
+    from gsmerge.file_checks import FileCheck, check_content
     from gsmerge.report import document_head
 
-    checks = [check_content(path) for path in args.paths]
+    checks = list[FileCheck]()
+    with stage_progress(quiet=args.silent) as progress:
+        for path in args.paths:
+            progress(f"check: {path.name}", len(checks), len(args.paths))
+            checks.append(check_content(path))
     wrong = [result for result in checks if result.problems]
     notes = [f"{result.path}: {note}" for result in checks for note in result.notes]
     say_notes(notes, quiet=args.silent)

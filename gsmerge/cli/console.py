@@ -15,6 +15,10 @@ from typing import Any
 Progress = Callable[[str, int, int], None]
 
 MAX_LINE = 5000  # characters
+SHORT = 5  # seconds: what is left is shown from so many on
+OPENING = "start ..."  # on a terminal until a command has its first line or bar
+
+_opening: list[str] = []  # what stands on the terminal's last line, to be erased
 
 
 def one_line(text: str) -> str:
@@ -23,9 +27,29 @@ def one_line(text: str) -> str:
     return clean if len(clean) <= MAX_LINE else f"{clean[: MAX_LINE // 2]} ... {clean[-MAX_LINE // 2 :]}"
 
 
+@contextmanager
+def opening_line(*, quiet: bool) -> Iterator[None]:
+    """Show at once on a terminal, unless ``quiet``, that a command runs: imports alone may take a second."""
+    with suppress(OSError):
+        if not quiet and sys.stderr.isatty():
+            _opening.append(f"{OPENING:>16}")
+            print(_opening[0], end="", file=sys.stderr, flush=True)
+    try:
+        yield
+    finally:
+        _erase_opening()
+
+
+def _erase_opening() -> None:
+    while _opening:
+        with suppress(OSError):
+            print("\r" + " " * len(_opening.pop()), end="\r", file=sys.stderr, flush=True)
+
+
 def say(message: str, *, quiet: bool = False) -> None:
     """Print one status line on stderr unless ``quiet``; ignore a closed stderr."""
     if not quiet:
+        _erase_opening()
         with suppress(OSError):
             print(one_line(message), file=sys.stderr, flush=True)
 
@@ -41,6 +65,7 @@ def say_warning(text: str, *, quiet: bool = False) -> None:
     """Print a warning on stderr unless ``quiet``, in red where it is a terminal with colours."""
     start, end = ("\033[31m", "\033[0m") if _has_colors(sys.stderr) else ("", "")
     if not quiet:
+        _erase_opening()
         with suppress(OSError):
             print(f"{start}gsmerge: warning: {one_line(text)}{end}", file=sys.stderr, flush=True)
 
@@ -70,6 +95,7 @@ def print_document(
     """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break lines for a terminal."""
     from gsmerge.report import to_json
 
+    _erase_opening()
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
@@ -96,6 +122,7 @@ def _terminal(*, quiet: bool) -> Any:
         return None
     from rich.console import Console
 
+    _erase_opening()
     console = Console(stderr=True)
     console.width = max(20, console.width - len("^C") - 1)  # which the terminal prints, and which must not begin a line
     return console if console.is_terminal else None
@@ -115,9 +142,16 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
     from gsmerge.runtime.record import STAGES
 
+    class TimeLeft(rich.ProgressColumn):
+        max_refresh = 0.5
+
+        def render(self, task: rich.Task) -> str:
+            seconds = task.time_remaining
+            return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
+
     columns = (
         rich.TextColumn("{task.description:>12}"), rich.BarColumn(16), rich.TimeElapsedColumn(),
-        rich.TextColumn("{task.fields[count]}"), rich.TextColumn("{task.fields[detail]}"),
+        rich.TextColumn("{task.fields[count]}"), TimeLeft(), rich.TextColumn("{task.fields[detail]}"),
     )  # fmt: skip
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
@@ -156,24 +190,39 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 
 
 @contextmanager
-def total_progress(total: int, *, quiet: bool) -> Iterator[Progress]:
-    """Show one bar for many runs on stderr: done of total, time left; a line per run without a terminal.
+def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, str], None]]:
+    """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Yields ``(text, done, total) -> None``.
+    Without a terminal, a line for each run. Yields ``(text, done, failure) -> None``; ``failure`` is empty after a run
+    that succeeded.
     """
     console = _terminal(quiet=quiet)
     if console is None:
-        yield lambda text, done, total: say(f"{done}/{total} {text}", quiet=quiet)
+
+        def print_run(text: str, done: int, failure: str) -> None:
+            say(f"{done}/{total} {text}{f': {failure}' if failure else ''}", quiet=quiet)
+
+        yield print_run
         return
     from rich import progress as rich
+    from rich.console import Group
+    from rich.live import Live
+    from rich.text import Text
 
     columns = (
-        rich.BarColumn(), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
+        rich.BarColumn(16), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
         rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
     )  # fmt: skip
-    with rich.Progress(*columns, console=console, transient=True) as bars:
+    bars, last = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
+    with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):
         task = bars.add_task("", total=total)
-        yield lambda text, done, total: bars.update(task, completed=done, total=total, description=one_line(text))
+
+        def move(text: str, done: int, failure: str) -> None:
+            bars.update(task, completed=done, description=one_line(text))
+            if failure:
+                last.plain = one_line(f"last failure: {failure}")
+
+        yield move
 
 
 def duration(seconds: float) -> str:

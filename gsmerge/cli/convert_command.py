@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say_notes
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs
 from gsmerge.errors import UsageError
 
@@ -33,12 +33,14 @@ def convert(args: opt.Args) -> None:
     check_outputs((output,), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
     check_format(output, writing, levels=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
+    from gsmerge.runtime.record import record_run
 
     options = ConvertOptions(
         inputs, output, args.cameras, args.images, args.opacity, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full", spz_version=writing.spz_version,
         overwrite=args.overwrite,
     )  # fmt: skip
-    document = convert_files(options)
+    with stage_progress(quiet=args.silent) as progress, record_run(progress):
+        document = convert_files(options)
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document
+from gsmerge.cli.console import print_document, stage_progress
 
 
 @opt.command(opt.SCENE, opt.READING, "masks threads")
@@ -13,8 +13,10 @@ def inspect(args: opt.Args) -> None:
     from gsmerge.measure.inspect import inspect as inspect_scene
     from gsmerge.measure.inspect import inspection_lines
     from gsmerge.report import document_head
+    from gsmerge.runtime.record import record_run
 
     places = {"cameras": args.cameras, "images": args.images, "masks": args.masks}
-    facts = inspect_scene(args.scene, **places, opacity=args.opacity, threads=args.threads, **vars(hints))
+    with stage_progress(quiet=args.silent) as progress, record_run(progress):
+        facts = inspect_scene(args.scene, **places, opacity=args.opacity, threads=args.threads, **vars(hints))
     document, lines = {**document_head(), **facts}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
+from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
@@ -234,7 +235,9 @@ def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[
         @wraps(function)
         def run(**values: Any) -> None:
             plain = {name: value.value if isinstance(value, Enum) else value for name, value in values.items()}
-            function(Args(**plain))
+            args = Args(**plain)
+            with opening_line(quiet=args.silent):
+                function(args)
 
         run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
         run.__annotations__ = {}

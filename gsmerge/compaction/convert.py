@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.io import (
+    GaussianFile,
     atomic_outputs,
     file_notes,
     lost_harmonics,
@@ -31,6 +32,7 @@ from gsmerge.io.formats.write import add_levels
 from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.report import document_head, human_bytes
+from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.files import result_cameras
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
@@ -68,7 +70,10 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     """
     ending = output_format(options.output, options.spz_version, levels=True).ending
     with use_threads():
-        files = [read_gaussians(path, opacity=options.opacity) for path in options.inputs]
+        files, steps = list[GaussianFile](), len(options.inputs) + 1
+        for path in options.inputs:
+            report_progress(f"convert: {path.name}", len(files), steps)
+            files.append(read_gaussians(path, opacity=options.opacity))
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
@@ -90,6 +95,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     names = () if stored is None else stored.names
     if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
         comments += camera_comments(moved, names)
+    report_progress(f"convert: {options.output.name}", steps - 1, steps)
     num_bytes, beside = _write(options, ending, gaussians, moved, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]

@@ -33,6 +33,7 @@ SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to 
 HOLDOUT = 0.1  # share of the photos' blocks
 NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
 PERCEPTUAL_SIDE = 64  # pixels, at least
+TRIED = "curve: what each count brings"  # progress
 RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
 SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
@@ -148,11 +149,12 @@ def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[i
         photos = photos[prepared.photo_views]
         weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
+    report_progress(TRIED, 0, len(counts))
     for count in counts:
-        report_progress("curve: what each count brings", len(points), len(counts))
         with record_part(silent=True):
             gaussians = build(prepared, quick, count).gaussians
         points.append(_point(count, gaussians, photos, weights, short.tuning.min_gain))
+        report_progress(TRIED, len(points), len(counts))
     return points
 
 

@@ -20,7 +20,7 @@ from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
 from gsmerge.plan import plan_whole, stands_alone
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
-from gsmerge.runtime.record import record_part
+from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
@@ -93,8 +93,12 @@ def inspect(
     read_hints = make_hints(hints)
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads(threads):
+        report_progress("inspect: reading", 0, 3)
         ply = read_rows(files, opacity=opacity, hints=read_hints)
-        document: dict[str, Any] = finite(_describe_file(ply) | _describe_views(ply, files, read_hints))
+        report_progress("inspect: Gaussians", 1, 3)
+        described = _describe_file(ply)
+        report_progress("inspect: views", 2, 3)
+        document: dict[str, Any] = finite(described | _describe_views(ply, files, read_hints))
         document["notes"] = [*document["notes"], *degree_notes(ply.info)]
     return document
 

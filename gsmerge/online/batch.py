@@ -73,6 +73,11 @@ class Batch:
         """The canonical scene of the batch."""
         return self.prepared.scene
 
+    @property
+    def num_new(self) -> int:
+        """Number of input Gaussians for the share of views that are new: a state counts the input of a view once."""
+        return round(self.prepared.input_scene.num_gaussians * float(self.is_new.mean()))
+
 
 def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online: OnlineOptions, max_k: int) -> Batch:
     """Make a batch: resize its photos to those of the state, and find out which views are new."""

@@ -86,6 +86,10 @@ def extend(
         if keeps_latents(plan) and not has_latents:
             note("the state holds no latents: groups of this batch are decoded when they enter")
         batch = make_batch(state, prepared, plan, online, max_k)
+        if not batch.is_new.all():
+            note(
+                f"views with the cameras of earlier ones, which count once: {sum(~batch.is_new)} of {len(batch.is_new)}"
+            )
         state, counts = _add_batch(state, batch, LATENTS if has_latents else MOMENTS, count)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(online)
@@ -148,7 +152,7 @@ def _with_views(state: OnlineState | None, groups: GroupSet, batch: Batch) -> On
         groups=groups,
         kept=Gaussians.concat(kept) if kept else None,
         cameras=concat_cameras(state.cameras, cameras),
-        settings=replace(state.settings, num_input=state.settings.num_input + input_scene.num_gaussians, k=k),
+        settings=replace(state.settings, num_input=state.settings.num_input + batch.num_new, k=k),
     )
 
 

@@ -83,6 +83,7 @@ def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path
     assert outcome.code == 5
     assert names(outcome.out, "5 scenes", "0 done", "4 skipped", "1 failed")
     assert "failed: " in outcome.out
+    assert "truncated" not in outcome.err.splitlines()[-1]  # which was said before
     assert len([line for line in outcome.err.splitlines() if "warning: " not in line]) == 1 + 5 + 1
     assert names(outcome.err, "1 of 5")
     assert results(out) == before

@@ -99,7 +99,7 @@ def test_what_a_grid_leaves_behind(results: Path) -> None:
     assert first.seconds == 0
     assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
     page = (results / "out" / "index.html").read_text()
-    assert "3 runs on 1 scene(s): room" in page
+    assert "4 runs on 1 scene(s): room" in page
     assert page.count('<input type="range"') == 2
     assert len((results / "out" / "runs.csv").read_text().splitlines()) == 1 + 4
     names = {path.name for path in (results / "out" / "charts").iterdir()}

@@ -9,6 +9,7 @@ from gsmerge.report import csv_text, human_bytes
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import (
     METRICS,
+    MIN_SCENES,
     PARTS,
     Interval,
     Results,
@@ -38,7 +39,7 @@ def make_page(
     failed = [record for record in records if record.error is not None]
     scenes = list(dict.fromkeys(record.scene for record in records))
     names = ", ".join(scenes[:12]) + (", ..." if len(scenes) > 12 else "")
-    words = f"{len(results.runs) + len(failed)} runs on {len(scenes)} scene(s): {names}"
+    words = f"{len(records)} runs on {len(scenes)} scene(s): {names}"
     return render_template(
         "charts.html",
         policy=PICTURES,
@@ -58,7 +59,7 @@ def make_page(
 
 def _interval(value: Interval, digits: int) -> str:
     half = value.high - value.mean
-    return f"{value.mean:.{digits}f}" + (f" ± {half:.{digits}f}" if value.count > 1 else "")
+    return f"{value.mean:.{digits}f}" + (f" ± {half:.{digits}f}" if value.count >= MIN_SCENES else "")
 
 
 def _mean(group: Sequence[RunRecord], name: str) -> float | None:

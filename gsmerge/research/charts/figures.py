@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,14 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.io import atomic_output
 from gsmerge.measure.speed import break_even
-from gsmerge.research.charts.lines import METRICS, PARTS, Line, Results, make_lines, size_label
+from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results, make_lines, size_label
 from gsmerge.research.charts.measure_run import INPUT, SCORING, SEGMENTATIONS, SHARES
 from gsmerge.runtime.record import STAGES
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn
 MIN_GAIN = 0.05  # share of the render time; smaller gains are noise
 MIN_STAGE = 0.03  # share of the longest bar; shorter stages are shown together
-MIN_SCENES = 3  # scenes that an interval is drawn from; that of two scenes is too wide to be of use
+MAX_TICKS, SAME_SIZE = 8, 1.15  # ticks at sizes; factor between the costs of results of one size
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 KEY_WIDTH, KEY_LINE = 2.3, 0.135  # of the key: inches, inches per line
@@ -78,6 +78,7 @@ class Figure:
     rows: tuple[tuple[str, ...], ...]  # of the same
     panels: tuple[Panel, ...] = ()  # side by side
     log: str = ""  # axis that is logarithmic: x, y or none
+    labelled: bool = False  # whether the sizes stand at the points of our first line
     bars: Mapping[str, Sequence[float]] = field(default_factory=dict)  # instead of panels: parts of each row's bar
 
 
@@ -99,7 +100,7 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
     if not panels:
         return None
     rows = [
-        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *(f"{y:.5g}" for y in astuple(point.y)[:3]))
+        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *_numbers(point.y))
         for panel in panels
         for line in panel.lines
         for point in line.points
@@ -116,6 +117,12 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
         words += " One line for each method; the table has all."
         panels = [replace(panel, lines=tuple(line for line in panel.lines if line.name in kept)) for panel in panels]
     return Figure(name, title, f"{caption} {words}", x_label, head, tuple(rows), tuple(panels), log)
+
+
+def _numbers(interval: Interval) -> list[str]:
+    """Write a mean and the ends of its interval, which few scenes do not have."""
+    ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
+    return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 
 
 def choose_lines(panel: Panel) -> set[str]:
@@ -145,7 +152,8 @@ def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]
     title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
     caption = f"Quality against {described}. Measured on {PARTS[results.part]}."
-    return _curves(name, title, caption, label, panels, "x")
+    figure = _curves(name, title, caption, label, panels, "x")
+    return figure and replace(figure, labelled=cost == "seconds")
 
 
 def _size_words(results: Results) -> str:
@@ -284,16 +292,11 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
         if panel.reference is not None:
             axes.axhline(panel.reference, **{**styles[INPUT], "marker": ""})
         arrow = {True: " ↑", False: " ↓", None: ""}[panel.higher]
-        axes.set(xlabel=figure.x_label, ylabel=panel.y_label + arrow)
-        ticks = sorted({point.x for line in panel.lines for point in line.points})
-        if figure.log:
-            axes.set(**{f"{figure.log}scale": "log"})
-            axis = axes.xaxis if figure.log == "x" else axes.yaxis
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
-            axis.set_minor_locator(NullLocator())
-        if figure.log != "x" and len(ticks) <= 8:
-            axes.set_xticks(ticks)
+        labels = {"x": figure.x_label, "y": panel.y_label + arrow}
+        axes.set(**{f"{axis}label": text + ", log scale" * (axis == figure.log) for axis, text in labels.items()})
+        _set_ticks(axes, _size_ticks(panel), figure.log)
+        if figure.labelled:
+            _label_sizes(axes, panel)
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
     width, height = drawing.get_size_inches()
@@ -303,6 +306,36 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
         loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
     )  # fmt: skip
     return drawing
+
+
+def _set_ticks(axes: Axes, sizes: Sequence[float], log: str) -> None:
+    """Put ticks at sizes where they are few, otherwise at round numbers; ``log``: the axis that is logarithmic."""
+    few = 0 < len(sizes) <= MAX_TICKS
+    if log:
+        axes.set(**{f"{log}scale": "log"})
+        axis = axes.xaxis if log == "x" else axes.yaxis
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
+        axis.set_minor_locator(NullLocator())
+    if few:
+        axes.set_xticks(sizes, [f"{size:.2g}" if size < 100 else f"{size:,.0f}" for size in sizes])
+
+
+def _size_ticks(panel: Panel) -> list[float]:
+    """Return the mean cost of each size; none where the costs of a size differ."""
+    costs = dict[str, list[float]]()
+    for point in (point for line in panel.lines for point in line.points):
+        costs.setdefault(point.label, []).append(point.x)
+    same = all(max(each) < SAME_SIZE * min(each) for each in costs.values())
+    return sorted(math.exp(float(np.mean(np.log(each)))) for each in costs.values()) if same else []
+
+
+def _label_sizes(axes: Axes, panel: Panel) -> None:
+    """Write the sizes at the points of our first line."""
+    for point in next((line.points for line in panel.lines if line.ours and len(line.points) > 1), ()):
+        axes.annotate(
+            _plain(point.label), (point.x, point.y.mean), (0, -9), textcoords="offset points", ha="center", fontsize=6
+        )
 
 
 def _plain(name: str) -> str:

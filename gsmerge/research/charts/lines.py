@@ -16,6 +16,7 @@ from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, RunRecord
 from gsmerge.settings.compact import OURS
 
 LEVEL = 0.95  # confidence of the intervals
+MIN_SCENES = 3  # scenes that an interval is shown of; that of two scenes is too wide to be of use
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have
 MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
 TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes

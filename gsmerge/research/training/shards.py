@@ -76,31 +76,48 @@ def prepare_shards(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
-    lists = []
-    for number, scene in enumerate(part := processes.share(scenes)):
-        lists.append(_scene_shards(scene, options, folder, report))
-        if report:
-            report("prepare", number + 1, len(part))
+    lists, part = list[list[Shard]](), processes.share(scenes)
+    for number, scene in enumerate(part):
+        move = _in_all(report, sum(map(len, lists)), len(part) - number)
+        lists.append(_scene_shards(scene, options, folder, move))
     return [shard for shards in processes.gather(lists) for shard in shards]
 
 
-def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Report | None) -> list[Shard]:
+def _in_all(report: Report | None, before: int, scenes: int) -> Report:
+    """Return a report of a scene's examples as a part of all: so many ``before``, then as many of each scene."""
+
+    def move(text: str, done: int, count: int) -> None:
+        if report:
+            report(f"examples: {text}", before + done, before + scenes * count)
+
+    return move
+
+
+def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Report) -> list[Shard]:
     key, name = scene_key(scene, options), scene_name(scene)
     record = folder / f"{key[:32]}.json"
     hashes = _read_record(record)
     if hashes is None:
-        hashes = {}
-
-        def fitted(step: int, steps: int) -> None:
-            if report:
-                report(f"fit {name}", step, steps)
-
-        for label, make in make_examples(scene, options, fitted):
-            path = folder / f"{key[:32]}-{label}.safetensors"
-            hashes[path.name] = _content_hash(path) or write_shard(path, make())
+        hashes = _make_shards(scene, options, folder / key[:32], report)
         with atomic_output(record, overwrite=True) as temporary:
             temporary.write_text(json.dumps(hashes, indent=1) + "\n")
     return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
+
+
+def _make_shards(scene: Path, options: TrainOptions, start: Path, report: Report) -> dict[str, str]:
+    """Write those examples of a scene that are missing, in files that begin with ``start`` -> hash of each by name."""
+    hashes, count, name = dict[str, str](), 0, scene_name(scene)
+
+    def move(step: int, steps: int) -> None:
+        report(f"{name}, fit {step} of {steps}" if steps else name, len(hashes), count)
+
+    move(0, 0)
+    for label, number, make in make_examples(scene, options, move):
+        count = number
+        move(0, 0)
+        path = start.with_name(f"{start.name}-{label}.safetensors")
+        hashes[path.name] = _content_hash(path) or write_shard(path, make())
+    return hashes
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:

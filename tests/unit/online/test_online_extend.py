@@ -108,6 +108,15 @@ def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: OnlineState) 
     same_state(first, before)
 
 
+def test_views_that_come_again_count_once(pairs: list[Scene], first: OnlineState) -> None:
+    state, report = extend(first, pairs[0], options())
+    assert state.settings.num_input == first.settings.num_input
+    assert len(state.cameras) == len(first.cameras)
+    assert noted(report.notes, "count once", "2 of 2")
+    _, report = extend(first, pairs[1], options())
+    assert not noted(report.notes, "count once")
+
+
 def test_tensors_too(scene: Scene) -> None:
     given = replace(scene, gaussians=scene.gaussians.to("cpu"), cameras=scene.cameras.to("cpu"))
     same_state(state_of(fed([given])), state_of(fed([scene])))

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import pytest
 from experiments import make_grid, make_proxies, make_record
+from matplotlib.axes import Axes
 
 from gsmerge.research.charts import require_matplotlib
 from gsmerge.research.charts.figures import (
@@ -118,6 +119,36 @@ def test_of_many_lines_one_for_each_method_is_drawn() -> None:
     assert len(figure.panels[0].lines) == 1
     assert figure.caption.endswith("One line for each method; the table has all.")
     assert len({row[1] for row in figure.rows}) == MAX_LINES + 1
+
+
+def axes_of(figure: Figure) -> Axes:
+    with matplotlib.rc_context(RC):
+        drawing = draw_curves(figure, line_styles((line.name, line.ours) for line in figure.panels[0].lines))
+        drawing.draw_without_rendering()
+    return drawing.axes[0]
+
+
+def test_ticks_are_at_the_sizes_and_a_logarithmic_axis_says_so() -> None:
+    """Over time, where each method has costs of its own, ours has the sizes at its points."""
+    sizes = ("1%", "4%", "10%")
+    records = [
+        replace(make_record(scene, method, {"budget": size}), count=round(120 * float(size[:-1]) * wobble))
+        for scene in ("fern", "fox")
+        for method, wobble in (("gsmerge", 1.0), ("voxel", 1.02))
+        for size in sizes
+    ]
+    seconds, ratio = (f for f in figures_of(records) if f.name in ("quality-seconds", "quality-ratio"))
+    assert [text.get_text() for text in axes_of(ratio).get_xticklabels()] == ["1", "4", "10"]
+    assert [text.get_text() for text in axes_of(seconds).texts] == list(sizes)
+    assert not list(axes_of(ratio).texts)
+    for figure in (seconds, ratio):
+        assert axes_of(figure).get_xlabel().endswith("log scale")
+        assert "log" not in axes_of(figure).get_ylabel()
+
+
+def test_two_scenes_have_no_interval_in_the_table() -> None:
+    records = [make_record(scene, "gsmerge", {"budget": "1%"}) for scene in ("fern", "fox")]
+    assert all(row[-2:] == ("", "") for row in figures_of(records)[0].rows)
 
 
 def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,7 +97,7 @@ def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monk
         pass
 
     def watch(*arguments: object) -> Iterator[object]:
-        for label, make in make_each(*arguments):
+        for label, count, make in make_each(*arguments):
 
             def counted(label: str = label, make: object = make) -> Example:
                 if len(made) == stop:
@@ -105,7 +105,7 @@ def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monk
                 made.append(label)
                 return make()
 
-            yield label, counted
+            yield label, count, counted
 
     monkeypatch.setattr("gsmerge.research.training.shards.make_examples", watch)
     options, stop = replace(PAPER, densities=(0.05, 0.1)), 3
@@ -113,8 +113,12 @@ def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monk
         prepare_shards(scenes, options, tmp_path)
     assert len(made) == 3
     stop = 99
-    shards = prepare_shards(scenes, options, tmp_path)
+    moves: list[tuple[str, int, int]] = []
+    shards = prepare_shards(scenes, options, tmp_path, report=lambda *move: moves.append(move))
     assert len(made) == len(shards) == 6
+    assert [done for _, done, count in moves if count] == sorted(done for _, done, count in moves if count)
+    assert moves[-1][1:] == (5, 6)  # the last of six is being made
+    assert all(text.startswith("examples: ") for text, _, _ in moves)
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     assert prepare_shards(scenes, options, tmp_path) == shards
     assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == times

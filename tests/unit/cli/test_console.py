@@ -1,0 +1,77 @@
+"""What a terminal shows while a command runs."""
+
+from __future__ import annotations
+
+import io
+import re
+from contextlib import redirect_stderr
+
+import pytest
+
+from gsmerge.cli.console import OPENING, opening_line, print_document, say, stage_progress, total_progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+    def lines(self) -> list[str]:
+        """What was ever printed, in lines, without colours and movements of the cursor."""
+        return [line.strip() for line in re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue()))]
+
+
+@pytest.fixture(autouse=True)
+def terminal_of_100_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def test_a_terminal_shows_at_once_that_a_command_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    with redirect_stderr(Terminal()) as terminal, opening_line(quiet=False):
+        assert terminal.lines() == [OPENING]
+        say("read")
+        print_document({}, "data", as_json=False)
+        say("done")
+    assert [line for line in terminal.lines() if line] == [OPENING, "read", "done"]
+    assert terminal.getvalue().count("\r") == 2  # erased once
+    assert capsys.readouterr().out == "data\n"
+
+
+@pytest.mark.parametrize(("stream", "quiet"), [(Terminal(), True), (io.StringIO(), False)], ids=["quiet", "pipe"])
+def test_nothing_is_shown_where_nobody_looks(stream: io.StringIO, quiet: bool) -> None:
+    with redirect_stderr(stream), opening_line(quiet=quiet):
+        assert stream.getvalue() == ""
+    assert stream.getvalue() == ""
+
+
+def test_bars_of_stages_replace_the_first_line() -> None:
+    with redirect_stderr(Terminal()) as terminal, opening_line(quiet=False), stage_progress(quiet=False) as progress:
+        progress("examples: room", 2, 6)
+    bars = [line for line in terminal.lines() if line.startswith("examples")]
+    assert "2/6" in bars[-1]
+    assert bars[-1].endswith("room")
+
+
+def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:
+    why = "scenes/room/scene.ply: truncated " + "or damaged " * 20
+    with redirect_stderr(Terminal()) as terminal, total_progress(3, quiet=False) as progress:
+        progress("kitchen done", 1, "")
+        progress("room failed", 2, why)
+        progress("garden done, 1 failed", 3, "")
+    lines = terminal.lines()
+    bars = [line for line in lines if re.search(r"\d/3 ", line)]
+    assert all(len(line) < 100 for line in lines)
+    assert all("left" in bar for bar in bars)  # not squeezed
+    assert bars[-1].endswith("garden done, 1 failed")
+    last = [line for line in lines if line.startswith("last failure: scenes/room")]
+    assert last
+    assert lines.index(bars[-1]) < len(lines) - 1 - lines[::-1].index(last[-1])
+
+
+def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with total_progress(2, quiet=False) as progress:
+        progress("room failed", 1, "no photos")
+        progress("garden done, 1 failed", 2, "")
+    assert capsys.readouterr().err == "1/2 room failed: no photos\n2/2 garden done, 1 failed\n"
