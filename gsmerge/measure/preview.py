@@ -176,7 +176,7 @@ class FfmpegWriter:
 
     def __init__(self, program: str, path: Path, size: tuple[int, int], fps: int) -> None:
         frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-")
-        colors = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")  # which players take for untold ones
+        colors = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")  # as players expect of large frames
         encoding = ("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4")
         command = (program, "-v", "quiet", "-y", *frames, *colors, *encoding, str(path))
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
