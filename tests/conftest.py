@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
+from browser import NO_BROWSER
 from floors import NUDGE, at_least_the_floor, nudged
 from scripts import load_script
 
@@ -37,6 +38,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "floor" in getattr(item, "fixturenames", ()):
             item.add_marker("floor")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Generator[None, None, None]:
+    """End with a line that nobody overlooks where the pages were not tried in a browser."""
+    yield
+    skipped = [one for one in terminalreporter.stats.get("skipped", ()) if NO_BROWSER in str(one.longrepr)]
+    if skipped:
+        files = " and ".join(sorted({one.nodeid.partition("::")[0] for one in skipped}))
+        terminalreporter.section("the pages were NOT tested", red=True, bold=True)
+        terminalreporter.line(
+            f"{len(skipped)} tests were skipped, {NO_BROWSER}: run .ci/chromium, then {files}", red=True
+        )
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
     FOLDER,
+    H264,
     MAX_VIDEO_PIXELS,
     Picture,
     contact_sheet,
@@ -307,7 +308,11 @@ def drawing_line(document: Mapping[str, Any]) -> str:
     if "frames" in document:
         line = f"{document['frames']} frames of {document['width']} x {document['height']}"
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""
-        return f"{line}, {document['encoding']}" if "encoding" in document else line
+        if "encoding" not in document:
+            return line
+        less_played = document["encoding"] != H264 and document["pictures"][0].lower().endswith(".mp4")
+        hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
+        return f"{line}, {document['encoding']}{hint}"
     line = f"{len(document['pictures'])} picture(s) of {len(document['views'])} views"
     if "superpixels" in document:
         line += f", {min(document['superpixels'])} to {max(document['superpixels'])} superpixels per view"

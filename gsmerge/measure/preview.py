@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import html
 import os
+import shutil
+import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -35,6 +37,7 @@ ENCODERS = {
     ".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")),
     ".webm": (("VP80", "VP8"), ("VP90", "VP9")),
 }
+H264 = "H.264"  # of .mp4 where the program ffmpeg is at hand: nearly every program plays it
 MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
 OPENCV = "opencv-contrib-python-headless"
 FOLDER = "name a folder instead, for one picture a frame"
@@ -168,6 +171,38 @@ def heat_map(levels: np.ndarray) -> Picture:
     return np.ascontiguousarray(colored[..., ::-1], np.uint8)
 
 
+class FfmpegWriter:
+    """Write frames as H.264 with the program ffmpeg, by the calls of :class:`cv2.VideoWriter`."""
+
+    def __init__(self, program: str, path: Path, size: tuple[int, int], fps: int) -> None:
+        frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-")
+        colors = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")  # as players expect of large frames
+        encoding = ("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4")
+        command = (program, "-v", "quiet", "-y", *frames, *colors, *encoding, str(path))
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+
+    def write(self, frame: np.ndarray) -> None:
+        """Add a frame ``[h,w,3]`` in the order blue, green, red."""
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):  # it has ended: the frames that are missing are counted later
+            self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
+
+    def release(self) -> None:
+        """Finish the file."""
+        with suppress(BrokenPipeError):
+            self.process.communicate()
+
+
+def find_ffmpeg() -> str | None:
+    """Find a program ffmpeg that encodes H.264 on the PATH; None if there is none."""
+    program = shutil.which("ffmpeg")
+    with suppress(OSError):
+        if program is not None:
+            listed = subprocess.run((program, "-hide_banner", "-encoders"), capture_output=True, check=False).stdout
+            return program if b" libx264 " in listed else None
+    return None
+
+
 def is_video(path: Path) -> bool:
     """Return whether a file name has the ending of a video format that can be written."""
     return path.suffix.lower() in ENCODERS
@@ -175,6 +210,8 @@ def is_video(path: Path) -> bool:
 
 def write_video(path: StrPath, frames: Iterable[Picture], fps: int, *, overwrite: bool = False) -> str:
     """Write pictures ``[h,w,3]`` of one size as a video, and return the name of its encoding.
+
+    It is H.264 in a ``.mp4`` where :func:`find_ffmpeg` finds a program for it, otherwise the first that OpenCV has.
 
     One frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since encodings have
     none. SceneError if OpenCV has no encoder for the name's ending, or the file cannot be written whole.
@@ -202,9 +239,11 @@ def _to_even(picture: Picture) -> Picture:
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
-def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple[cv2.VideoWriter, str]:
+def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
     """Open a file with the first encoder that there is; also return the name of its encoding."""
     height, width = first.shape[:2]
+    if path.suffix.lower() == ".mp4" and (program := find_ffmpeg()):
+        return FfmpegWriter(program, temporary, (width, height), fps), H264
     encoders = ENCODERS[path.suffix.lower()]
     for code, name in encoders:
         with _silent_stderr():

@@ -19,6 +19,7 @@ from gsmerge.io.photo_files import encode_indexed
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate, near_plane
 from gsmerge.measure.fog import ALL, Fog
+from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
 from gsmerge.raster import render
 from gsmerge.raster.photos import WHOLE
@@ -27,6 +28,7 @@ from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
+LPIPS = "alex"  # the network of LPIPS where its weights are installed: 0.05 s a picture, the other one takes 0.8 s
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
@@ -91,8 +93,13 @@ class ViewData:
 
     @property
     def start(self) -> int:
-        """Index of the view on which the page opens: the one of median score, or the first without scores."""
-        return (len(self.views) - 1) // 2 if self.scored else 0
+        """Index of the view on which the page opens: the one of median score, or the first without scores.
+
+        It is held out where there are such views, as the figures at the top are.
+        """
+        held_out = [i for i, view in enumerate(self.views) if view.held_out]
+        counted = held_out or range(len(self.views))
+        return counted[(len(counted) - 1) // 2] if self.scored else counted[0]
 
     @property
     def scored(self) -> bool:
@@ -130,7 +137,8 @@ def collect(
     def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
         stills[result, split, view] = encode_still(to_picture(image))
 
-    options = EvaluateOptions((), threads=threads)
+    nets = (LPIPS,) if lpips_available(LPIPS) else ()
+    options = EvaluateOptions(nets, threads=threads)
     evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=keep)
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}

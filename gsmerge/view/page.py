@@ -8,6 +8,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,7 @@ PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {sc
 # Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY = "{policy}"  # stands for it in the templates until the hashes are known
+NONE = "-"  # in place of a figure
 ENGINE = "vendor/spark-three.js.gz"
 
 
@@ -52,11 +54,14 @@ def view_page(data: ViewData) -> str:
     opened[left] = opened[right] = None
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
+    places = range(min(len(data.sides) - 1, 1), len(data.sides))
+    results = [(_unbroken(headline(data, place)), figures(data, place)) for place in places]
     return render_template(
         "view.html",
         policy=SOLID,
         data=data,
-        headline=headline(data),
+        results=results,
+        table=results_table(data),
         sources=sources,
         left=left,
         right=right,
@@ -64,7 +69,11 @@ def view_page(data: ViewData) -> str:
         json_data={
             "sources": sources,
             "photos": photos,
+            "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
+            "results": [
+                {"headline": line, "figures": [[figure.new, figure.better] for figure in row]} for line, row in results
+            ],
             "views": [_view(view) for view in data.shown],
         },
         stills=stills,
@@ -103,14 +112,14 @@ def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[s
     )  # fmt: skip
 
 
-def headline(data: ViewData) -> str:
-    """Write the headline: share of Gaussians and change of quality; for one scene alone its size."""
+def headline(data: ViewData, place: int = 1) -> str:
+    """Write the headline of a result: share of Gaussians and change of quality; for one scene alone its size."""
     before = data.sides[0]
     if len(data.sides) == 1:
         quality = before.mean.psnr
         has_quality = quality is not None and np.isfinite(quality)
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
-    after, reference = data.sides[1], PHOTOS if data.held_out else data.reference
+    after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
     return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr, reference)
 
 
@@ -126,6 +135,70 @@ def headline_of(num_before: int, num_after: int, old: float | None, new: float |
     return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
 
 
+@dataclass(frozen=True)
+class Figure:
+    """A figure at the top of the page, of the scene itself and of a result."""
+
+    label: str
+    old: str
+    new: str
+    better: bool  # than the scene's own
+
+
+def figures(data: ViewData, place: int) -> list[Figure]:
+    """Collect the figures at the top for one of the sides: size and mean quality."""
+    before, after = data.sides[0], data.sides[place]
+    sizes = [
+        Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", False),
+        Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
+    ]
+    views = "held-out photos" if data.held_out else "input photos" if data.reference == PHOTOS else data.reference
+    qualities = [
+        (f"PSNR, {views}", "psnr", before.mean, after.mean),
+        (f"SSIM, {views}", "ssim", before.mean, after.mean),
+    ]
+    if data.lacks_pixels:
+        label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
+        qualities.append((label, "psnr", before.covered, after.covered))
+    made = []
+    for label, name, *pair in qualities:
+        digits, unit = (2, " dB") if name == "psnr" else (3, "")
+        old, new = (getattr(quality, name) for quality in pair)
+        if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
+            better = place > 0 and old is not None and new is not None and old < new
+            made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, better))
+    return sizes + (made if data.scored else [])
+
+
+def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
+    """Make the table over all results: head and rows, without columns that have no figure."""
+    first = data.sides[0]
+    columns: dict[str, list[str]] = {
+        "": [side.name for side in data.sides],
+        "Gaussians": [f"{side.num_gaussians:,}" for side in data.sides],
+        "Share": [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides],
+        "File": [human_bytes(side.file_bytes) for side in data.sides],
+    }
+    for head, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips_alex", 3)):
+        columns[head] = [_number(getattr(side.mean, name), digits) for side in data.sides]
+    if data.lacks_pixels:
+        columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
+    for head, name in (("Near fog", "fog_near"), ("Far fog", "fog_far"), ("Holes", "holes")):
+        columns[head] = [_number(getattr(side.fog, name, None), 3) for side in data.sides]
+    filled = {head: cells for head, cells in columns.items() if set(cells) != {NONE}}
+    return list(filled), [list(row) for row in zip(*filled.values(), strict=True)]
+
+
+def _unbroken(text: str) -> str:
+    """Keep units on the lines of their figures."""
+    return text.replace(" dB", "\u00a0dB").replace(" %", "\u00a0%")
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Write a number; the PSNR of equal pictures, which is infinite, as none."""
+    return NONE if value is None or value == float("inf") else f"{value:.{digits}f}"
+
+
 def _view(view: PageView) -> dict[str, Any]:
     """Convert a view for the page's script: row-major world to camera, intrinsics in pixels."""
     camera = view.camera
@@ -138,7 +211,7 @@ def _view(view: PageView) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "distance": view.distance,
-        "scores": [[_finite(score.psnr), _finite(score.ssim)] for score in view.scores],
+        "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
     }
 
 
@@ -183,13 +256,10 @@ def _hashes(page: str, kind: str) -> list[str]:
 def _environment() -> jinja2.Environment:
     import jinja2
 
-    def number(value: float | None, digits: int) -> str:
-        return "-" if value is None or value == float("inf") else f"{value:.{digits}f}"
-
     loader = jinja2.PackageLoader("gsmerge.view")
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters |= {"bytes": human_bytes, "number": number}
+    made.filters |= {"bytes": human_bytes, "number": _number, "unbroken": _unbroken}
     made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
     return made

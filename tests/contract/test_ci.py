@@ -7,10 +7,12 @@ import re
 import shlex
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import typer.main
+from browser import NO_BROWSER, needs_browser
 from scripts import load_script
 
 from gsmerge import __version__
@@ -93,8 +95,9 @@ CHROMIUM = {
 }
 
 
+@pytest.mark.parametrize("ci", ["", "true"])
 @pytest.mark.parametrize("case", CHROMIUM)
-def test_a_browser_is_installed_where_that_is_allowed(case: str, tmp_path: Path) -> None:
+def test_a_browser_is_installed_where_that_is_allowed(case: str, ci: str, tmp_path: Path) -> None:
     programs, said, made = CHROMIUM[case]
     folder = tmp_path / "bin"
     install = f'[[ "$*" != *install* ]] || {{ echo > "{folder}/chromium"; /bin/chmod +x "{folder}/chromium"; }}'
@@ -102,11 +105,43 @@ def test_a_browser_is_installed_where_that_is_allowed(case: str, tmp_path: Path)
     for name, lines in programs.items():
         write_program(folder / name, lines.replace("{install}", install) or "true")
     command = [SHELL[0], str(ROOT / ".ci" / "chromium")]
-    done = subprocess.run(command, env={"PATH": str(folder)}, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    env = {"PATH": str(folder), "CI": ci}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    without = done.stdout.count("cannot run\n")
+    assert (done.returncode, done.stderr) == (without if ci else 0, "")
     assert said in done.stdout
-    assert done.stdout.count("no Chromium") == done.stdout.count("will be skipped\n") <= 1
+    assert done.stdout.count("no Chromium") == without <= 1
+    assert without == (not (folder / "chromium").exists())
     assert not made or Path(made.format(bin=folder)).exists()
+
+
+def test_without_a_browser_tests_are_skipped_aloud_and_fail_in_ci(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CI", raising=False)
+    mark = needs_browser(None).mark
+    assert (mark.args, mark.kwargs["reason"]) == ((True,), NO_BROWSER)
+    monkeypatch.setenv("CI", "true")
+    with pytest.raises(RuntimeError, match=NO_BROWSER):
+        needs_browser(None)
+    assert needs_browser("/usr/bin/chromium").mark.args == (False,)
+
+
+def test_the_end_of_a_run_says_what_was_not_tried_in_a_browser() -> None:
+    said: list[str] = []
+    skipped = [
+        SimpleNamespace(longrepr=("a.py", 1, f"Skipped: {why}"), nodeid="tests/a.py::b") for why in (NO_BROWSER, "slow")
+    ]
+    reporter = SimpleNamespace(
+        stats={"skipped": skipped},
+        section=lambda line, **_: said.append(line),
+        line=lambda line, **_: said.append(line),
+    )
+    conftest = load_script(ROOT / "tests" / "conftest.py")
+    list(conftest.pytest_terminal_summary(reporter))
+    assert "NOT tested" in said[0]
+    assert said[1].startswith("1 tests were skipped")
+    assert said[1].endswith("tests/a.py")
+    list(conftest.pytest_terminal_summary(SimpleNamespace(stats={})))
+    assert len(said) == 2
 
 
 def test_badges_say_what_the_project_says() -> None:

@@ -5,6 +5,8 @@ const FEWER = 0.5; // of the pixels per side: while the camera moves and frames 
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // names of renderers that draw on the processor
 const SLOW_FRAME = 90; // milliseconds
 const REST = 160; // milliseconds without a movement after which the camera is at rest
+const SOLID = 0.1; // least opacity of Gaussians that points and the frame count
+const FRAMED = 0.8; // of the Gaussians are in the picture: what lies far behind would make it small
 const GAIN_POINTS = 1.6; // pixels of the screen per point
 const HEADER = 16; // bytes of a .spz, followed here by four of the checksum of all
 const CHECKSUM = 4;
@@ -178,6 +180,54 @@ class SplatView {
     this.place(column(this.camera.matrix, 3).sub(this.target).multiplyScalar(factor).add(this.target));
   }
 
+  // Moves by multiples of the distance from the target, which comes along.
+  fly(right, up, ahead) {
+    const centre = column(this.camera.matrix, 3);
+    const distance = centre.distanceTo(this.target);
+    const shift = [right, up, -ahead].reduce((sum, by, axis) => sum.addScaledVector(column(this.camera.matrix, axis), by * distance), new Vendor.Vector3());
+    this.target.add(shift);
+    this.place(centre.add(shift));
+  }
+
+  // Steps to where most of a scene is in the picture, looking as before, and turns about its middle from then on.
+  frameAll(source) {
+    const places = [[], [], []];
+    this.results.get(source).mesh.forEachSplat((_, centre, scales, turn, opacity) => {
+      if (opacity >= SOLID) centre.toArray().forEach((value, axis) => places[axis].push(value));
+    });
+    if (!places[0].length) return;
+    const share = (values, part) => Float64Array.from(values).sort()[Math.floor(part * (values.length - 1))];
+    const middle = places.map((values) => share(values, 0.5));
+    const distances = places[0].map((_, i) => Math.hypot(...middle.map((value, axis) => places[axis][i] - value)));
+    const { width, height, K: [fx, fy] } = this.view;
+    const distance = share(distances, FRAMED) / Math.sin(Math.atan(Math.min(width / fx, height / fy) / 2));
+    this.target = new Vendor.Vector3(...middle);
+    this.place(this.target.clone().addScaledVector(column(this.camera.matrix, 2), distance));
+  }
+
+  // The point seen at a place of the picture, in shares of it: where half of the light is stopped; null where it is not.
+  pointAt(source, x, y) {
+    const { width, height, K: [fx, fy, cx, cy] } = this.view;
+    const ray = new Vendor.Vector3((x * width - cx) / fx, (cy - y * height) / fy, -1);
+    const toCamera = this.camera.matrix.clone().invert();
+    const met = [];
+    const point = new Vendor.Vector3();
+    this.results.get(source).mesh.forEachSplat((_, centre, scales, turn, opacity) => {
+      point.copy(centre).applyMatrix4(toCamera);
+      const depth = -point.z;
+      if (depth <= this.camera.near) return;
+      const size = (scales.x + scales.y + scales.z) / 3 + depth / fx; // at least a pixel
+      const off = Math.hypot(point.x - ray.x * depth, point.y - ray.y * depth) / size;
+      if (off < 3) met.push([depth, opacity * Math.exp(-off * off / 2)]);
+    });
+    let open = 1;
+    for (const [depth, opacity] of met.sort((a, b) => a[0] - b[0])) {
+      open *= 1 - opacity;
+      if (open < 0.5) return ray.multiplyScalar(depth).applyMatrix4(this.camera.matrix);
+    }
+    return null;
+  }
+
   place(centre) {
     this.camera.matrix.setPosition(centre);
     this.moved();
@@ -273,7 +323,7 @@ class SplatView {
     if (result.points) return result.points;
     const [places, colors] = [[], []];
     result.mesh.forEachSplat((_, centre, scales, turn, opacity, color) => {
-      if (opacity < 0.1) return;
+      if (opacity < SOLID) return;
       places.push(centre.x, centre.y, centre.z);
       colors.push(color.r, color.g, color.b);
     });

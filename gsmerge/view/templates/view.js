@@ -1,17 +1,19 @@
 "use strict";
-// Controls and stills. 3D (scene.js) is asked to draw what they say, and may never come.
+// What is shown, and where. Results (results.js) and gestures (gestures.js) change it; 3D (scene.js), which may never
+// come, draws it.
 
 const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0,
+  order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0, scheme: "",
+  result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
-const KEYS = { 1: "swipe", 2: "side", 3: "blink", 4: "difference" };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
-const [LOW, HIGH, FULL] = ["62vh", "max(62vh, 100vh - 12rem)", "100vh - 3.6rem"]; // most height: wide, upright, full screen
+const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
+const OUTLINES = 0.8; // opacity of superpixels' outlines
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
 let outlines = []; // per view the borders of its superpixels, where there are any
@@ -19,6 +21,7 @@ let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
 
+const clamp = (value, least, most) => Math.max(least, Math.min(most, value));
 const view = () => data.views[state.view];
 const inSolid = (source) => Boolean(state.solid && solid && solid.has(source));
 
@@ -57,15 +60,36 @@ function frame() {
   };
 }
 
+// As large as the window allows from where the stage begins, so that its lower edge is seen without scrolling.
 function fitStage() {
   const { width, height } = view();
   const side = state.mode === "side";
   stage.classList.toggle("stacked", side && stage.parentElement.clientWidth < NARROW && width > height);
   const stacked = stage.classList.contains("stacked");
-  const ratio = ((side && !stacked ? 2 : 1) * width) / ((stacked ? 2 : 1) * height);
-  stage.style.aspectRatio = String(ratio);
-  const most = document.fullscreenElement ? FULL : ratio < 1 ? HIGH : LOW;
-  stage.style.maxWidth = `calc((${most}) * ${ratio.toFixed(4)})`;
+  const above = stage.getBoundingClientRect().top + (document.fullscreenElement ? 0 : window.scrollY);
+  stage.style.setProperty("--ratio", ((side && !stacked ? 2 : 1) * width) / ((stacked ? 2 : 1) * height));
+  stage.style.setProperty("--above", `${Math.ceil(above)}px`);
+}
+
+// Stills only: 3D goes nearer instead.
+function showZoom() {
+  const zoom = state.solid ? 1 : state.zoom;
+  const [x, y] = state.centre.map((at) => `${100 * (0.5 - zoom * at)}%`);
+  const pane = panes()[0].box[2] * stage.clientWidth;
+  stage.classList.toggle("zoomed", zoom > 1);
+  stage.classList.toggle("squares", (zoom * pane) / view().width >= PIXELS);
+  for (const [name, value] of [["--x", x], ["--y", y], ["--zoom", zoom]]) stage.style.setProperty(name, value);
+  id("back").hidden = state.atCamera && zoom === 1;
+  id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
+}
+
+// Lays a picture over a side: the photo, or outlines.
+function lay(layer, address, opacity) {
+  layer.hidden = !address || opacity === 0;
+  if (layer.hidden) return;
+  if (layer.dataset.shown !== String(state.view)) layer.style.backgroundImage = `url("${address}")`;
+  layer.dataset.shown = state.view;
+  layer.style.opacity = opacity;
 }
 
 function show() {
@@ -73,9 +97,11 @@ function show() {
   stage.classList.toggle("solid", Boolean(state.solid));
   stage.style.setProperty("--at", `${100 * state.at}%`);
   fitStage();
+  showZoom();
   const seen = panes().map((pane) => pane.source);
   const twice = state.left === state.right;
   const missing = [];
+  const plain = state.atCamera && state.mode !== "difference";
   for (const side of ["left", "right"]) {
     const source = state[side];
     const here = seen.includes(source) && !(twice && seen.length === 1 && side === "right");
@@ -85,6 +111,10 @@ function show() {
     picture.hidden = !here || drawn || !state.atCamera || (stills && !still);
     if (!picture.hidden && still && picture.src !== still) picture.src = still;
     picture.alt = data.sources[source].name;
+    const pane = id(`${side}-pane`);
+    pane.hidden = !here;
+    lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
+    lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
@@ -94,14 +124,6 @@ function show() {
   id("message").textContent = `${[...new Set(missing)].join(" and ")}: at the photos' cameras only`;
   id("handle").hidden = stage.dataset.mode !== "swipe";
   id("handle").setAttribute("aria-valuenow", Math.round(100 * state.at));
-  id("back").hidden = state.atCamera;
-  const photo = data.photos && stillOf(0);
-  id("overlay").hidden = !photo || !state.atCamera || state.overlay === 0;
-  if (!id("overlay").hidden) id("overlay").style.backgroundImage = `url("${photo}")`;
-  id("overlay").style.opacity = state.overlay;
-  const outline = outlines[state.view];
-  id("outlines").hidden = !outline || !state.atCamera || !state.outlines;
-  if (!id("outlines").hidden) id("outlines").style.backgroundImage = `url("${outline}")`;
   for (const button of document.querySelectorAll("[data-set]")) {
     button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
   }
@@ -111,7 +133,7 @@ function show() {
 
 // Greys out what has no effect now, and says why.
 function showLimits() {
-  const away = state.atCamera ? "" : "From the photo's camera only: press R";
+  const away = !state.atCamera ? "From the photo's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
   const flat = state.solid ? "" : none || "In 3D only";
   const outside = view().outside ? "No photo is outside" : "";
@@ -130,29 +152,9 @@ function grey(control, reason) {
   control.title = reason || "";
 }
 
-function showNumbers() {
-  const named = view();
-  const badge = document.createElement("em");
-  badge.className = "badge";
-  badge.textContent = named.held_out ? "held out" : "from outside";
-  id("view-name").replaceChildren(`${named.name} `, ...(named.held_out || named.outside ? [badge] : []));
-  const rows = named.scores.map(([psnr, ssim], i) => {
-    const row = document.createElement("tr");
-    const cells = [data.sources[i + Number(data.photos)].name, psnr === null ? "-" : psnr.toFixed(2), ssim === null ? "-" : ssim.toFixed(3)];
-    row.append(...cells.map((words) => {
-      const cell = document.createElement("td");
-      cell.textContent = words;
-      cell.title = words;
-      return cell;
-    }));
-    return row;
-  });
-  id("scores").replaceChildren(...rows);
-}
-
 // To the camera of a view, exactly.
 function jump(index) {
-  state.view = Math.max(0, Math.min(data.views.length - 1, index));
+  state.view = clamp(index, 0, data.views.length - 1);
   state.atCamera = true;
   for (const card of id("strip").children) {
     const current = Number(card.dataset.view) === state.view;
@@ -172,121 +174,28 @@ function stepBack() {
   jump(data.views.findIndex((one) => one.outside));
 }
 
-// The view that many cards further along the strip.
-function step(count) {
-  const cards = [...id("strip").children].sort((a, b) => a.style.order - b.style.order);
-  const at = cards.findIndex((card) => Number(card.dataset.view) === state.view);
-  const next = cards[Math.max(0, Math.min(cards.length - 1, at + count))];
-  jump(Number(next.dataset.view));
-}
-
 function set(name, value) {
   state[name] = value;
   if (name === "solid") chosen = true;
   if (name === "mode") state.other = false;
-  if (name === "order") for (const card of id("strip").children) card.style.order = value === "worst" ? card.dataset.view : card.dataset.place;
-  if (solid && (name === "left" || name === "right")) load(solid).then(show);
+  if (name === "order") orderStrip();
+  if (name === "scheme") document.documentElement.className = value;
+  if (name === "left" || name === "right") {
+    const result = [state.right, state.left].find((source) => source >= FIRST_RESULT);
+    if (result !== undefined && result !== state.result) showResult(result);
+    if (solid) load(solid).then(show);
+  }
   show();
 }
 
-const toggled = { solid: ["", "1"], shape: ["splats", "points"], frustums: ["", "1"] };
-function toggle(name) {
-  if (name === "solid" ? solid : state.solid) set(name, toggled[name][1 - toggled[name].indexOf(state[name])]);
-}
-
 function swipeTo(share) {
-  state.at = Math.max(0, Math.min(1, share));
+  state.at = clamp(share, 0, 1);
   show();
 }
 
 function toggleFull() {
   if (document.fullscreenElement) document.exitFullscreen();
   else if (document.fullscreenEnabled) stage.parentElement.requestFullscreen().catch((error) => say(error.message));
-}
-
-function onKey(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
-  const key = event.key.toLowerCase();
-  const actions = {
-    arrowleft: () => swipeTo(state.at - 0.02), arrowright: () => swipeTo(state.at + 0.02),
-    home: () => swipeTo(0), end: () => swipeTo(1), arrowup: () => step(-1), arrowdown: () => step(1),
-    b: stepBack, f: toggleFull, o: () => set("outlines", state.outlines ? "" : "1"), s: () => toggle("solid"), p: () => toggle("shape"), c: () => toggle("frustums"), r: () => jump(state.view),
-    " ": () => { state.other = true; show(); },
-  };
-  if (KEYS[key] && data.sources.length > 1) set("mode", KEYS[key]);
-  else if (actions[key] && !(key === " " && event.target.tagName === "BUTTON")) actions[key]();
-  else return;
-  event.preventDefault();
-}
-
-function listen() {
-  document.addEventListener("keydown", onKey);
-  document.addEventListener("keyup", (event) => {
-    if (event.key === " " && state.other && state.mode !== "blink") set("other", false);
-  });
-  document.addEventListener("click", (event) => {
-    const button = event.target.closest("[data-set]");
-    const card = event.target.closest("[data-view]");
-    if (button) set(button.dataset.set, button.dataset.value);
-    if (card) jump(Number(card.dataset.view));
-  });
-  for (const side of ["left", "right"]) id(`${side}-source`).addEventListener("input", (event) => set(side, Number(event.target.value)));
-  if (id("overlay-share")) id("overlay-share").addEventListener("input", (event) => set("overlay", event.target.value / 100));
-  id("back").addEventListener("click", () => jump(state.view));
-  id("outside").addEventListener("click", stepBack);
-  id("full").addEventListener("click", toggleFull);
-  document.addEventListener("fullscreenchange", () => {
-    id("full").textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";
-    show();
-  });
-  window.addEventListener("resize", show);
-  const still = window.matchMedia("(prefers-reduced-motion: reduce)");
-  blinking = setInterval(() => {
-    if (state.mode === "blink" && !still.matches && !document.hidden) set("other", !state.other);
-  }, BLINK);
-  listenToPointers();
-}
-
-// Handle, or anywhere in stills: the swipe. Elsewhere in 3D: one finger turns, two shift and zoom.
-function listenToPointers() {
-  const pointers = new Map();
-  let swiping = false;
-  const toShare = (event) => {
-    const box = stage.getBoundingClientRect();
-    return (event.clientX - box.left) / box.width;
-  };
-  stage.addEventListener("pointerdown", (event) => {
-    if (event.target === id("back")) return;
-    pointers.set(event.pointerId, event);
-    stage.setPointerCapture(event.pointerId);
-    swiping = stage.dataset.mode === "swipe" && (event.target === id("handle") || !state.solid);
-    if (swiping) swipeTo(toShare(event));
-  });
-  stage.addEventListener("pointermove", (event) => {
-    const last = pointers.get(event.pointerId);
-    if (!last) return;
-    pointers.set(event.pointerId, event);
-    if (swiping) swipeTo(toShare(event));
-    else if (state.solid) drag(last, event, [...pointers.values()].find((one) => one.pointerId !== event.pointerId));
-  });
-  for (const name of ["pointerup", "pointercancel"]) stage.addEventListener(name, (event) => pointers.delete(event.pointerId));
-  stage.addEventListener("contextmenu", (event) => event.preventDefault());
-  stage.addEventListener("wheel", (event) => {
-    if (!state.solid) return;
-    event.preventDefault();
-    solid.dolly(Math.exp(0.0012 * Math.max(-240, Math.min(240, event.deltaY))));
-  }, { passive: false });
-}
-
-function drag(last, event, other) {
-  const box = stage.getBoundingClientRect();
-  const [dx, dy] = [(event.clientX - last.clientX) / box.width, (event.clientY - last.clientY) / box.height];
-  if (other) {
-    const apart = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY) || 1;
-    solid.dolly(apart(last) / apart(event));
-    solid.pan(dx / 2, dy / 2);
-  } else if (event.shiftKey || event.buttons & 6) solid.pan(dx, dy);
-  else solid.orbit(-3 * dx, -3 * dy * (box.height / box.width));
 }
 
 // The strip, when the stills have come.
@@ -353,8 +262,16 @@ async function startScene() {
   }
 }
 
-[state.left, state.right] = ["left", "right"].map((side) => Number(id(`${side}-source`).value));
-const inPage = new Map(["left", "right"].map((side) => [state[side], id(side).getAttribute("src")]));
-listen();
-fitStage();
-showNumbers();
+const inPage = new Map();
+
+function start() {
+  for (const side of ["left", "right"]) {
+    state[side] = Number(id(`${side}-source`).value);
+    inPage.set(state[side], id(side).getAttribute("src"));
+  }
+  state.result = Math.max(state.right, FIRST_RESULT);
+  listen();
+  show();
+  showNumbers();
+  markResult();
+}

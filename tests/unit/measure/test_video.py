@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +31,58 @@ def read(path: Path) -> list[np.ndarray]:
     while (step := reader.read())[0]:
         pictures.append(step[1][..., ::-1])
     return pictures
+
+
+FFMPEG = f"""#!{sys.executable}
+import os, sys
+import cv2, numpy as np
+if "-encoders" in sys.argv:
+    print(" V....D libx264              H.264")
+    sys.exit()
+width, height = map(int, sys.argv[sys.argv.index("-s") + 1].split("x"))
+fps = int(sys.argv[sys.argv.index("-r") + 1])
+frames = np.frombuffer(sys.stdin.buffer.read(), np.uint8).reshape(-1, height, width, 3)
+writer = cv2.VideoWriter(sys.argv[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
+for frame in frames:
+    writer.write(frame)
+writer.release()
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_ffmpeg(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that all machines write the same."""
+    monkeypatch.setenv("PATH", os.devnull)
+
+
+@pytest.fixture
+def ffmpeg(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program that takes what ffmpeg takes, on the PATH."""
+    program = tmp_path_factory.mktemp("bin") / "ffmpeg"
+    program.write_text(FFMPEG, encoding="utf-8")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(program.parent))
+    return program
+
+
+@pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
+def test_h264_where_ffmpeg_is_at_hand(ffmpeg: Path, tmp_path: Path) -> None:
+    assert preview.write_video(tmp_path / "a.webm", frames(2), 24) in ("VP8", "VP9")
+    assert preview.write_video(tmp_path / "a.mp4", frames(12, 47, 63), 24) == "H.264"
+    shown = read(tmp_path / "a.mp4")
+    assert len(shown) == 12
+    for drawn, picture in zip(frames(12, 48, 64), shown, strict=True):
+        assert np.abs(drawn.astype(float) - picture).mean() < 12
+    ffmpeg.write_text(FFMPEG.replace("libx264", "libx265"), encoding="utf-8")
+    assert preview.write_video(tmp_path / "b.mp4", frames(2), 24) != "H.264"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
+def test_an_ffmpeg_that_fails_leaves_nothing(ffmpeg: Path, tmp_path: Path) -> None:
+    ffmpeg.write_text(FFMPEG.replace("width, height", "sys.exit(1)  # ", 1), encoding="utf-8")
+    with refuses(SceneError, "a.mp4", 12):
+        preview.write_video(tmp_path / "a.mp4", frames(12), 24)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "A.MP4"])

@@ -21,6 +21,7 @@ from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
+from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
 from gsmerge.raster.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -70,7 +71,8 @@ def unpacked(packed: bytes | None) -> bytes:
 
 
 def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
-    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=()))
+    nets = (data.LPIPS,) if lpips_available(data.LPIPS) else ()
+    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets))
     by_place = sorted(actual.views, key=lambda view: view.place)
     for side, result in enumerate(expected.results):
         assert [view.scores[side] for view in by_place] == [score.masked for score in result.scores]
@@ -82,10 +84,14 @@ def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gau
 
 
 def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
-    values = [view.scores[1].psnr or 0 for view in actual.views]
-    assert values[actual.start] == np.median(values)
-    assert replace(actual, views=actual.views[:4]).start == 1
-    assert replace(actual, views=actual.views[:1]).start == 0
+    """Of those that the figures at the top are of: the held-out ones, otherwise the inputs."""
+    inputs = replace(actual, views=tuple(view for view in actual.views if not view.held_out))
+    values = [view.scores[1].psnr or 0 for view in inputs.views]
+    assert values[inputs.start] == np.median(values)
+    assert replace(inputs, views=inputs.views[:1]).start == 0
+    assert actual.start == next(place for place, view in enumerate(actual.views) if view.held_out)
+    best = max((view for view in actual.views if view.held_out), key=lambda view: view.scores[1].psnr or 0)
+    assert replace(actual, views=(*inputs.views, best)).start == 3
 
 
 def test_one_scene_alone(scene: Scene) -> None:

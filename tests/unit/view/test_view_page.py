@@ -19,7 +19,7 @@ from gsmerge.measure.fog import Fog
 from gsmerge.measure.preview import view_pictures
 from gsmerge.measure.scores import evaluation_document
 from gsmerge.view.data import ViewData, collect
-from gsmerge.view.page import headline, report_page, view_page
+from gsmerge.view.page import headline, report_page, results_table, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 WEBP = "data:image/webp;base64,"
@@ -111,14 +111,73 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
     assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
 
 
-def test_fog_and_holes_are_in_a_table(data: ViewData, alone: ViewData) -> None:
-    sides = data.sides[0], replace(data.sides[1], fog=Fog(0.25, None, 0.0126))
-    page = view_page(replace(data, sides=sides))
-    table = re.findall('<table class="outside">(.*?)</table>', page, re.DOTALL)[0]
-    cells = [re.findall(">([^<]*)</t[hd]>", row) for row in table.split("<tr>")[1:]]
-    assert cells[0] == ["from outside", "near fog", "far fog", "holes"]
-    assert [[html.unescape(cell) for cell in row] for row in cells[1:]] == [[EVIL, "0.250", "-", "0.013"]]
-    assert 'class="outside"' not in view_page(alone)
+def with_three_results(data: ViewData) -> ViewData:
+    """The scene with results of a half, a tenth and a hundredth; the second is worse than it."""
+    scene, half = (replace(side, num_gaussians=1000, mean=Quality(20.0, 0.5)) for side in data.sides)
+    half = replace(half, name="half", num_gaussians=500, file_bytes=2_000, mean=Quality(25.0, 0.75))
+    tenth = replace(half, name="tenth", num_gaussians=100, file_bytes=400, mean=Quality(19.0, 0.5, lpips_alex=0.25))
+    return replace(data, sides=(scene, half, tenth, replace(tenth, name="least", num_gaussians=10)))
+
+
+def test_a_table_over_all_results(data: ViewData) -> None:
+    three = with_three_results(data)
+    three = replace(
+        three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:])
+    )
+    head, rows = results_table(three)
+    assert head == ["", "Gaussians", "Share", "File", "PSNR (dB)", "SSIM", "LPIPS", "Near fog", "Far fog", "Holes"]
+    assert rows[0] == ["input", "1,000", "100.0 %", "2.0 MB", "20.00", "0.500", "-", "-", "-", "-"]
+    assert rows[1][:8] == ["half", "500", "50.0 %", "2.0 kB", "25.00", "0.750", "-", "0.250"]
+    assert rows[1][-1] == "0.013"
+    assert [row[:3] + row[6:7] for row in rows[2:]] == [
+        ["tenth", "100", "10.0 %", "0.250"],
+        ["least", "10", "1.0 %", "0.250"],
+    ]
+    page = view_page(three)
+    assert re.findall(r'<tr data-result="(\d)">', page) == ["2", "3", "4"]
+    assert page.count('<button class="link"') == 3
+
+
+def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
+    sides = tuple(replace(side, mean=Quality(), fog=None) for side in data.sides)
+    assert results_table(replace(data, sides=sides))[0] == ["", "Gaussians", "Share", "File"]
+
+
+def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
+    page = view_page(with_three_results(data))
+    half, tenth, least = json.loads(block(page, "data"))["results"]
+    assert half["figures"] == [["500", False], ["2.0 kB", False], ["25.00 dB", True], ["0.750", True]]
+    assert tenth["figures"][2:] == [["19.00 dB", False], ["0.500", False]]
+    assert [one["headline"].split("\u00a0")[0] for one in (half, tenth, least)] == ["50.0", "10.0", "1.0"]
+    assert "farther" in tenth["headline"]
+    choice = re.findall('<select id="result".*?</select>', page, re.DOTALL)[0]
+    assert re.findall('value="(.)">(.*?)<', choice) == [("2", "half"), ("3", "tenth"), ("4", "least")]
+    assert '<select id="result"' not in view_page(data)
+
+
+def test_colours_are_readable_in_both_schemes(page: str) -> None:
+    """Contrast of at least 4.5 of text on what it stands on."""
+    style = re.findall("<style>(.*?)</style>", page, re.DOTALL)[0]
+    light = dict(re.findall(r"--([\w-]+): (#\w+)", style.split(".top")[0].split("prefers-color-scheme")[0]))
+    dark = light | dict(re.findall(r"--([\w-]+): (#\w+)", re.findall(r":root\.dark \{(.*?)\}", style)[0]))
+    pairs = [(ink, ground) for ink in ("ink", "muted", "ours", "baseline", "good") for ground in ("page", "soft")]
+    pairs += [("held-ink", "held"), ("worst-ink", "worst"), ("page", "ink")]
+    for colors in (light, dark):
+        assert [pair for pair in pairs if contrast(*(colors[name] for name in pair)) < 4.5] == []
+    assert dark["page"] != light["page"]
+
+
+def contrast(*colors: str) -> float:
+    """The ratio of two colours' luminances, as WCAG 2 has it."""
+
+    def luminance(color: str) -> float:
+        digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
+        values = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+        linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in values]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted(map(luminance, colors))
+    return (high + 0.05) / (low + 0.05)
 
 
 def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:

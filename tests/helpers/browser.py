@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
     "--disable-background-networking", "--disable-sync", "--hide-scrollbars", "--remote-debugging-pipe",
@@ -20,6 +22,14 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 PATIENCE = 60.0  # seconds
+NO_BROWSER = "no Chromium on the PATH"
+
+
+def needs_browser(executable: str | None = CHROMIUM) -> pytest.MarkDecorator:
+    """A mark that skips tests without a browser, which the end of the run says; in CI that is an error."""
+    if executable is None and os.environ.get("CI"):
+        raise RuntimeError(f"{NO_BROWSER}: .ci/chromium installs it")
+    return pytest.mark.skipif(executable is None, reason=NO_BROWSER)
 
 
 class Browser:
@@ -65,9 +75,10 @@ class Browser:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def press(self, key: str, code: int) -> None:
-        for kind in ("rawKeyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+    def press(self, key: str, *, shift: bool = False, release: bool = True) -> None:
+        code = f"Key{key.upper()}" if key.isalpha() and len(key) == 1 else key
+        for kind in ("rawKeyDown", "keyUp")[: 1 + release]:
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, modifiers=8 * shift)
 
     def requests(self) -> list[str]:
         """Addresses that the page asked for."""
@@ -81,8 +92,9 @@ class Browser:
 
 
 @contextmanager
-def browser(executable: str, profile: Path, *flags: str) -> Iterator[Browser]:
+def browser(executable: str | None, profile: Path, *flags: str) -> Iterator[Browser]:
     """A browser with a profile and further flags of its own, ended with the block."""
+    assert executable is not None
     to_browser, from_browser = os.pipe(), os.pipe()
 
     def connect() -> None:  # Chromium reads commands from descriptor 3 and answers on 4
