@@ -24,6 +24,7 @@ from gsmerge.kernels.build import FOLDER
 
 CALLS, CHANGES = 8, 60  # calls of each function that are made again, and how often
 BYTES = 1 << 22  # calls with more arguments are left out
+BY_TABLE = {"fit_phase"}  # its argument holds addresses: tests/kernels/raster/test_step.py changes what they point to
 SECONDS = 120  # in which the changed copies of a call must come to an end
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-40, 1e30, -1e30, 3e38, np.nan, np.inf, -np.inf)
 INTEGERS = (0, 1, 2, -1, -2, 2**15, 2**31 - 1, 2**31, -(2**31), 2**32 + 1, 2**62, 2**63 - 1, -(2**63))
@@ -47,6 +48,7 @@ def declare(name: str, returns: signature.Argument | None = None, /, **arguments
                 repeat(name, call, arguments, row)
         return call(*values, **named)
 
+    recorded.prepare = call.prepare  # type: ignore[attr-defined]
     return recorded
 
 
@@ -145,7 +147,7 @@ def _admit(arguments: Arguments, named: dict[str, Any]) -> None:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Say how many calls were made; fail where a function was not called."""
-    missing = sorted(set(signature.PROTOTYPES) - set(tried))
+    missing = sorted(set(signature.PROTOTYPES) - set(tried) - BY_TABLE)
     print(f"\n{len(tried)} functions, {tried.total()} changed calls, {refused.total()} of them refused")
     if missing:
         print(f"never called: {', '.join(missing)}")

@@ -175,10 +175,18 @@ static void finish(Step *s, int64_t phase) {
   }
 }
 
+// Whether the buffers go with the picture and the Gaussians.
+static inline bool fits(const Step *s) {
+  int64_t columns = columns_of(s), lines = (s->height + TILE - 1) / TILE;
+  return s->width > 0 && s->height > 0 && s->threads > 0 && s->spans > 0 && s->n >= 0 && s->n < INT64_C(1) << 31 &&
+         s->tiles == columns * lines && s->ends == s->tiles + 1 &&
+         s->num_corners == (columns + 1) * (lines + 1) && s->pieces == (s->n + PIECE - 1) / PIECE;
+}
+
 API int32_t fit_phase(int64_t *table, int64_t phase, int64_t fields) {
   Step *s = (Step *)table;
   if (fields * (int64_t)sizeof(int64_t) != sizeof(Step)) return OUTSIDE;
-  if (phase > COUNT && s->num_intersections > s->room) return OUTSIDE;
+  if (!fits(s) || (phase > COUNT && s->num_intersections > s->room)) return OUTSIDE;
   int64_t num = num_pieces(s, phase), piece;
   while ((piece = __atomic_fetch_add(&s->next, 1, __ATOMIC_RELAXED)) < num)
     if (WORK[phase](s, piece)) __atomic_store_n(&s->failed, 1, __ATOMIC_RELAXED);
