@@ -13,6 +13,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.convert import NUM_FULL, find_placement, pad_harmonics, place
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
+from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.fit.gpu import choose_backend
@@ -94,10 +95,13 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         result = _placed(result, outputs)
+        parts = split_levels(result, load.scene, settings, progress) if streamed else None
+        if parts is not None:
+            result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        written = _write_results(add, outputs, at[out], results, comments)
+        written = _write_results(add, outputs, at[out], results, comments, parts)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -161,16 +165,24 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _write_results(
-    add: AddOutput, outputs: Outputs, first: Path, results: Sequence[CompactResult], comments: Sequence[Sequence[str]]
+    add: AddOutput,
+    outputs: Outputs,
+    first: Path,
+    results: Sequence[CompactResult],
+    comments: Sequence[Sequence[str]],
+    parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    Returns the path of each, in their order, with its files as they are before they are renamed.
+    ``parts`` are those of a ``lod-meta.json``. Returns the path of each, in their order, with its files as they are
+    before they are renamed.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True).ending
-    if ending == INDEX:
-        (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
+    if parts is not None:
+        (_, finest), *coarser = add_levels(
+            add, out, first, parts.levels, comments[0], environment=parts.environment, measure=parts.measure
+        )
         return {out: [first, *finest], **dict(coarser)}
     written = {out: [first]}
     for level in range(1, len(results)):
