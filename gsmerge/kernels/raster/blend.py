@@ -7,10 +7,13 @@ threads, and no result depends on them. The formula is in ``gsmerge/kernels/rast
 
 from __future__ import annotations
 
+import math
+
 from gsmerge.kernels.raster.binning import MOST_TILES
 from gsmerge.kernels.raster.project import CONIC, MAX_SIZE, SUMS
 from gsmerge.kernels.signature import STATUS, f4, i4, i8, native
 
+LN_CUT = math.log(1 / 255)  # of the least opacity that shows
 CHANNELS = 4  # channels that one walk of weighted_sums adds up
 MAX_ALPHA = 0.99  # largest share of the light that one Gaussian takes (gsplat)
 
@@ -65,6 +68,11 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
 
     ``totals [m,2]`` float32.
     """
+
+
+@native(STATUS, **LISTS, layers=i4("h", "w", out=True))
+def count_layers(conics, flatten_ids, isect_offsets, tile_width, layers):
+    """Count the Gaussians that show in each pixel, whatever is in front of them -> ``layers [h,w]``."""
 
 
 @native(
