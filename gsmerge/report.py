@@ -182,7 +182,10 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     if drawn := document["choices"].get("overdraw"):
         (old, _), (new, crowded), limit = _worst(drawn["before"]), _worst(drawn["after"]), drawn["limit"]
         remark = f"at most {limit['mean']:g}; 95 %: {crowded:.0f}, at most {limit['crowded']:g}"
-        rows += [("overdraw", f"{old:.1f}", f"{new:.1f}", remark)]
+        rows += [
+            ("overdraw", f"{old:.1f}", f"{new:.1f}", remark),
+            ("limit", "", f"{limit['num_gaussians']:,}", "Gaussians"),
+        ]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
@@ -245,6 +248,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
     if drawn := document["choices"].get("overdraw"):
         (mean, crowded), limit = _worst(drawn["after"]), drawn["limit"]
+        quality += f"; at most {limit['num_gaussians']:,} Gaussians"
         quality += f"; overdraw {mean:.1f} of {limit['mean']:g}, 95 %: {crowded:.0f} of {limit['crowded']:g}"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"

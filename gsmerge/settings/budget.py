@@ -40,8 +40,8 @@ class BudgetOptions(Settings):
     budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
         "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
         "scene needs.",
-        "quest3 and mobile limit overdraw as well. A size is that of the output's file, a `.ply` in Python, and never "
-        "exceeded.",
+        "In one piece quest3 and mobile limit overdraw as well. A size is that of the output's file, a `.ply` in "
+        "Python, and never exceeded.",
         metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
         "lose at most so much against the best, such as -0.2dB.",

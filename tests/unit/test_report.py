@@ -88,11 +88,12 @@ def test_overdraw_stands_beside_its_limit(files: tuple[Path, Path]) -> None:
     before, after = (
         {"views": {"mean": mean, "crowded": crowded}, "outside": outside} for mean, crowded in ((50, 90), (39, 60))
     )
-    drawn = {"before": before, "after": after, "limit": {"num_gaussians": 9, "mean": 40, "crowded": 80}, "met": True}
+    drawn = {"before": before, "after": after, "limit": {"num_gaussians": 9000, "mean": 40, "crowded": 80}, "met": True}
     document = make_document(files)
     document["choices"] = {**document["choices"], "overdraw": drawn}
-    assert "; overdraw 39.0 of 40, 95 %: 70 of 80; " in report.summary_line(document)
-    (line,) = [line for line in report.result_table(document) if "overdraw" in line]
+    assert "; at most 9,000 Gaussians; overdraw 39.0 of 40, 95 %: 70 of 80; " in report.summary_line(document)
+    line, limit = report.result_table(document)[4:6]
+    assert limit.split() == ["limit", "9,000", "Gaussians"]
     assert line.split() == ["overdraw", "50.0", "39.0", "at", "most", "40;", "95", "%:", "70,", "at", "most", "80"]
     assert len(line) <= 80
 
