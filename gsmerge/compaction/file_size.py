@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from gsmerge.budget import LEVEL_FACTOR, FileSize
 from gsmerge.compaction.result import Candidate, shrink
 from gsmerge.facts.prepare import Prepared
@@ -23,13 +25,17 @@ TRIES, MAX_REBUILDS = 8, 3
 Rebuild = Callable[[int], Candidate]
 
 
-def measure_bytes(levels: Sequence[Gaussians], file: Format) -> int:
-    """Count the bytes of a file with some Gaussians, or of all files of an index with several levels."""
+def measure_bytes(levels: Sequence[Gaussians], file: Format, environment: Gaussians | None = None) -> int:
+    """Count the bytes of a file with some Gaussians, or at most those of all files of an index with several levels."""
     first = levels[0]
     if file is PLY:
         return file_bytes(len(first), first.sh_degree)
     if file.encode is None:
-        return sum(map(len, streamed_files(levels).values()))
+        longest = 1.234e-5  # as long as an error can be
+        files = streamed_files(
+            levels, environment=environment, measure=lambda leaves: np.full((len(leaves), len(levels)), longest)
+        )
+        return sum(map(len, files.values()))
     return len(file.encode(first, (RESULT_COMMENT, MIP_COMMENT)))
 
 

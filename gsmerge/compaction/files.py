@@ -21,6 +21,7 @@ from gsmerge.compaction.convert import (
 )
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
+from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.fit.gpu import choose_backend
@@ -103,11 +104,14 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         result = _placed(result, outputs)
+        parts = split_levels(result, load.scene, settings, progress) if streamed else None
+        if parts is not None:
+            result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
         photos = name_photos(files.images, names)
-        written = _write_results(add, outputs, at[out], results, comments, result.cameras[views], photos)
+        written = _write_results(add, outputs, at[out], results, comments, result.cameras[views], photos, parts)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -178,18 +182,22 @@ def _write_results(
     comments: Sequence[Sequence[str]],
     cameras: Cameras,
     photos: Sequence[str],
+    parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    A COLMAP model has the ``cameras``, and the names of their ``photos``, as well. Returns the path of each result, in
-    their order, with its files as they are before they are renamed.
+    A COLMAP model has the ``cameras``, and the names of their ``photos``, as well; ``parts`` are those of a
+    ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
+    renamed.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
     if ending == COLMAP.ending:
         return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
-    if ending == INDEX:
-        (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments[0])
+    if parts is not None:
+        (_, finest), *coarser = add_levels(
+            add, out, first, parts.levels, comments[0], environment=parts.environment, measure=parts.measure
+        )
         return {out: [first, *finest], **dict(coarser)}
     written = {out: [first]}
     for level in range(1, len(results)):

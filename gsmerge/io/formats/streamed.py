@@ -1,7 +1,9 @@
 """Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail that viewers load.
 
 ``lod-meta.json`` is a tree of boxes. For each level, a leaf names a run of rows in a chunk: an
-unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits.
+unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits:
+by distance, or by the ``errors`` of the leaf, one for each level from 0 on. What an
+``environment`` holds is shown with every level.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -34,30 +36,46 @@ CHUNK_SIZE = 2**sog.PALETTE_BITS
 # Gaussians of all levels in a leaf, for which a viewer chooses one level: a quarter of a chunk, so that
 # the few hundred thousand of a room are some twenty places with levels of their own
 LEAF_SIZE = CHUNK_SIZE // 4
+ERROR_DIGITS = 4
 MAX_LEVELS = 64  # no real file has more than a dozen
-_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")
+ENVIRONMENT = "env"
+_CHUNK = re.compile(rf"(\d+_\d+|{ENVIRONMENT})-[0-9a-f]{{8}}")
 
 
 @dataclass
-class _Leaf:
+class Leaf:
     """A place and its Gaussians at each level."""
 
     node: dict[str, Any]  # its part of the index
     rows: list[np.ndarray]  # of each level
 
 
-def streamed_files(levels: Sequence[Gaussians], *, mip: bool = False) -> dict[str, bytes]:
+# Errors [leaves, levels] of leaves, no smaller from level to level; 0 is the finest level's
+LeafErrors = Callable[[Sequence[Leaf]], np.ndarray]
+
+
+def streamed_files(
+    levels: Sequence[Gaussians],
+    *,
+    mip: bool = False,
+    environment: Gaussians | None = None,
+    measure: LeafErrors | None = None,
+) -> dict[str, bytes]:
     """Encode levels of detail, the finest first, as files by path below one folder; the index comes last.
 
     A chunk's folder has its level, its number and a hash of its content in its name, so that chunks of
     two results are never mixed: neither where one replaces the other, nor in a browser's cache. ``mip``
-    marks antialiased Gaussians. ValueError if a level is empty or not finite.
+    marks antialiased Gaussians, the ``environment`` is part of no level, and ``measure`` gives the leaves
+    their errors. ValueError if a level is empty or not finite.
     """
     if not levels or not all(len(level) for level in levels):
         raise ValueError("levels: expected Gaussians in each, got none")
     columns = [arrays.to_columns(level, MAX_DEGREE) for level in levels]
-    leaves: list[_Leaf] = []
+    leaves: list[Leaf] = []
     tree = _Boxes(columns).split(leaves)
+    if measure is not None:
+        for leaf, errors in zip(leaves, measure(leaves).tolist(), strict=True):
+            leaf.node["errors"] = [float(f"{error:.{ERROR_DIGITS}g}") for error in errors]
     files: dict[str, bytes] = {}
     names: list[str] = []
     for level, level_columns in enumerate(columns):
@@ -73,7 +91,13 @@ def streamed_files(levels: Sequence[Gaussians], *, mip: bool = False) -> dict[st
             names.append(f"{folder}/{sog.META}")
     counts = [len(level_columns) for level_columns in columns]
     index = {"version": VERSION, "asset": {"generator": sog.GENERATOR}, "count": sum(counts), "counts": counts}
-    index |= {"lodLevels": len(counts), "filenames": names, "tree": tree}
+    index |= {"lodLevels": len(counts), "lodErrors": measure is not None}
+    if environment is not None:
+        chunk = sog.sog_files(arrays.to_columns(environment, MAX_DEGREE), mip=mip)
+        folder = f"{ENVIRONMENT}-{_hash(chunk)}"
+        files |= {f"{folder}/{name}": data for name, data in chunk.items()}
+        index["environment"] = f"{folder}/{sog.META}"
+    index |= {"filenames": names, "tree": tree}
     return files | {INDEX: json.dumps(index).encode("ascii")}
 
 
@@ -91,7 +115,7 @@ class _Boxes:
         self.low = self.means - widths - rounding
         self.high = self.means + widths + rounding
 
-    def split(self, leaves: list[_Leaf], rows: np.ndarray | None = None) -> dict[str, Any]:
+    def split(self, leaves: list[Leaf], rows: np.ndarray | None = None) -> dict[str, Any]:
         """Halve rows along their longest side until they are few; return the node, and add its leaves."""
         rows = np.arange(len(self.means)) if rows is None else rows
         inside = self.means[rows]
@@ -105,7 +129,7 @@ class _Boxes:
         if len(rows) <= LEAF_SIZE or not extent.max() > 0:
             ends = np.searchsorted(rows, self.starts)
             level_rows = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
-            leaves.append(_Leaf(node | {"lods": {}}, level_rows))
+            leaves.append(Leaf(node | {"lods": {}}, level_rows))
             return leaves[-1].node
         places = inside[:, int(extent.argmax())]
         middle = np.partition(places, len(rows) // 2)[len(rows) // 2]
@@ -279,7 +303,9 @@ def remove_unused_chunks(path: Path) -> None:
 
     Other files in the chunks' folders stay, with their folders; so does what cannot be removed.
     """
-    used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
+    index = read_index(path)
+    chunks = [chunk for level in index.levels for chunk in level]
+    used = {chunk.parent.name for chunk in (*chunks, index.environment) if chunk is not None}
     with suppress(OSError), os.scandir(path.parent) as entries:
         for entry in list(entries):
             if _CHUNK.fullmatch(entry.name) and entry.name not in used and entry.is_dir(follow_symlinks=False):

@@ -103,21 +103,30 @@ def write_levels(
 
 
 def add_levels(
-    add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
+    add: AddOutput,
+    path: Path,
+    index: Path,
+    levels: Sequence[Gaussians],
+    comments: Sequence[str] = (),
+    *,
+    environment: Gaussians | None = None,
+    measure: streamed.LeafErrors | None = None,
 ) -> list[tuple[Path, list[Path]]]:
     """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
 
-    Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
+    ``environment`` and ``measure`` are as of :func:`streamed.streamed_files`. Returns, for each level, the final path
+    of its first chunk's ``meta.json``, and the present paths of all its files; an environment's are the finest level's.
     """
-    for gaussians in levels:
+    for gaussians in levels if environment is None else (*levels, environment):
         _check_readable(gaussians, comments)
     firsts: dict[str, Path] = {}
     written: dict[str, list[Path]] = {}
-    for name, data in streamed.streamed_files(levels, mip=MIP_COMMENT in comments).items():
+    mip = MIP_COMMENT in comments
+    for name, data in streamed.streamed_files(levels, mip=mip, environment=environment, measure=measure).items():
         if name == streamed.INDEX:
             index.write_bytes(data)
             continue
-        target, level = path.parent / name, name.partition("_")[0]
+        target, level = path.parent / name, "0" if name.startswith(streamed.ENVIRONMENT) else name.partition("_")[0]
         same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
         written.setdefault(level, []).append(target if same else add(target))
         if not same:

@@ -13,6 +13,7 @@ from gsmerge.kernels.raster.blend import (
     blend,
     blend_backward,
     contributions,
+    count_layers,
     gather_slots,
     rows_in_tile,
     survey,
@@ -47,6 +48,7 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
         lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),
         lambda: blend_backward(*walked, colors, first, last, image, left, image, None, slots),
         lambda: list_weights(*walked, SIDE, SIDE),
+        lambda: count_layers(*walked, np.empty((SIDE, SIDE), np.int32)),
     ]
 
 

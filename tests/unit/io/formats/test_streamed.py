@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -272,6 +272,29 @@ def test_a_dataset_is_replaced_whole(first: list[Gaussians], tmp_path: Path, sma
     write_levels(alone, chain())
     assert content(index.parent) == {**content(alone.parent), **theirs, mine: b"mine"}
     check_dataset(index, chain())
+
+
+def test_errors_and_environment(tmp_path: Path, small: None) -> None:
+    """Every leaf has an error for each level; what the environment holds is read with the finest level alone."""
+    index, levels, sky = tmp_path / "lod-meta.json", chain(), corners()
+
+    def measure(leaves: Sequence[streamed.Leaf]) -> np.ndarray:
+        return np.arange(len(leaves))[:, None] + np.array([0, 1 / 3, 2e-5])
+
+    for files in (streamed.streamed_files(levels, environment=sky, measure=measure), streamed.streamed_files(levels)):
+        for name, data in files.items():
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_bytes(data)
+        document = json.loads(index.read_text())
+        streamed.remove_unused_chunks(index)
+        assert len(list(tmp_path.glob("env-*"))) == document["lodErrors"]
+        if document["lodErrors"]:
+            leaves = leaves_of(document["tree"])
+            assert [leaf["errors"][1] for leaf in leaves[:2]] == [0.3333, 1.333]
+            assert len(leaves) > 2
+            assert document["counts"] == list(COUNTS)
+            assert [len(read_level(index, level).gaussians) for level in (0, 1)] == [COUNTS[0] + len(sky), COUNTS[1]]
+    check_dataset(index, levels)
 
 
 def test_the_rest_of_killed_runs_is_removed(tmp_path: Path) -> None:
