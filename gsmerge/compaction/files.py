@@ -104,7 +104,7 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         result = _placed(result, outputs)
-        parts = split_levels(result, load.scene, settings, progress) if streamed else None
+        parts = split_levels(result, load.scene, settings, progress) if ending == INDEX else None
         if parts is not None:
             result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
