@@ -49,6 +49,7 @@ UNEXPECTED = 0.69
 COARSE = 4  # pixels per side of those that one says the brightness of
 BRIGHT = 1.15  # gain from which on clipped pixels no longer count
 NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
+NEAREST, FARTHER = 24, 8  # views that one is compared with: of all others the nearest, and some at equal steps of rank
 
 
 @dataclass(frozen=True)
@@ -191,11 +192,12 @@ def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:SAMPLES]
+    partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
-    def measure(view: int) -> list[_Pair]:
+    def measure(row: int) -> list[_Pair]:
+        view, pairs = views[row], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
-        pairs = []
-        for other in (other for other in views if other != view):
+        for other in (views[column] for column in partners[row]):
             both, places = pixels.look_up(view, rows, other)
             here, there = photos[view, rows[both]], photos[other, places]
             clear = ((here > LOW) & (here < HIGH) & (there > LOW) & (there < HIGH)).all(1)
@@ -204,7 +206,19 @@ def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
                 pairs.append(_Pair(view, other, np.median(ratios, 0), ratios[:MIN_PAIRS].copy(), len(ratios)))
         return pairs
 
-    return [pair for pairs in parallel_map(measure, views) for pair in pairs]
+    return [pair for pairs in parallel_map(measure, range(len(views))) for pair in pairs]
+
+
+def choose_partners(distances: np.ndarray) -> np.ndarray:
+    """Choose the views ``[v,p]``, rising, that each of v is compared with: all others, or some of many.
+
+    The nearest share the most surfaces; those at equal steps of rank hold groups of cameras together.
+    """
+    order = _order_others(distances)
+    if order.shape[1] > NEAREST + FARTHER:
+        steps = np.linspace(NEAREST, order.shape[1] - 1, FARTHER).round().astype(int)
+        order = order[:, [*range(NEAREST), *steps]]
+    return np.sort(order, axis=1)
 
 
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:

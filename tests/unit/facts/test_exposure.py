@@ -10,12 +10,16 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.facts.exposure import (
+    FARTHER,
     FOLLOWS,
     NEARER,
+    NEAREST,
     UNEXPECTED,
     _divide,
     _measure_pairs,
+    _solve_gains,
     camera_distances,
+    choose_partners,
     equalise_exposure,
     is_metered,
     root_mean_square,
@@ -56,6 +60,24 @@ def test_gains_bring_the_same_surfaces_nearer(scene: Scene) -> None:
     assert share_left(pairs, gains) < 0.2
     assert share_left(pairs, np.zeros((5, 3))) == 1
     assert share_left(pairs, -gains) > 1 > NEARER
+
+
+def test_few_views_are_compared_with_all_others_and_many_with_some() -> None:
+    few, many = choose_partners(row(NEAREST + FARTHER + 1)), choose_partners(row(200))
+    assert all(sorted({*others, view}) == list(range(len(few))) for view, others in enumerate(few.tolist()))
+    assert many.shape == (200, NEAREST + FARTHER)
+    assert set(range(100 - NEAREST // 2, 101 + NEAREST // 2)) - {100} <= set(many[100])
+    assert many[100].min() == 0  # some are far away
+    assert (np.diff(many) > 0).all()
+
+
+def test_gains_of_many_views_follow_from_some_pairs() -> None:
+    count = 2 * (NEAREST + FARTHER)
+    scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 32, 24)))
+    gains = grey(*np.random.default_rng(0).uniform(-0.2, 0.2, count))
+    solved = _solve_gains(_measure_pairs(brightened(scene, gains), range(count)), count)
+    assert solved is not None
+    np.testing.assert_allclose(solved - solved.mean(0), gains - gains.mean(0), atol=0.03)
 
 
 def test_metered_photos_are_equally_bright() -> None:
