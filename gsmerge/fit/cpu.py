@@ -108,7 +108,9 @@ class _CpuEngine:
                 "loss_weights": np.array(loss_weights(rates, step.progress), np.float32),
             }
             drawn = state.splats.opacities if opacities is None else opacities
-            return tables.take(step.number, photos.image(step.view), weight, drawn, numbers)
+            return tables.take(
+                step.number, np.ascontiguousarray(photos.image(step.view), np.float32), weight, drawn, numbers
+            )
 
     def _constants(self, state: State, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""

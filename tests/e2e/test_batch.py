@@ -145,16 +145,8 @@ def test_what_compact_has_besides_is_set_by_name() -> None:
     only = {option.removeprefix("--") for option in options["compact"].keys() - options["batch"].keys() - one_scene}
     frame = {"up", "scale", "rotate", "translate"}  # in which a result is written, and nothing else is done
     assert only <= gsmerge.CompactOptions().to_dict().keys() | frame
-    own = {
-        "scenes",
-        "--cameras",
-        "--images",
-        "-o",
-        "--output",
-        "--threads",
-        "--overwrite",
-        "--json",
-    }  # of many scenes in batch
+    own = {"scenes", "--cameras", "--images", "-o", "--output", "--threads", "--overwrite", "--json"}  # of many scenes
+    own.add("--help-all")  # which names what else there is
     for name in options["compact"].keys() & options["batch"].keys() - own:
         assert options["compact"][name].help == options["batch"][name].help
 
