@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from gsmerge.compaction.blocks import compact_in_blocks
@@ -65,11 +66,11 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
-    best = meet_bytes(search.best, lambda count: build_scored(method, prepared, plan, count), prepared, plan)
-    best = meet_overdraw(best, lambda count: build_scored(method, prepared, plan, count), prepared, plan)
+    rebuild = partial(build_scored, method, prepared, plan)
+    best = meet_overdraw(meet_bytes(search.best, rebuild, prepared, plan), rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-    best = meet_bytes_of_levels(best, levels, prepared, plan)
+    best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
     return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 

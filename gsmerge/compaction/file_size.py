@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -59,12 +60,22 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
 
 
 def meet_bytes_of_levels(
-    candidate: Candidate, coarser: Sequence[Candidate], prepared: Prepared, plan: Plan
+    candidate: Candidate, coarser: Sequence[Candidate], rebuild: Rebuild, prepared: Prepared, plan: Plan
 ) -> Candidate:
-    """Leave out the faintest Gaussians of the finest level until all levels of an index are no larger than asked."""
+    """Make the finest level as large as the size of an index leaves it room beside the coarser ones.
+
+    It is built again where these are smaller than those that stood for them, and left without its faintest Gaussians.
+    """
     if plan.size is None or plan.size.levels == 1:
         return candidate
-    return _without_faintest(candidate, [level.gaussians for level in coarser], prepared, plan)
+    levels, most = [level.gaussians for level in coarser], plan.size.num_bytes
+    for _ in range(MAX_REBUILDS):
+        count, size = len(candidate.gaussians), measure_bytes([candidate.gaussians, *levels], plan.size.file)
+        if size >= NEAR * most or count == prepared.input_scene.num_gaussians:
+            break
+        more = math.ceil(SURPLUS * sum(map(len, (candidate.gaussians, *levels))) * (most - size) / size)
+        candidate = rebuild(min(count + more, prepared.input_scene.num_gaussians))
+    return _without_faintest(candidate, levels, prepared, plan)
 
 
 def _with_coarser(gaussians: Gaussians, size: FileSize) -> list[Gaussians]:
