@@ -15,6 +15,7 @@ from gsmerge.io.formats import arrays, ply, streamed
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
@@ -225,7 +226,31 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
 
 
 def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill the arrays of one block of rows, column by column; opacities are only copied."""
+    """Fill the arrays of one block of rows; opacities are only copied."""
+    plain = _convert_plain(rows, out)
+    out["valid"][:plain] = True
+    if plain == len(rows):
+        return 0, 0
+    return _convert_columns(rows[plain:], {name: array[plain:] for name, array in out.items()})
+
+
+def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
+    """Fill arrays with the rows before the first one that is not plain, see :func:`convert_rows`; return how many."""
+    columns, num_higher = dict(rows.dtype.fields or {}), out["shN"].shape[1]
+    rest = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
+    used = (*arrays.MEANS, *arrays.SH0, *rest, *arrays.SCALES, *arrays.QUATS, "opacity")
+    types = {out["means"].dtype, *(kind for kind, *_ in columns.values())}
+    if types != {np.dtype(np.float32)} or not columns.keys() >= set(used):
+        return 0
+    places = np.array([columns[name][1] // 4 for name in used], np.int32)
+    values = rows.view(np.float32).reshape(len(rows), -1)
+    sh0, shN = (out[name].reshape(len(rows), -1) for name in ("sh0", "shN"))
+    limits = MAX_HARMONIC, arrays.MAX_LOG_SCALE
+    return convert_rows(values, places, *limits, out["means"], out["quats"], out["scales"], out["opacities"], sh0, shN)
+
+
+def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Fill the arrays of any rows, column by column."""
     with np.errstate(all="ignore"):
         total = np.zeros(len(rows), np.float32)  # not finite where any column is not: one test instead of many
 

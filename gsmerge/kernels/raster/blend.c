@@ -41,6 +41,20 @@ static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_
   return weights;
 }
 
+// Blend Gaussian j over half a tile's columns, two rows at a time: the same bits.
+static inline void blend_pairs(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
+  Curve curve = pair_curve_of(b, (int)j);
+  float red = b->red[j], green = b->green[j], blue = b->blue[j];
+  for (int32_t y = first_pair(y0, y1); y <= y1; y += 2) {
+    float *row = state + y * TILE + b->x0[j];
+    Share s = take_share(load_pair(row), pair_exponents(&curve, y, y0, y1));
+    store_pair(row, s.left);
+    store_pair(row + PLANE, load_pair(row + PLANE) + s.weight * red);
+    store_pair(row + 2 * PLANE, load_pair(row + 2 * PLANE) + s.weight * green);
+    store_pair(row + 3 * PLANE, load_pair(row + 3 * PLANE) + s.weight * blue);
+  }
+}
+
 API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
                   const int64_t *restrict isect_offsets, int64_t tile_width, const float *restrict colors,
                   int64_t first, int64_t last, int64_t top, const float *restrict background, float *restrict image,
@@ -58,8 +72,14 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
-      for (int64_t j = 0; j < stop - start; j++)
-        blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j));
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
+        if (y0 > y1) continue;
+        if (batch.x0[j] == WIDE)
+          blend_rows(state, &batch, j, y0, y1);
+        else
+          blend_pairs(state, &batch, j, y0, y1);
+      }
       narrow_tile(&t, state);
     }
     for (int y = 0; y < t.num_y; y++)
@@ -226,9 +246,9 @@ API int32_t count_layers(const float *restrict conics, const int32_t *restrict f
   return 0;
 }
 
-// The rows of one tile in which the Gaussians of a list show, as the walks take them: first and last of each.
-API int32_t rows_in_tile(const float *conics, const int32_t *flatten_ids, int64_t left, int64_t top, int32_t *rows,
-                         int64_t m, int64_t n) {
+// The part of one tile in which each Gaussian of a list shows, as the walks take it: first and last row, first column.
+API int32_t parts_of_tile(const float *conics, const int32_t *flatten_ids, int64_t left, int64_t top, int32_t *parts,
+                          int64_t m, int64_t n) {
   Lists lists = {conics, flatten_ids, 0, 1, m, n, 0};
   Batch batch;
   clear_batch(&batch);
@@ -237,8 +257,9 @@ API int32_t rows_in_tile(const float *conics, const int32_t *flatten_ids, int64_
     int64_t stop = mini(n, start + BATCH);
     if (!gather(&batch, &t, &lists, start, stop, n)) return OUTSIDE;
     for (int64_t j = 0; j < stop - start; j++) {
-      rows[2 * (start + j)] = batch.y0[j];
-      rows[2 * (start + j) + 1] = batch.y1[j];
+      parts[3 * (start + j)] = batch.y0[j];
+      parts[3 * (start + j) + 1] = batch.y1[j];
+      parts[3 * (start + j) + 2] = batch.x0[j];
     }
   }
   return 0;

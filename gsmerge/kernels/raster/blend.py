@@ -73,10 +73,13 @@ def count_layers(conics, flatten_ids, isect_offsets, tile_width, layers):
 
 
 @native(
-    STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), rows=i4("n", 2, out=True),
+    STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
-def rows_in_tile(conics, flatten_ids, left, top, rows):
-    """Write first and last row ``[n,2]`` in which Gaussians show in the tile at a pixel, as all walks take them."""
+def parts_of_tile(conics, flatten_ids, left, top, parts):
+    """Write where Gaussians show in the tile at a pixel, as all walks take it.
+
+    ``parts``: first and last row, and the first of the eight columns that suffice; -1 where they do not.
+    """
 
 
 @native(

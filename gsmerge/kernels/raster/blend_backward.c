@@ -11,37 +11,63 @@
 
 enum { SUMS = 9 };
 
+// Sums over rows, by column, of what pixels want of one Gaussian: v are the gradients of ln alpha.
+typedef struct {
+  v16f red, green, blue, v, vy, vyy;
+} Wants;
+
+// Take the share of a Gaussian off sixteen pixels, with gradients of their colours, and add what they want of it.
+static inline v16f take_back(Wants *w, Share s, v16f rest, const v16f g[3], const float color[3], v16f dy) {
+  v16f own = s.weight * (color[0] * g[0] + color[1] * g[1] + color[2] * g[2]);
+  rest = rest - own;
+  v16f v = own - s.alpha * rest / (1.f - s.alpha);
+  v = sel(s.goes & s.unclamped, v, splat(0.f));
+  v16f vy = v * dy;
+  w->red += s.weight * g[0];
+  w->green += s.weight * g[1];
+  w->blue += s.weight * g[2];
+  w->v += v;
+  w->vy += vy;
+  w->vyy += vy * dy;
+  return rest;
+}
+
+// Add all columns; x is the same in all rows of a lane, so its moments wait until here.
+static inline void add_columns(const Wants *w, v16f dx, float *slot) {
+  v16f vx = w->v * dx;
+  store8(slot, totals((v16f[8]){w->red, w->green, w->blue, w->v, vx, w->vy, vx * dx, w->vy * dx}));
+  slot[8] = total(w->vyy);
+}
+
 // Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it.
-static inline void walk_back(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
-  if (y1 < y0) {
-    for (int c = 0; c < SUMS; c++) slot[c] = 0.f;
-    return;
-  }
+static inline void walk_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
   Curve curve = curve_of(b, (int)j);
-  float red = b->red[j], green = b->green[j], blue = b->blue[j];
-  v16f sr = {0}, sg = {0}, sb = {0}, sv = {0}, sy = {0}, syy = {0};
+  float color[3] = {b->red[j], b->green[j], b->blue[j]};
+  Wants wants = {{0}, {0}, {0}, {0}, {0}, {0}};
   for (int32_t y = y0; y <= y1; y++) {
     float *row = state + y * TILE, dy = (float)y - curve.my;
     Share s = take_share(load(row), exponents(&curve, dy));
-    v16f g0 = load(row + 2 * PLANE), g1 = load(row + 3 * PLANE), g2 = load(row + 4 * PLANE);
-    v16f own = s.weight * (red * g0 + green * g1 + blue * g2);
-    v16f rest = load(row + PLANE) - own;
-    v16f v = own - s.alpha * rest / (1.f - s.alpha);
-    v = sel(s.goes & s.unclamped, v, splat(0.f));
+    v16f g[3] = {load(row + 2 * PLANE), load(row + 3 * PLANE), load(row + 4 * PLANE)};
     store(row, s.left);
-    store(row + PLANE, rest);
-    v16f vy = v * dy;
-    sr += s.weight * g0;
-    sg += s.weight * g1;
-    sb += s.weight * g2;
-    sv += v;
-    sy += vy;
-    syy += vy * dy;
+    store(row + PLANE, take_back(&wants, s, load(row + PLANE), g, color, splat(dy)));
   }
-  // x is the same in all rows of a lane, so its moments wait until here
-  v16f dx = COLUMNS - curve.mx, vx = sv * dx;
-  store8(slot, totals((v16f[8]){sr, sg, sb, sv, vx, sy, vx * dx, sy * dx}));
-  slot[8] = total(syy);
+  add_columns(&wants, COLUMNS - curve.mx, slot);
+}
+
+// The same over half a tile's columns, two rows at a time.
+static inline void walk_pairs(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  Curve curve = pair_curve_of(b, (int)j);
+  float color[3] = {b->red[j], b->green[j], b->blue[j]};
+  Wants wants = {{0}, {0}, {0}, {0}, {0}, {0}};
+  for (int32_t y = first_pair(y0, y1); y <= y1; y += 2) {
+    float *row = state + y * TILE + b->x0[j];
+    Share s = take_share(load_pair(row), pair_exponents(&curve, y, y0, y1));
+    v16f g[3] = {load_pair(row + 2 * PLANE), load_pair(row + 3 * PLANE), load_pair(row + 4 * PLANE)};
+    v16f dy = splat_pair((float)y - curve.my, (float)(y + 1) - curve.my);
+    store_pair(row, s.left);
+    store_pair(row + PLANE, take_back(&wants, s, load_pair(row + PLANE), g, color, dy));
+  }
+  add_columns(&wants, PAIR_COLUMNS + (float)b->x0[j] - curve.mx, slot);
 }
 
 API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,
@@ -73,8 +99,16 @@ API int32_t blend_backward(const float *restrict conics, const int32_t *restrict
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
-      for (int64_t j = 0; j < stop - start; j++)
-        walk_back(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), slots + SUMS * (start + j));
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
+        float *slot = slots + SUMS * (start + j);
+        if (y0 > y1)
+          for (int c = 0; c < SUMS; c++) slot[c] = 0.f;
+        else if (batch.x0[j] == WIDE)
+          walk_rows(state, &batch, j, y0, y1, slot);
+        else
+          walk_pairs(state, &batch, j, y0, y1, slot);
+      }
       narrow_tile(&t, state);
     }
     for (int64_t i = SUMS * start; i < SUMS * end; i++) slots[i] = 0.f;

@@ -6,20 +6,23 @@
 #pragma once
 #include "native.h"
 
-enum { TILE = 16, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, SPLAT_COLORS = 3 };
+enum { TILE = 16, HALF = TILE / 2, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, SPLAT_COLORS = 3, WIDE = -1 };
 
 #define LN_CUT -5.541263545158426f  // ln(1/255)
 #define MAX_ALPHA 0.99f
 #define MIN_TRANSMITTANCE 1e-4f
-#define SPARE 0.02f  // rows beside those in which a Gaussian shows, for rounding
+#define HIDDEN -1e4f  // an exponent that shows nothing
+#define SPARE 0.02f  // rows and columns beside those in which a Gaussian shows, for rounding
 
 static const v16f COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+static const v16f PAIR_COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};  // of two rows of half a tile
 
 // Gaussians relative to the tile's first pixel centre: ln w = lnop - (rate (x - mx - slope (y - my)))^2 - decay (y - my)^2.
 typedef struct {
   float mx[BATCH], my[BATCH], rate[BATCH], slope[BATCH], decay[BATCH], lnop[BATCH], first[BATCH], last[BATCH];
   float red[BATCH], green[BATCH], blue[BATCH];
   int32_t y0[BATCH], y1[BATCH];  // rows of the tile in which each shows
+  int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE where these are more
 } Batch;
 
 // Part of the light of sixteen pixels that a Gaussian takes.
@@ -68,16 +71,48 @@ static inline v16f exponents(const Curve *c, float dy) {
   return (c->lnop - c->decay * dy * dy) - d * d;
 }
 
+// Eight pixels of a row, and those below them.
+static inline v16f load_pair(const float *p) {
+  v8f upper = *(const v8f *)p, lower = *(const v8f *)(p + TILE);
+  return PICK(upper, lower, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+static inline void store_pair(float *p, v16f v) {
+  *(v8f *)p = PICK(v, v, 0, 1, 2, 3, 4, 5, 6, 7);
+  *(v8f *)(p + TILE) = PICK(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
+}
+static inline v16f splat_pair(float upper, float lower) {
+  v16f a = splat(upper), b = splat(lower);
+  return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+}
+
+// The curve over eight columns from x0 on, twice.
+static inline Curve pair_curve_of(const Batch *b, int j) {
+  Curve curve = curve_of(b, j);
+  curve.across = curve.rate * (PAIR_COLUMNS + (float)b->x0[j]);
+  return curve;
+}
+
+// First row of the pairs that cover y0 to y1 and, where their number is odd, a row of the tile beside them.
+static inline int32_t first_pair(int32_t y0, int32_t y1) { return y0 > 0 && (y1 - y0) % 2 == 0 ? y0 - 1 : y0; }
+
+// Exponents of rows y and y + 1 by the same arithmetic as exponents(); far below the cut outside of y0 to y1.
+static inline v16f pair_exponents(const Curve *c, int32_t y, int32_t y0, int32_t y1) {
+  float dy = (float)y - c->my, below = (float)(y + 1) - c->my;
+  float upper = c->lnop - c->decay * dy * dy, lower = c->lnop - c->decay * below * below;
+  v16f d = c->across - splat_pair(c->rate * (c->mx + c->slope * dy), c->rate * (c->mx + c->slope * below));
+  return splat_pair(y < y0 ? HIDDEN : upper, y < y1 ? lower : HIDDEN) - d * d;
+}
+
 static inline float clamp_column(float x) {
   x = x < (float)(TILE - 1) ? x : (float)(TILE - 1);
   return x > 0.f ? x : 0.f;
 }
 
-// Narrow the rows of a batch to those where a column of the tile reaches the cut.
+// Narrow the rows of a batch to those where a column of the tile reaches the cut, and find the columns where a row does.
 //
 // With q the ln opacity above the cut, a Gaussian shows where decay y^2 + rate^2 (x - slope y)^2 <= q. The highest point
 // of this ellipse lies at y = sqrt(q / decay); where that is outside the tile, the ellipse is highest at the tile's
-// column next to it.
+// column next to it. It reaches sqrt(q (1 / rate^2 + slope^2 / decay)) to the sides.
 static inline void narrow_rows(Batch *b) {
   for (int i = 0; i < BATCH; i++) {
     float mx = b->mx[i], my = b->my[i], slope = b->slope[i], decay = b->decay[i], squared = b->rate[i] * b->rate[i];
@@ -94,6 +129,10 @@ static inline void narrow_rows(Batch *b) {
     last = last < b->last[i] ? last : b->last[i];
     b->y0[i] = whole(first, 0.f, (float)TILE);
     b->y1[i] = whole(last, -1.f, (float)(TILE - 1));
+    float side = 1.00001f * sqrtf4(q / squared + slope * slope * reach * reach) + SPARE;
+    float column = maxf(ceilf4(mx - side), 0.f);
+    bool narrow = column >= (float)HALF || mx + side < column + (float)HALF;
+    b->x0[i] = whole(narrow ? column : (float)WIDE, (float)WIDE, (float)HALF);
   }
 }
 

@@ -15,7 +15,7 @@ from gsmerge.kernels.raster.blend import (
     contributions,
     count_layers,
     gather_slots,
-    rows_in_tile,
+    parts_of_tile,
     survey,
     weighted_sums,
 )
@@ -90,8 +90,8 @@ def test_members_outside_are_refused_by_what_adds_up(bad: int) -> None:
         add_slots(flatten_ids, np.zeros((2, 4), np.float32), ids, 0, sums)
     with pytest.raises(ValueError, match="add_slots"):
         add_slots(np.zeros(2, np.int32), np.zeros((2, 4), np.float32), np.full(M, bad, np.int32), 0, sums)
-    with pytest.raises(ValueError, match="rows_in_tile"):
-        rows_in_tile(rows, flatten_ids, 0, 0, np.zeros((2, 2), np.int32))
+    with pytest.raises(ValueError, match="parts_of_tile"):
+        parts_of_tile(rows, flatten_ids, 0, 0, np.zeros((2, 3), np.int32))
     gather_slots(flatten_ids, np.ones((2, SUMS), np.float32), 0, M, sums)
     assert sums.sum() == SUMS  # those outside the range of Gaussians are another thread's
 

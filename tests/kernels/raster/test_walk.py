@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.raster.blend import rows_in_tile
+from gsmerge.kernels.raster.blend import parts_of_tile
 from gsmerge.kernels.raster.project import LN_CUT, TILE
 
 BATCH = 32  # Gaussians that the kernels take at once
 LEFT, TOP = 32, 48  # the tile's first pixel
 
 
-def rows_of(conics: np.ndarray) -> np.ndarray:
-    rows = np.empty((len(conics), 2), np.int32)
-    rows_in_tile(conics, np.arange(len(conics), dtype=np.int32), LEFT, TOP, rows)
-    return rows
+def parts_of(conics: np.ndarray) -> np.ndarray:
+    parts = np.empty((len(conics), 3), np.int32)
+    parts_of_tile(conics, np.arange(len(conics), dtype=np.int32), LEFT, TOP, parts)
+    return parts
 
 
 def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
@@ -34,10 +34,10 @@ def conics_of(kind: str, rng: np.random.Generator) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["near", "far", "huge"])
 @pytest.mark.parametrize("seed", range(20))
-def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
+def test_rows_and_columns_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
     """None that shows is left out, and at most one beside them is kept."""
     conics = conics_of(kind, np.random.default_rng(seed))
-    rows = rows_of(conics)
+    parts = parts_of(conics)
     mx, my, rate, slope, decay, lnop = conics.T[:6].astype(np.float64)[..., None, None]
     mx, my = mx - LEFT - 0.5, my - TOP - 0.5
     y, x = np.mgrid[:TILE, :TILE].astype(np.float64)
@@ -45,11 +45,18 @@ def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
     # along a row without pixels between: what the bounds are of
     line = np.linspace(0, TILE - 1, 4096)
     for j in range(BATCH):
-        first, last = rows[j]
+        first, last, column = parts[j]
         shows = np.flatnonzero((exponents[j] >= LN_CUT + 1e-5).any(1))
         if len(shows):
             assert first <= shows[0]
             assert last >= shows[-1]
+        columns = np.flatnonzero((exponents[j] >= LN_CUT + 1e-5).any(0))
+        if column >= 0 and len(columns):
+            assert column <= columns[0]
+            assert columns[-1] <= column + 7
+        side = np.sqrt(max(lnop[j, 0, 0] - LN_CUT, 0) * (rate[j, 0, 0] ** -2 + slope[j, 0, 0] ** 2 / decay[j, 0, 0]))
+        reach = np.clip(mx[j, 0, 0] + np.array([-side, side]) * 1.001 + (-0.05, 0.05), -1, TILE)
+        assert (column < 0) <= (reach[1] - reach[0] >= 7)  # eight columns are enough where no more are reached
         dy = np.arange(TILE)[:, None] - my[j, 0, 0]
         along = (
             lnop[j, 0, 0] - (rate[j, 0, 0] * (line - mx[j, 0, 0] - slope[j, 0, 0] * dy)) ** 2 - decay[j, 0, 0] * dy**2
@@ -63,5 +70,5 @@ def test_rows_are_those_that_reach_the_cut(kind: str, seed: int) -> None:
 def test_a_gaussian_that_misses_the_tile_has_no_rows() -> None:
     conics = np.zeros((1, 8), np.float32)
     conics[0] = LEFT + 60, TOP + 8, 1, 0, 1, 0, 0, 1000
-    first, last = rows_of(conics)[0]
+    first, last, _ = parts_of(conics)[0]
     assert first > last
