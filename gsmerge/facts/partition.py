@@ -6,12 +6,13 @@ by the view that shares most with those in it, and then exchange views while tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gsmerge.geometry import camera_centres, project
+from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
@@ -21,7 +22,8 @@ SAME_DEPTH = 0.15  # share by which a point may lie behind the depth of a cell t
 SHARED = 0.25  # views of neighbours that a block takes in addition, a share of its own
 SLACK = 0.2  # share by which blocks may differ from equal sizes
 SWEEPS = 8  # exchanges of views between blocks, at most
-POINTS = 65536  # per task
+TOGETHER = 32  # points of a view that are looked up together: few cameras may see any of them
+POINTS = 1024  # the same where owners are searched
 BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
 WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece
 
@@ -84,12 +86,59 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     stride = slice(None, None, max(1, len(picked) // SAMPLES))
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
+    frustums = make_frustums(cameras, depths)
+
     def one_view(points: np.ndarray) -> np.ndarray:
-        return see(points, cameras, depths)[0].mean(1) if len(points) else np.zeros(len(scene))
+        counts = np.zeros(len(scene))
+        for rows in split_points(points, TOGETHER):
+            near = frustums.reached_by(points[rows])
+            counts[near] += see(points[rows], cameras[near], depths[near])[0].sum(1)
+        return counts / max(1, len(points))
 
     shares = np.stack(parallel_map(one_view, samples))
     numbers = np.repeat(np.arange(len(scene)), [len(points) for points in samples])
     return Covisibility(cameras, depths, shares, np.concatenate(samples), numbers)
+
+
+@dataclass(frozen=True, eq=False)
+class Frustums:
+    """Half-spaces that bound what each of v cameras sees: most cameras are far from a few points."""
+
+    planes: np.ndarray  # [v,5,4] unit normals, which point inside, and distances; the last is the image plane
+    farthest: np.ndarray  # [v] largest depth that is seen
+
+    def reached_by(self, points: np.ndarray, *, hidden: bool = False) -> np.ndarray:
+        """Return the cameras that may see some of ``points [n,3]``, ascending; with ``hidden`` through surfaces."""
+        low, high = points.min(0), points.max(0)
+        middle, radius = (low + high) / 2, float(np.sqrt(np.square(high - low).sum())) * 0.500001
+        distances = matmul(self.planes[..., :3], middle[:, None])[..., 0] + self.planes[..., 3]
+        radius += 1e-9 * float(np.abs(distances).max(initial=0))
+        reached = (distances >= -radius).all(1)
+        if not hidden:
+            reached &= distances[:, -1] - radius <= self.farthest
+        return np.flatnonzero(reached)
+
+
+def make_frustums(cameras: Cameras, depths: np.ndarray) -> Frustums:
+    """Compute the frustums of cameras whose surfaces lie at ``depths [v,h,w]``."""
+    across, down, ahead = (cameras.Ks[:, row].astype(np.float64) for row in range(3))
+    normals = np.stack([across, down, cameras.width * ahead - across, cameras.height * ahead - down, ahead], 1)
+    normals /= np.sqrt(np.square(normals).sum(-1, keepdims=True))
+    viewmats = cameras.viewmats.astype(np.float64)[:, :3]
+    return Frustums(matmul(normals, viewmats), (1 + SAME_DEPTH) * depths.max((1, 2)))
+
+
+def split_points(points: np.ndarray, most: int) -> Iterator[np.ndarray]:
+    """Yield the rows of ``points [n,3]`` in groups of at most ``most`` that lie close to each other."""
+    groups = [np.arange(len(points))] if len(points) else []
+    while groups:
+        rows = groups.pop()
+        if len(rows) <= most:
+            yield rows
+            continue
+        values = points[rows]
+        order = np.argsort(values[:, np.ptp(values, 0).argmax()], kind="stable")
+        groups += [rows[order[len(rows) // 2 :]], rows[order[: len(rows) // 2]]]
 
 
 def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,15 +198,15 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     labels, left = np.full(num_views, -1), np.ones(num_views, bool)
     for label in range(count):
         size = round(left.sum() / (count - label))
-        degrees = np.where(left, weights[:, left].sum(1), np.inf)
+        behind = weights[:, left].sum(1)  # edges of each view to those left
         gain = np.where(left, 0.0, -np.inf)
-        view = int(degrees.argmin())
+        view = int(np.where(left, behind, np.inf).argmin())
         for _ in range(size):
             labels[view], left[view] = label, False
             gain += weights[view]
             gain[view] = -np.inf
             # of equals the one that leaves the fewest edges behind, so that no view is left alone
-            behind = weights[:, left].sum(1)
+            behind -= weights[view]
             score = gain - 0.5 * np.where(left, behind, 0)
             view = int(score.argmax())
     return labels
@@ -188,18 +237,27 @@ def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence
     If no view sees the point, the owner is the nearest view with the point in its picture, else the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
-    centres = camera_centres(cameras.viewmats.astype(np.float64))
+    centres, frustums = camera_centres(cameras.viewmats.astype(np.float64)), make_frustums(cameras, depths)
+    points = points.astype(np.float64)
 
-    def some(first: int) -> np.ndarray:
-        part = points[first : first + POINTS].astype(np.float64)
-        best = np.zeros(len(part), np.int64)
-        kinds, nearest = np.full(len(part), 3), np.full(len(part), np.inf)
-        for view in range(len(views)):
-            seen, inside = (rows[0] for rows in see(part, cameras[[view]], depths[[view]]))
-            kind, squares = 2 - inside - 1 * seen, np.square(part - centres[view]).sum(1)
-            nearer = (kind < kinds) | ((kind == kinds) & (squares < nearest))
-            best[nearer], kinds[nearer], nearest[nearer] = view, kind[nearer], squares[nearer]
+    def of_group(rows: np.ndarray) -> np.ndarray:
+        best, left = np.zeros(len(rows), np.int64), np.arange(len(rows))  # those without an owner so far
+        for sight in ("seen", "inside", "any"):
+            part = points[rows[left]]
+            near = np.arange(len(views)) if sight == "any" else frustums.reached_by(part, hidden=sight == "inside")
+            squares = np.square(part - centres[near][:, None]).sum(-1)
+            if sight != "any":
+                seen, inside = see(part, cameras[near], depths[near])
+                squares[~(seen if sight == "seen" else inside)] = np.inf
+            owned = np.isfinite(squares).any(0)
+            if owned.any():
+                best[left[owned]] = near[squares[:, owned].argmin(0)]
+            left = left[~owned]
+            if len(left) == 0:
+                break
         return best
 
-    best = np.concatenate([np.zeros(0, np.int64), *parallel_map(some, range(0, len(points), POINTS))])
-    return np.asarray(views)[best]
+    owners, groups = np.zeros(len(points), np.int64), list(split_points(points, POINTS))
+    for rows, best in zip(groups, parallel_map(of_group, groups), strict=True):
+        owners[rows] = best
+    return np.asarray(views)[owners]
