@@ -124,6 +124,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         has_photos = bool(prepared.photo_views)
         if checkpoint is None and cuts:  # baselines learn nothing
             checkpoint = load_networks(options, input_scene, photos=has_photos)
+        asked, options = options, options if alone else resolve_budget(options, scene)
         segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
         clean_options = options.clean
         if "sky" in clean_options.drops and not prepared.photo_views:
@@ -170,7 +171,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         backend=backend,
         seed=options.seed,
         checkpoint=checkpoint,
-        settings=options.to_dict() | {"fit_steps": fit.steps, "device": backend.device},
+        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps, "device": backend.device},
     )
 
 
@@ -321,6 +322,17 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
             f"{name}: expected at most {checkpoint.networks.options.max_children} with the absolute outputs of"
             f" {checkpoint.path}, got {count}"
         )
+
+
+def resolve_budget(options: CompactOptions, scene: Scene) -> CompactOptions:
+    """Replace an automatic budget of a fit by the share that the depths of several views bear, and say why."""
+    fits = options.budget.auto and options.fit.fit != "none"
+    share, why = measured_share(scene) if fits else (None, "")
+    if share is None:
+        return options
+    text = f"{100 * share:.2g}%"
+    note(f"budget: {text} of the input, because {why}")
+    return replace(options, budget=replace(options.budget, budget=text))
 
 
 def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:

@@ -17,7 +17,7 @@ from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
-from gsmerge.plan import plan_whole, stands_alone
+from gsmerge.plan import plan_whole, resolve_budget, stands_alone
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part, report_progress
@@ -29,6 +29,7 @@ from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
+from gsmerge.stages.encode import measured_share
 from gsmerge.stages.segment import largest_count, measure_size
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import Gaussians, Scene, StrPath
@@ -79,7 +80,8 @@ def inspect(
         ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order), ``alignment`` (or
         ``alignment_problem``, why it could not be measured), ``sight`` (what the cameras see), ``coverage`` (shares of
         the pixels and of the Gaussians in each view), ``num_sky_views``. ``compact``: :func:`estimate` with the
-        defaults, None where ``compact`` would refuse the scene. ``notes``: warnings.
+        defaults, None where ``compact`` would refuse the scene; ``auto``: what ``--budget auto`` makes of it, with
+        ``share``, ``num_gaussians`` and ``why``, None where a curve would decide. ``notes``: warnings.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not
@@ -123,6 +125,12 @@ def _photo_notes(scene: Scene) -> list[str]:
     return record.notes
 
 
+def _describe_auto(scene: Scene) -> dict[str, Any] | None:
+    """Say how many Gaussians an automatic budget takes where the depths of several views decide it; None elsewhere."""
+    share, why = measured_share(canonicalise(scene)[0]) if scene.aligned else (None, "")
+    return None if share is None else {"share": share, "num_gaussians": int(share * scene.num_gaussians), "why": why}
+
+
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     is_result = is_from_gsmerge(ply.info.comments)
     facts: dict[str, Any] = {
@@ -131,7 +139,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "exporter": _OWN if is_result else "not known before the cameras fit",
         "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
-        **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact")),
+        **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto")),
         "coverage": [],
     }
     camera_file = None
@@ -155,6 +163,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
+    facts |= {"auto": _describe_auto(scene)}
     if not is_result:
         facts["exporter"] = exporter_names(load.exporters)
     if load.recovery is None or load.alignment is None:
@@ -221,6 +230,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         machine has enough.
     """
     size = measure_size(scene)
+    if options.budget.auto and scene.aligned:
+        options = resolve_budget(options, canonicalise(scene)[0])
     whole = plan_whole(size, options)
     limits, settings = whole.limits, whole.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
@@ -305,6 +316,9 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     ]
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
+    if auto := scene["auto"]:
+        share = f"{100 * auto['share']:.2g} %, {auto['num_gaussians']:,} Gaussians"
+        lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
     notes = [note for note in scene["notes"] if not note.startswith(repeated)]
     return [line for line in lines if line] + [f"note       {note}" for note in notes]

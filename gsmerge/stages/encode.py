@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 # surface, and those of which fewer views have it there than see through it
 ALONE, DISPUTED = 0.15, 0.39
 SAMPLES = 65536  # pixels whose depths are compared
-# Superpixels per pixel: most, where all depths agree, falling to the fewest as those that other views see through come
-# near this part of all. More of them repeat what is wrong, and are learned by heart (nine training captures).
-MOST, FEWEST, WRONG = 0.08, 0.015, 0.38
+# Gaussians per pixel that a scene bears: most, up to a share of pixels that other views see through, then falling to the
+# fewest at another one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
+MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.18, 0.38
 
 
 def make_context(
@@ -113,12 +113,12 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose superpixels per pixel by how well the depths of the views agree (None: unknown); also say why."""
+    """Choose Gaussians per pixel by how well the depths of the views agree (None: unknown); also say why."""
     if not scene.aligned or len(scene) < 2:
         return None, "depths of several views cannot be compared"
     wrong = contradicted_share(scene, scene_members(scene))
-    share = min(MOST, max(FEWEST, MOST * (1 - wrong / WRONG)))
-    choose(superpixels={"share": share, "contradicted": wrong})
+    share = min(MOST, max(FEWEST, MOST * (WRONG - wrong) / (WRONG - SOUND)))
+    choose(agreement={"share": share, "contradicted": wrong})
     return share, f"other views see through {100 * wrong:.0f} % of the pixels"
 
 

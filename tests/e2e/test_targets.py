@@ -83,8 +83,8 @@ def test_a_loss_spends_less_where_more_may_be_lost(scene: Scene) -> None:
     assert all(0 < point["psnr"] < 60 and 0 < point["ssim"] <= 1 for point in curve)
 
 
-def test_auto_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--set", "fit_steps=12", code=0)
+def test_auto_without_a_fit_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit", "none", code=0)
     lines = said.out.splitlines()
     assert "PSNR" in lines[2]
     assert len(lines) == 7

@@ -65,10 +65,26 @@ def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
         with record_run() as log:
             plan = make_plan(prepare(scene), AUTO)
         shares.append(plan.superpixels.options.share)
-        assert log.choices["superpixels"]["share"] == pytest.approx(shares[-1], rel=0.05)
+        assert log.choices["agreement"]["share"] == pytest.approx(shares[-1], rel=0.05)
         assert len(log.notes) == 1
         assert "through" in log.notes[0]
-    assert 0.08 >= shares[0] > shares[1] > shares[2] >= 0.015
+    assert shares[0] == shares[1] == 0.1  # an eighth of the pixels is contradicted, then a quarter
+    assert 0.015 <= shares[2] < 0.09
+
+
+def test_an_automatic_budget_is_the_share_that_the_depths_bear(wall: Scene) -> None:
+    auto = CompactOptions().with_settings({"budget": "auto"})
+    for scene in (wall, with_nearer_half(wall, [0, 2])):
+        with record_run() as log:
+            plan = make_plan(prepare(scene), auto)
+        assert plan.limits.count == pytest.approx(log.choices["agreement"]["share"] * len(scene.gaussians), rel=0.05)
+        assert any(note.startswith("budget: ") and "through" in note for note in log.notes)
+        assert not plan.auto_count
+        assert plan.settings["budget"] == "auto"
+    without_fit = make_plan(prepare(wall), auto.with_settings({"fit": "none"}))
+    lone = make_plan(prepare(scenes.take_views(wall, [0])), auto)
+    assert without_fit.auto_count
+    assert lone.auto_count  # the curve decides: nothing can be compared
 
 
 def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene) -> None:
@@ -76,7 +92,7 @@ def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene)
         with record_run() as log:
             assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
         assert "compared" in log.notes[0]
-        assert "superpixels" not in log.choices
+        assert "agreement" not in log.choices
 
 
 def test_a_run_says_what_it_chose(wall: Scene) -> None:
