@@ -179,7 +179,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 class WholePlan:
     """Decisions about a whole scene that cost no computation; a run, its estimate and its blocks share them."""
 
-    blocks: int  # Parts in which the scene is compacted
+    blocks: int  # Parts in which the scene is compacted; at most, where many views alone ask for them
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
     match: Method  # Of merging across views
@@ -215,7 +215,7 @@ def plan_whole(
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if the scene cannot be cut into as many as asked."""
     problems = blocks_problems(scene, options)
-    asked = wanted_blocks(options, scene.num_gaussians if scene.aligned else 0)
+    asked = wanted_blocks(options, *((scene.num_gaussians, scene.num_views) if scene.aligned else (0, 0)))
     if options.blocks.blocks == "auto":
         asked = min(scene.num_views, asked)
     if asked <= 1:
@@ -240,11 +240,11 @@ def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
     return [*_whole_needed(options), *([] if scene.aligned else ["a scene without one Gaussian per pixel"])]
 
 
-def wanted_blocks(options: CompactOptions, num_gaussians: int) -> int:
-    """Return the number of blocks that the options ask for, given ``num_gaussians``; 1: one piece."""
+def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
+    """Return the number of blocks that the options ask for, at most; 1: one piece. ``num_views``: 0 for few."""
     asked = options.blocks.blocks
     if asked == "auto":
-        return 1 if _whole_needed(options) else usual_blocks(num_gaussians)
+        return 1 if _whole_needed(options) else usual_blocks(num_gaussians, num_views)
     return 1 if asked == "none" else int(asked)
 
 

@@ -22,12 +22,14 @@ from gsmerge.compaction.result import (
     measure_psnr,
 )
 from gsmerge.facts.partition import (
+    WHOLE_GAUSSIANS,
     Block,
     Covisibility,
     count_factors,
     gaussians_at_once,
     measure_covisibility,
     owning_views,
+    partition_apart,
     partition_views,
 )
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
@@ -63,18 +65,26 @@ MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views 
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
-def compact_in_blocks(scene: Scene, options: CompactOptions, whole: WholePlan) -> CompactResult:
-    """Compact an aligned scene in blocks of views; the plan of the whole scene sets how many.
+def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
+    """Cut the views of an aligned scene into ``count`` blocks; fewer, or one, where only many views ask for them."""
+    with stage("partition"):
+        covisibility = measure_covisibility(scene.numpy())
+        fewer = options.blocks.blocks == "auto" and scene.num_gaussians <= WHOLE_GAUSSIANS
+        return (partition_apart if fewer else partition_views)(covisibility.weights, count), covisibility
+
+
+def compact_in_blocks(
+    scene: Scene, options: CompactOptions, whole: WholePlan, blocks: Sequence[Block], covisibility: Covisibility
+) -> CompactResult:
+    """Compact an aligned scene in blocks of views.
 
     The views of each block are merged first, and only the Gaussians that belong to the block are kept, so that all
     blocks together start from one set of Gaussians. Then each block fits what its views see, its neighbours' Gaussians
     included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
-    count, most = whole.blocks, whole.limits.count
+    count, most = len(blocks), whole.limits.count
     with stage("partition"):
-        covisibility = measure_covisibility(scene)
-        blocks = partition_views(covisibility.weights, count)
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_whole_choices(options, whole)
     size = gaussians_at_once(scene.num_gaussians, count)

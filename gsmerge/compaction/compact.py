@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from gsmerge.compaction.blocks import compact_in_blocks
+from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 from gsmerge.compaction.methods import Build, choose_method
 from gsmerge.compaction.overdraw import meet_overdraw
@@ -54,7 +54,11 @@ def compact(
         size = measure_size(scene)
         whole = plan_whole(size, options)  # what needs no work to decide
         note_engine(size, options, whole.blocks)
-        return compact_in_blocks(scene, options, whole) if whole.blocks > 1 else compact_piece(scene, options)
+        if whole.blocks > 1:
+            blocks, covisibility = cut_views(scene, options, whole.blocks)
+            if len(blocks) > 1:
+                return compact_in_blocks(scene, options, whole, blocks, covisibility)
+        return compact_piece(scene, options)
 
 
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:

@@ -25,12 +25,16 @@ SWEEPS = 8  # exchanges of views between blocks, at most
 TOGETHER = 32  # points of a view that are looked up together: few cameras may see any of them
 POINTS = 1024  # the same where owners are searched
 BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
-WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece
+WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece, unless it has many views
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same in views, where those of different blocks see little of each other
+MOST_CUT = 1 / 3  # of what views share: where blocks cut more, one piece is better
 
 
-def usual_blocks(num_gaussians: int) -> int:
-    """Return the usual number of blocks for an aligned scene of ``num_gaussians``."""
-    return 1 if num_gaussians <= WHOLE_GAUSSIANS else -(-num_gaussians // BLOCK_GAUSSIANS)
+def usual_blocks(num_gaussians: int, num_views: int) -> int:
+    """Return the usual number of blocks for an aligned scene; the most, where views decide it."""
+    if num_gaussians > WHOLE_GAUSSIANS:
+        return -(-num_gaussians // BLOCK_GAUSSIANS)
+    return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
 def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
@@ -186,6 +190,19 @@ def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> 
         nearest = np.argsort(-seen, kind="stable")[: round(shared * len(members))]
         blocks.append(Block(tuple(members.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
     return blocks
+
+
+def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
+    """Cut views into at most ``count`` blocks, as :func:`partition_views`, that see little of each other.
+
+    The number is halved while they cut more than a third of what the views share, down to one block.
+    """
+    while True:
+        blocks = partition_views(weights, count)
+        inside = sum(float(weights[np.ix_(block.own, block.own)].sum()) for block in blocks)
+        if count == 1 or inside >= (1 - MOST_CUT) * float(weights.sum()):
+            return blocks
+        count //= 2
 
 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:

@@ -238,7 +238,8 @@ class BlockOptions(Settings):
     """Settings for compacting scenes with many views in blocks."""
 
     blocks: int | Literal["auto", "none"] = setting("auto", "Blocks of views that are compacted one by one, for scenes "
-        "of hundreds of views; auto: from 20 million Gaussians on, one for every 8 million.",
+        "of hundreds of views; auto: beyond 20 million Gaussians, one for every 8 million, and for hundreds of views "
+        "that see little of each other.",
         "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
         metavar="auto|none|NUMBER")  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)

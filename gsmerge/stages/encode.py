@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 # surface, and those of which fewer views have it there than see through it
 ALONE, DISPUTED = 0.15, 0.39
 SAMPLES = 65536  # pixels whose depths are compared
-# Gaussians per pixel that a scene bears: most, up to a share of pixels that other views see through, then falling to the
-# fewest at another one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
+# Gaussians per pixel that a scene bears: most, up to a share of pixels that other views see through, then falling to
+# the fewest at another one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
 MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.18, 0.38
 
 

@@ -15,9 +15,11 @@ from gsmerge.facts.partition import (
     make_frustums,
     measure_covisibility,
     owning_views,
+    partition_apart,
     partition_views,
     see,
     split_points,
+    usual_blocks,
 )
 from gsmerge.settings.stages import BlockOptions
 from gsmerge.types import Cameras, Scene
@@ -64,6 +66,23 @@ def test_two_rooms_are_two_blocks() -> None:
     blocks = partition_views((rooms[:, None] == rooms).astype(float) - np.eye(24), 2)
     assert {tuple(rooms[list(block.own)]) for block in blocks} == {(0,) * 12, (1,) * 12}
     assert all(not block.shared for block in blocks)
+
+
+@pytest.mark.parametrize(("rooms", "asked", "expected"), [(1, 4, 1), (2, 4, 2), (4, 4, 4), (8, 3, 3)])
+def test_views_of_one_room_stay_together(rooms: int, asked: int, expected: int) -> None:
+    of_view = np.arange(48) % rooms
+    weights = (of_view[:, None] == of_view).astype(float) - np.eye(48) + 0.001
+    blocks = partition_apart(weights - np.diag(weights.diagonal()), asked)
+    assert len(blocks) == expected
+    assert sorted(view for block in blocks for view in block.own) == list(range(48))
+
+
+@pytest.mark.parametrize(
+    ("num_gaussians", "num_views", "blocks"),
+    [(19_000_000, 60, 1), (19_000_000, 168, 1), (4_838_400, 252, 6), (19_200_000, 1000, 24), (21_000_000, 20, 3)],
+)
+def test_many_gaussians_or_views_ask_for_blocks(num_gaussians: int, num_views: int, blocks: int) -> None:
+    assert usual_blocks(num_gaussians, num_views) == blocks
 
 
 @pytest.fixture(scope="module")
