@@ -185,6 +185,13 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt((vectors * vectors).sum(-1, keepdims=True))
 
 
+def median(values: np.ndarray) -> float:
+    """Return the median of ``values [n]``, n >= 1, as ``np.median`` does without its checks; none may be NaN."""
+    middle = len(values) // 2
+    parts = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)
+    return float(parts[middle] if len(values) % 2 else (parts[middle - 1] + parts[middle]) / 2)
+
+
 def lower_median(values: np.ndarray) -> np.ndarray:
     """Return the median of each column of ``[n,...]`` rows, n >= 1; the lower middle value if n is even."""
     middle = (len(values) - 1) // 2

@@ -35,7 +35,7 @@ from gsmerge.alignment.score import (
     solve_pose,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY
+from gsmerge.geometry import IDENTITY, median
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
@@ -238,7 +238,7 @@ def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | 
         if not len(block_pairs.rows):
             return None
         views = (np.full(len(block_pairs.rows), view) for view in range(len(inputs.cameras)))
-        errors = [np.median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
+        errors = [median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
         chosen.append(int(np.argmin(errors)))
     return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None
 
@@ -267,7 +267,7 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
             pose = None if reason else solve_pose(pairs, 0, cameras.Ks[0])
             # a pose that takes up most of wrong intrinsics, too, shows that the rows are pixels of some camera
             posed = None if pose is None else replace(cameras[:1], viewmats=pose[None])
-            is_grid = posed is not None and np.median(pixel_errors(pairs, posed)) < 4 * alignment.limit_px
+            is_grid = posed is not None and median(pixel_errors(pairs, posed)) < 4 * alignment.limit_px
             if reason or is_grid:
                 raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry import Schedule, descend, motion_matrices, robust_weights
+from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
 SCHEDULE = Schedule(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
@@ -72,27 +73,11 @@ def _linearise(
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
-    fx, fy, (cx, cy) = K[0, 0], K[1, 1], K[:2, 2]
     for view, pose in enumerate(poses):
-        camera = matmul(points[view], pose[:3, :3].T) + pose[:3, 3]
+        jacobian, residual = np.empty((2 * len(points[view]), size)), np.empty(2 * len(points[view]))
+        values = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
+        reproject.linearise(*values, jacobian, residual)
         with np.errstate(all="ignore"):  # points in the camera's plane
-            x, y, inverse = camera[:, 0] / camera[:, 2], camera[:, 1] / camera[:, 2], 1 / camera[:, 2]
-            zeros, ones = np.zeros_like(x), np.ones_like(x)
-            right = np.stack([fx * inverse, zeros, -fx * x * inverse], 1)
-            down = np.stack([zeros, fy * inverse, -fy * y * inverse], 1)
-            by_K = {
-                0: ([], []),
-                ONE_FOCAL: ([fx * x], [fy * y]),
-                TWO_FOCALS: ([fx * x, zeros], [zeros, fy * y]),
-                ALL_INTRINSICS: ([fx * x, zeros, ones, zeros], [zeros, fy * y, zeros, ones]),
-            }[free]
-            jacobian = np.concatenate(
-                [
-                    np.concatenate([np.cross(camera, way), way, *(column[:, None] for column in columns)], 1)
-                    for way, columns in zip((right, down), by_K, strict=True)
-                ]
-            )
-            residual = np.concatenate([fx * x + cx - pixels[view][:, 0], fy * y + cy - pixels[view][:, 1]])
             curvature[view], slope[view] = matmul(jacobian.T, jacobian), matmul(jacobian.T, residual)
             error += float((residual * residual).sum())
     return curvature, slope, error

@@ -14,7 +14,8 @@ import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, subsample
 from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, project_points, robust_weights, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, median, robust_weights, sh0_to_rgb
+from gsmerge.kernels import reproject
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
 from gsmerge.runtime.memory import free_pages
@@ -62,11 +63,11 @@ class Correspondences:
 
 def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
     """Measure the distances ``[t]``, pixels, of projected Gaussians from their pixel centres; inf behind a camera."""
-    with np.errstate(all="ignore"):
-        viewmats, Ks = cameras.viewmats[pairs.views], cameras.Ks[pairs.views]
-        xy, depth = project_points(pairs.points[:, None], viewmats, Ks)
-        error = np.linalg.norm(xy[:, 0] - pairs.pixels, axis=1)
-    return np.where((depth[:, 0] > 0) & np.isfinite(error), error, np.inf)
+    errors = np.empty(len(pairs.views))
+    values = pairs.points, cameras.viewmats, cameras.Ks, pairs.pixels
+    points, viewmats, Ks, pixels = (np.ascontiguousarray(array, np.float64) for array in values)
+    reproject.pixel_errors(points, np.ascontiguousarray(pairs.views, np.int64), viewmats, Ks, pixels, errors)
+    return errors
 
 
 def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
@@ -171,8 +172,8 @@ def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras
     viewmats = cameras.viewmats.copy()
     for view, pose in _solve_poses(pairs, cameras.Ks).items():
         viewmats[view] = pose
-    best = float(np.median(pixel_errors(pairs, replace(cameras, viewmats=viewmats))))
-    return float(np.median(pixel_errors(pairs, frame.move(cameras)))) <= max(_AS_GOOD * best, best + _AS_GOOD_PX)
+    best = median(pixel_errors(pairs, replace(cameras, viewmats=viewmats)))
+    return median(pixel_errors(pairs, frame.move(cameras))) <= max(_AS_GOOD * best, best + _AS_GOOD_PX)
 
 
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
@@ -264,10 +265,10 @@ def score_layout(
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
     errors = pixel_errors(pairs, frame.move(inputs.cameras))
-    medians = [float(np.median(part)) for part in pairs.split(errors, len(layout.views)) if len(part)]
-    median, worst = float(np.median(errors)) if len(errors) else math.inf, max(medians, default=math.inf)
+    medians = [median(part) for part in pairs.split(errors, len(layout.views)) if len(part)]
+    middle, worst = median(errors) if len(errors) else math.inf, max(medians, default=math.inf)
     ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
-    return Reading(layout, frame, median, worst, ok)
+    return Reading(layout, frame, middle, worst, ok)
 
 
 def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
@@ -275,7 +276,7 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
     rng, layout = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
-    return float(np.median(errors)), _color_distance(inputs, pairs)
+    return median(errors), _color_distance(inputs, pairs)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
@@ -338,5 +339,5 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
     )
     count = max(1, len(errors))
     in_front, near = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
-    fits = [median < limit for median in medians if not math.isnan(median)]
+    fits = [middle < limit for middle in medians if not math.isnan(middle)]
     return Alignment(medians, in_front, near, limit, bool(fits) and all(fits) and in_front > 0.5)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from gsmerge.kernels.signature import STATUS, declare, f8, i4
 
 Array = np.ndarray[Any, Any]
+NARROW, WIDE = np.dtype(np.float32), np.dtype(np.float64)
 
 
 # b may be one matrix for all
@@ -32,9 +33,9 @@ _diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "
 
 def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
     """Return arrays in float64, and the type that a result of them has."""
-    kinds = [np.asarray(one).dtype for one in arrays]
-    kind = np.dtype(np.float32 if all(one == np.float32 for one in kinds) else np.float64)
-    return [np.asarray(one, np.float64) for one in arrays], kind
+    own = [np.asarray(one) for one in arrays]
+    kind = NARROW if all(one.dtype == NARROW for one in own) else WIDE
+    return [one if one.dtype == WIDE else one.astype(WIDE) for one in own], kind
 
 
 def matmul(a: ArrayLike, b: ArrayLike) -> Array:
@@ -46,11 +47,11 @@ def matmul(a: ArrayLike, b: ArrayLike) -> Array:
         lead = left.shape[:-2]
         first, second = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
     else:
-        lead = np.broadcast_shapes(left.shape[:-2], right.shape[:-2])
-        first, second = (
-            np.broadcast_to(one, lead + one.shape[-2:]).reshape(math.prod(lead), *one.shape[-2:])
-            for one in (left, right)
-        )
+        lead = left.shape[:-2]
+        if lead != right.shape[:-2]:
+            lead = np.broadcast_shapes(lead, right.shape[:-2])
+            left, right = (np.broadcast_to(one, lead + one.shape[-2:]) for one in (left, right))
+        first, second = (one.reshape(math.prod(lead), *one.shape[-2:]) for one in (left, right))
     out = np.empty((*first.shape[:2], second.shape[2]))
     _multiply_matrices(np.ascontiguousarray(first), np.ascontiguousarray(second), out)
     out = out.reshape(*lead, left.shape[-2], right.shape[-1])

@@ -31,11 +31,8 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
         assert content.startswith(HEADS[where.system])
         assert all(name in content for name in (b"blend_backward", b"sources_hash", hash_sources().encode()))
     assert sorted(tmp_path.iterdir()) == sorted(paths)
-
-
-def test_two_builds_are_equal(tmp_path: Path) -> None:
-    first, second = (build(tmp_path / name) for name in "ab")
-    assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
+    if tag == "manylinux_2_17_aarch64":  # of one target, which takes the least time
+        assert [path.read_bytes() for path in build(tmp_path / "again", platform=tag)] == [paths[0].read_bytes()]
 
 
 @pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")

@@ -1,0 +1,76 @@
+"""Projection errors and their derivatives, against plain formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.geometry import motion_matrices, project_points
+from gsmerge.kernels.reproject import linearise, pixel_errors
+
+K = np.array([[300.0, 0, 150], [0, 310, 110], [0, 0, 1]])
+STEP = 1e-6
+
+
+def make_poses(count: int, rng: np.random.Generator) -> np.ndarray:
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    poses[:, :3, 3] = rng.normal(0, 2, (count, 3))
+    return poses
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_errors_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, poses = rng.normal(0, 3, (400, 3)), make_poses(7, rng)
+    points[:3] = np.nan, np.inf, 1e300
+    views, pixels = rng.integers(0, 7, 400), rng.uniform(0, 300, (400, 2))
+    errors = np.empty(400)
+    pixel_errors(points, views, poses, np.tile(K, (7, 1, 1)), pixels, errors)
+    with np.errstate(all="ignore"):
+        places, depths = project_points(points[:, None], poses[views], np.tile(K, (400, 1, 1)))
+        expected = np.linalg.norm(places[:, 0] - pixels, axis=1)
+    expected = np.where((depths[:, 0] > 0) & np.isfinite(expected), expected, np.inf)
+    assert np.array_equal(errors, expected)
+    assert 0.2 < np.isinf(errors).mean() < 0.8
+
+
+@pytest.mark.parametrize("view", [-1, 2])
+def test_a_view_that_is_not_there_is_refused(view: int) -> None:
+    with pytest.raises(ValueError, match="pixel_errors"):
+        pixel_errors(
+            np.zeros((1, 3)), np.array([view]), np.zeros((2, 4, 4)), np.zeros((2, 3, 3)), np.zeros((1, 2)), np.zeros(1)
+        )
+
+
+def residuals_of(points: np.ndarray, pixels: np.ndarray, pose: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    places, _ = project_points(points, pose, intrinsics)
+    return (places - pixels).T.ravel()
+
+
+@pytest.mark.parametrize("free", [0, 1, 2, 4])
+def test_derivatives_are_central_differences(free: int) -> None:
+    rng = np.random.default_rng(free)
+    points, pixels, pose = rng.normal(0, 1, (20, 3)), rng.uniform(0, 300, (20, 2)), make_poses(1, rng)[0]
+    pose[:3, 3] = 0, 0, 6
+    jacobian, residuals = np.empty((40, 6 + free)), np.empty(40)
+    linearise(points, pixels, K, pose, jacobian, residuals)
+    assert np.allclose(residuals, residuals_of(points, pixels, pose, K), rtol=0, atol=1e-10)
+    for column in range(6 + free):
+        ends = []
+        for step in (STEP, -STEP):
+            moved, intrinsics = pose, K.copy()
+            if column < 6:
+                moved = motion_matrices(step * np.eye(6)[[column]])[0] @ pose
+            elif column - 6 >= 2:
+                intrinsics[column - 8, 2] += step
+            else:
+                intrinsics[(0, 1) if free == 1 else column - 6, (0, 1) if free == 1 else column - 6] *= np.exp(step)
+            ends.append(residuals_of(points, pixels, moved, intrinsics))
+        assert np.allclose(jacobian[:, column], (ends[0] - ends[1]) / (2 * STEP), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(("rows", "size"), [(39, 6), (40, 5), (40, 11)])
+def test_arrays_of_other_sizes_are_refused(rows: int, size: int) -> None:
+    with pytest.raises(ValueError, match="linearise"):
+        linearise(np.zeros((20, 3)), np.zeros((20, 2)), K, np.eye(4), np.empty((rows, size)), np.empty(rows))
