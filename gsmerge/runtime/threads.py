@@ -38,6 +38,7 @@ class _Pool:
         _local.inside = True
         while (work := self.work.get()) is not None:
             work()
+            del work  # it would keep what it worked on until the next one comes
 
     def shutdown(self) -> None:
         """End the threads, once all work that was handed over is done."""

@@ -3,6 +3,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+import time
+import weakref
 from collections.abc import Iterator
 
 import cv2
@@ -149,3 +151,32 @@ def test_in_turn_gives_all_results_in_order_and_holds_few(monkeypatch: pytest.Mo
             assert square == i * i
             assert len(begun) <= at_once * (i // at_once + 1)
     assert sorted(begun) == list(range(10))
+
+
+def test_nothing_is_kept_once_it_is_done() -> None:
+    class Item:
+        pass
+
+    barrier = threading.Barrier(3, timeout=30)  # each thread takes one
+    with use_threads(3):
+        items = [Item() for _ in range(3)]
+        refs = [weakref.ref(item) for item in items]
+        parallel_map(lambda _: barrier.wait(), items)
+        del items
+        for _ in range(1000):  # until the other threads have come back from their last lines
+            if all(ref() is None for ref in refs):
+                break
+            time.sleep(0.01)
+        assert [ref() for ref in refs] == [None] * 3
+
+
+def test_after_an_error_nothing_more_is_begun() -> None:
+    begun: list[int] = []
+
+    def fail(i: int) -> None:
+        begun.append(i)
+        raise KeyError(i)
+
+    with use_threads(2), pytest.raises(KeyError):
+        parallel_map(fail, range(100))
+    assert len(begun) <= 2
