@@ -42,6 +42,7 @@ from gsmerge.raster import contributions, plan_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
+from gsmerge.raster.view_plan import Splats
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
@@ -232,11 +233,23 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
 
 def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> tuple[np.ndarray, list[list[int]]]:
     """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views whose photos show many of them."""
-    total, foreign, seen = np.zeros(len(joined)), np.zeros(len(joined)), []
-    splats = prepare_splats(joined)
+    total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), prepare_splats(joined)
+    views: list[list[int]] = [[] for _ in parts]
+    for number, _, weights in _view_weights(splats, parts):
+        total += weights
+        foreign += np.where(owners == number, 0, weights)
+    at_seam = foreign > FOREIGN * total
+    for number, place, weights in _view_weights(splats, parts):  # again: those of all views would not fit into memory
+        of_seam, of_all = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
+        if place in parts[number].prepared.photo_views and of_seam > SEAM_SHARE * of_all:
+            views[number].append(place)
+    return at_seam, views
+
+
+def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yield block, view in it and the blending weights ``[n]`` of all Gaussians there, for each block's own views."""
     for number, part in enumerate(parts):
-        own_views = set(part.block.own)
-        repeated = part.prepared.repeated
+        own_views, repeated = set(part.block.own), part.prepared.repeated
         places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own_views})
         photos = blank_photos(part.prepared.scene.cameras[places], 2)
 
@@ -244,16 +257,7 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
             return contributions(plan_view(splats, **photos.camera(view)))[0]
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
-            rows = np.flatnonzero(weights)
-            total[rows] += weights[rows]
-            foreign[rows] += np.where(owners[rows] == number, 0, weights[rows])
-            seen.append((number, place, rows, weights[rows]))
-    at_seam = foreign > FOREIGN * total
-    views: list[list[int]] = [[] for _ in parts]
-    for number, place, rows, weights in seen:
-        if place in parts[number].prepared.photo_views and weights[at_seam[rows]].sum() > SEAM_SHARE * weights.sum():
-            views[number].append(place)
-    return at_seam, views
+            yield number, place, weights
 
 
 def free_scene(scene: Scene) -> None:
