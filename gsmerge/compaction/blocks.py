@@ -44,7 +44,7 @@ from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
 from gsmerge.raster.view_plan import Splats
 from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.runtime.memory import free_pages, peak_memory
+from gsmerge.runtime.memory import free_pages, make_array, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.runtime.work import start_work
@@ -63,6 +63,7 @@ SEAM_LOOKS = 2  # at each view, at least
 SEAM_RATE = 0.6  # times the usual first steps: what is there is fitted, but not beside its neighbours as they are now
 SEAM_DECAY = 0.1  # factor on the steps at the end
 MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views see so much of each other's
+IN_FILE = 1 << 24  # bytes from which on the photos of a block are in a file
 SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is too many are left out
 
 
@@ -96,9 +97,8 @@ def compact_in_blocks(
 
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
-                free_scene(scene)
                 piece_options = block_options(options, scene, block, factor, most)
-                yield subset(scene, block.views), block, seen, piece_options, frame
+                yield take_views(scene, block.views), block, seen, piece_options, frame
 
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
         with stage("join"):
@@ -106,8 +106,7 @@ def compact_in_blocks(
             owners = np.repeat(np.arange(count), [len(part.gaussians) for part in parts])
             growth = sum(part.count for part in parts) / max(1, len(joined))
         everything = work.share((joined, owners))
-        fits = ((part, everything, i, growth) for i, part in enumerate(parts))
-        fitted = list(adopt_records(work.run("fit", fit_part, count, fits)))
+        fitted = list(adopt_records(work.run("fit", fit_part, count, each_part(parts, everything, growth))))
         joined = Gaussians.concat([gaussians for gaussians, _ in fitted])
         owners = np.repeat(np.arange(count), [len(gaussians) for gaussians, _ in fitted])
         result = frame.leave(fit_seams(joined, owners, parts, options.seed))
@@ -118,8 +117,8 @@ def compact_in_blocks(
         shown_by = DEVICES.get(str(options.budget.budget))
         report_overdraw(frame.enter(result), frame.enter_cameras(scene.cameras), shown_by)
         everything = work.share(result)
-        views = ((part, everything) for part in parts)
-        scores = [score for score, _ in adopt_records(work.run("score", score_part, count, views))]
+        scored = work.run("score", score_part, count, each_part(parts, everything))
+        scores = [score for score, _ in adopt_records(scored)]
     facts = [
         {
             "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
@@ -164,15 +163,29 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
-    """Return a prepared scene without Gaussians, to free their memory."""
+    """Return a prepared scene without Gaussians and with photos in a file, to free their memory."""
+    moved: dict[int, np.ndarray] = {}  # photos that both scenes share are moved once
 
     def bare(scene: Scene) -> Scene:
-        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], pixel_ids=None, missing=None)
+        images = scene.images
+        if images is not None and id(images) not in moved:
+            moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
+            moved[id(images)][:] = images
+        images = None if images is None else moved[id(images)]
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixel_ids=None, missing=None)
 
     return replace(prepared, scene=bare(prepared.scene), input_scene=bare(prepared.input_scene))
 
 
-def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, growth: float) -> Gaussians:
+def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield arguments for a call with each part: it, ``values`` and its number; then release what it has in files."""
+    for number, part in enumerate(parts):
+        yield part, *values, number
+        for scene in (part.prepared.scene, part.prepared.input_scene):
+            free_scene(scene)
+
+
+def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
     """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``number``.
 
     ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians, as
@@ -191,7 +204,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], number: int, 
     return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
-def score_part(part: Part, gaussians: Gaussians) -> tuple[float | None, Covered | None]:
+def score_part(part: Part, gaussians: Gaussians, _: int) -> tuple[float | None, Covered | None]:
     """Measure the PSNR (dB) of the whole result on a block's scored photos, and where the input covers them."""
     psnr = measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
     return psnr, measure_covered(part.before, gaussians, part.prepared, part.plan)
@@ -208,11 +221,11 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
         return joined
     with stage("join"):
         at_seam, views = find_seams(joined, owners, parts)
-        scenes = [subset(part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids]
-    if not scenes:
-        return joined
-    scene = concat_scenes(scenes)
-    scene = replace(scene, cameras=in_float64(scene.cameras))
+        if not any(views):
+            return joined
+        chosen = ((part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids)
+        scene = concat_scenes([take_views(part_scene, ids) for part_scene, ids in chosen])
+        scene = replace(scene, cameras=in_float64(scene.cameras))
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
     options = replace(
@@ -258,6 +271,13 @@ def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, 
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
             yield number, place, weights
+
+
+def take_views(scene: Scene, views: Sequence[int]) -> Scene:
+    """Copy views of a scene, and release its memory as :func:`free_scene` does."""
+    piece = subset(scene, views)
+    free_scene(scene)
+    return piece
 
 
 def free_scene(scene: Scene) -> None:

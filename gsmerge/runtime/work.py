@@ -98,9 +98,12 @@ class Work:
         if self.cluster is not None:
             yield from self._run_there(self.cluster, title, function, count, calls)
             return
-        for place, arguments in enumerate(calls, 1):
+        place = 0
+        for arguments in calls:  # not by enumerate, which would keep them until the next ones are made
+            place += 1  # noqa: SIM113
             with record_part(title=f"block {place} of {count}: {title}") as record:
                 value = function(*arguments)
+            del arguments
             yield value, record
 
     def _run_there(

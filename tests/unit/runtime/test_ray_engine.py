@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import weakref
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -169,3 +170,20 @@ def test_a_task_asks_for_what_one_node_has() -> None:
     empty, _ = work_of([{"memory": 9.0}])
     with refuses(UsageError, "engine ray", "processors", "none"):
         empty.cluster.needs(1, 1)
+
+
+def test_arguments_of_a_call_are_gone_before_those_of_the_next_one_are_made() -> None:
+    class Piece:
+        pass
+
+    last: list[weakref.ref[Piece]] = []
+
+    def make_piece() -> Piece:
+        assert [ref() for ref in last] == [None] * len(last)
+        piece = Piece()
+        last.append(weakref.ref(piece))
+        return piece
+
+    with start_work("local", threads=1, memory=0) as work:
+        outcomes = list(work.run("make", id, 3, ((make_piece(),) for _ in range(3))))
+    assert len(outcomes) == len(last) == 3
