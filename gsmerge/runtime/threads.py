@@ -163,25 +163,27 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:
     """Work off the items on this thread and some of the pool's; who is free takes the next.
 
-    A thread that comes too late for any is not waited for. After an error nothing more is begun.
+    A thread that comes too late for any is not waited for. After an error nothing more is begun; of several errors that
+    of the first item is raised, whichever thread is quicker.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     following = itertools.count()  # its next() is atomic
-    ends: SimpleQueue[tuple[int, BaseException | None]] = SimpleQueue()  # how many items a thread took, and its error
+    errors: dict[int, BaseException] = {}  # by item; those before a failed one have all been begun
+    ends: SimpleQueue[int] = SimpleQueue()  # how many items each thread took
 
     def work() -> None:
-        taken, error = 0, None
+        taken, failed = 0, False
         for index in following:
             if index >= len(items):
                 break
             taken += 1
             try:
-                if error is None:
+                if not failed:
                     results[index] = function(items[index])
-            except BaseException as caught:
-                error = caught
+            except BaseException as error:
+                errors[index], failed = error, True
         if taken:
-            ends.put((taken, error))
+            ends.put(taken)
 
     for _ in range(helpers):
         pool.work.put(work)
@@ -190,10 +192,9 @@ def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int
         work()
     finally:
         _local.inside = False
-    left, first_error = len(items), None
+    left = len(items)
     while left:
-        taken, error = ends.get()
-        left, first_error = left - taken, first_error or error
-    if first_error is not None:
-        raise first_error
+        left -= ends.get()
+    if errors:
+        raise errors.pop(min(errors))
     return results

@@ -180,3 +180,12 @@ def test_after_an_error_nothing_more_is_begun() -> None:
     with use_threads(2), pytest.raises(KeyError):
         parallel_map(fail, range(100))
     assert len(begun) <= 2
+
+
+def test_the_error_of_the_first_item_comes_through() -> None:
+    def fail(i: int) -> None:
+        time.sleep(0.02 * (2 - i))  # the last one fails first
+        raise KeyError(i)
+
+    with use_threads(3), pytest.raises(KeyError, match="0"):
+        parallel_map(fail, range(3))
