@@ -192,7 +192,8 @@ def _formats_page(page: str) -> str:
     from gsmerge.io.formats.table import FORMATS as ROWS
 
     rows = [
-        (f"`{row.ending}`", "no" if row.read is None else "yes", str(row.max_degree),
+        (f"`{row.ending}`", "no" if row.read is None else "yes",
+         str(row.max_degree) if row.max_degree >= 0 else "not written",
          *(f"{row.each[i]:.0f}" if i < len(row.each) else "" for i in (0, 3)), row.about)
         for row in ROWS
     ]  # fmt: skip

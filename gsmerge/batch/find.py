@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,8 +15,8 @@ from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
-from gsmerge.io.formats.glb import holds_gaussians
-from gsmerge.io.formats.ply import header_counts
+from gsmerge.io.formats import depth_maps
+from gsmerge.io.formats.table import estimate_counts, may_hold_gaussians
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import stem_of
 from gsmerge.scene.files import (
@@ -34,7 +35,8 @@ from gsmerge.settings.compact import CompactOptions
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it
 _JOB_BYTES = 700  # of memory for each scene of a list
-SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
+DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
+SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
 SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
@@ -59,7 +61,7 @@ class Job:
     index: int  # its place in the list
     scene: str  # a ``.ply``, or the folder of one
     output: str  # name of the result in the output folder
-    num_gaussians: int  # by the header of its file; 0 where it cannot be read
+    num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
     num_rest: int = 0  # columns of higher harmonics, likewise
     work: Work | None = None  # what is done with it; None: it is compacted with the settings of the batch
 
@@ -92,7 +94,7 @@ def find_jobs(
         if real in inputs or real in results:
             continue
         inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *header_counts(ply))
+        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *estimate_counts(scene_plys(scene)))
         for name in result_names(job.output, options):
             if name in owners:
                 raise UsageError(
@@ -110,6 +112,13 @@ def find_jobs(
 def result_names(output: str, options: BatchOptions) -> list[str]:
     """Return the file names of a result and of its coarser levels."""
     return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
+
+
+def scene_plys(scene: Path) -> list[Path]:
+    """List the files of a scene, which is one of them or their folder; none of a folder that reading it refuses."""
+    with suppress(SceneError):
+        return list_plys(scene) if os.path.isdir(scene) else [scene]
+    return []
 
 
 def main_file(scene: Path) -> Path:
@@ -246,7 +255,13 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def _is_scene(folder: Path, names: list[str]) -> bool:
     """Return whether a folder with these names in it is a scene."""
     try:
-        return not SCENE_NAMES.isdisjoint(names) and named_ply(folder) is not None
+        if SCENE_NAMES.isdisjoint(names):
+            return False
+        if named_ply(folder) is not None:
+            return True
+        return not any(name.endswith(".ply") for name in names) and bool(depth_maps.find_depth_maps(folder))
+    except SceneError:  # a frame is missing: reading the scene says which
+        return True
     except OSError:  # its names can be read, and nothing else
         return False
 
@@ -256,7 +271,7 @@ def _matches(pattern: str, search: _Search) -> Iterator[Path]:
         path = Path(name)
         if os.path.isdir(path):
             yield from search.walk(path)
-        elif path.suffix in SCENE_SUFFIXES and (path.suffix != ".glb" or holds_gaussians(path)):
+        elif may_hold_gaussians(path):
             yield path
 
 

@@ -73,7 +73,7 @@ def estimate_seconds(jobs: Sequence[Job], options: BatchOptions, schedule: Sched
     """Estimate the wall time of all scenes in seconds, within a factor of about two."""
 
     total = 0.0
-    for job in jobs:
+    for job in (job for job in jobs if job.num_gaussians):  # the run says what cannot be read
         views = 1  # where cameras cannot be read
         with suppress(SceneError):
             files = find_scene_files(Path(job.scene))

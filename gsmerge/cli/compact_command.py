@@ -145,12 +145,11 @@ def _check_scenes(args: opt.Args) -> None:
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
     from gsmerge.facts.partition import gaussians_at_once
-    from gsmerge.io.formats.ply import header_counts
+    from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem
 
-    counts = [header_counts(ply) for scene_files in (files, *files.more) for ply in scene_files.plys]
-    count, num_rest = sum(count for count, _ in counts), max(rest for _, rest in counts)
+    count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
     needed = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=count - at_once)
     problem = memory_problem(needed)

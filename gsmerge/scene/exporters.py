@@ -109,7 +109,12 @@ _EXPORTERS = (
                 "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
                 " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
                 'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
-                " where its photos show the cameras; refused without `gs_ply`",
+                ' where its photos show the cameras; of `"npz"` alone the depth maps',
+            ),
+            Model(
+                "DA3-Streaming", "ByteDance-Seed/Depth-Anything-3 2c21ea8, `da3_streaming/`",
+                "`camera_poses.txt`, `intrinsic.txt`, and `results_output/frame_N.npz` with `save_depth_conf_result`",
+                "the depth maps of all chunks, as one scene",
             ),
             Model(
                 "Lyra 2", "nv-tlabs/lyra 67392d9",

@@ -17,6 +17,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
+from gsmerge.io.formats.depth_maps import FRAMES, find_depth_maps, is_frame
 from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.no_gaussians import check_scene_file, no_gaussians
@@ -62,7 +63,9 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path from which names of results are derived: the file, or ``scene.ply`` in the folder of parts."""
+        """Path from which names of results are derived: the file, or ``scene.ply`` in the folder of parts or frames."""
+        if is_frame(self.ply):
+            return self.ply.parent.with_name("scene.ply")
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -102,7 +105,7 @@ def find_scene_files(
         check_scene_file(part)
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE))
+    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
@@ -110,6 +113,8 @@ def find_scene_files(
     camera_path = _named(cameras) or result_cameras(ply)
     camera_path = camera_path or next((place for place in places if place is not None), None)
     image_path = _named(images)
+    if image_path is None and is_frame(ply):
+        image_path = ply
     if image_path is None and camera_path is not None:
         has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))
         image_path = camera_path if has_images else None
@@ -152,6 +157,8 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     if not plys:
         raise no_gaussians(folder)
     places = {path.parent for path in plys}
+    if is_frame(plys[0]):
+        return plys
     parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
     if parts is None:
         start = places.pop() if len(places) == 1 else folder
@@ -164,11 +171,12 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, or only results of gsmerge;
-    at last one of a usual name that holds no Gaussians, so that its reader says what it lacks.
+    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, depth maps, or only results
+    of gsmerge; at last one of a usual name that holds no Gaussians, so that its reader says what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
-    plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)] or _results_in(folder)
+    plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
+    plys = plys or find_depth_maps(folder) or _results_in(folder)
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.formats import glb
 from gsmerge.io.formats.ply import header_content
-from gsmerge.io.formats.table import SCENE_SUFFIXES
+from gsmerge.io.formats.table import may_hold_gaussians
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
 _NAME = "name the .ply of the Gaussians, or the folder that it is in"
@@ -32,15 +31,21 @@ POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
         ("exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "scene.glb"),
-        'ask it for export_format="npz-gs_ply" or "mini_npz-gs_ply" with infer_gs=True and a giant model',
+        'ask it for export_format="npz", whose depth maps are read, or for "npz-gs_ply" with infer_gs=True and a giant'
+        " model",
     ),
     PointsOnly("gsplat's trainer", ("ckpts/ckpt_*.pt",), "run it with its option save_ply"),
     PointsOnly("nerfstudio", ("nerfstudio_models/*.ckpt",), "write them with ns-export gaussian-splat"),
+    PointsOnly(
+        "DA3-Streaming or VGGT-Long",
+        ("camera_poses.txt",),
+        "run DA3-Streaming with save_depth_conf_result: True, whose results_output/frame_*.npz are read",
+    ),
     PointsOnly("FLARE", ("pred.npz",), f"it has no Gaussians to write: {_TRAIN}"),
     PointsOnly(
         "VGGT or MapAnything",
         ("sparse/points.ply", "dense_mesh.glb", "glbscene_*.glb", "predictions.npz", "points.ply"),
-        f"they have no Gaussians to write: {_TRAIN}",
+        "write depth, extrinsic, intrinsic and images into predictions.npz, whose depth maps are read",
     ),
     PointsOnly(
         "COLMAP",
@@ -50,7 +55,7 @@ POINTS_ONLY = (
     PointsOnly(
         "a model of points",
         ("*.glb", "*.npz"),
-        'Depth Anything 3 writes Gaussians with export_format="npz-gs_ply" and infer_gs=True, VGGT has none',
+        'write depth, extrinsics, intrinsics and image, as export_format="npz" of Depth Anything 3 does, or Gaussians',
     ),
 )
 
@@ -75,7 +80,11 @@ def find_remedy(folder: Path) -> str:
 
 def _content(folder: Path) -> tuple[str, str] | None:
     """Describe what a folder has in the place of a .ply, and what to do about it; None if nothing in it is known."""
-    files = (path for path in sorted(folder.glob("[!.]*")) if path.is_file() and _holds_gaussians(path))
+    files = (
+        path
+        for path in sorted(folder.glob("[!.]*"))
+        if path.is_file() and path.suffix != ".ply" and may_hold_gaussians(path)
+    )
     named = next(files, None)
     if named is not None:
         return named.name, "name that file"
@@ -90,15 +99,9 @@ def _content(folder: Path) -> tuple[str, str] | None:
 def check_scene_file(path: Path) -> None:
     """Raise SceneError with the remedy for a file that is known to hold no Gaussians, such as ``results.npz``."""
     suffix = path.suffix.lower()
-    if suffix not in (".npz", ".glb") or not check_file(path) or (suffix == ".glb" and glb.holds_gaussians(path)):
+    if suffix not in (".npz", ".glb") or not check_file(path) or may_hold_gaussians(path):
         return
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])
     problem = f"expected a file of Gaussians, found {suffix[1:]} without any, as {row.title} writes it"
     raise SceneError(path, problem, row.remedy)
-
-
-def _holds_gaussians(path: Path) -> bool:
-    """Return whether a file other than a .ply has Gaussians by its ending; a .glb is looked into."""
-    suffix = path.suffix.lower()
-    return suffix != ".ply" and suffix in SCENE_SUFFIXES and (suffix != ".glb" or glb.holds_gaussians(path))

@@ -27,11 +27,12 @@ from gsmerge.alignment import (
 )
 from gsmerge.alignment.registration.join import join_scenes
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity
+from gsmerge.geometry import Similarity, rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
-from gsmerge.io.cameras.npz_files import read_depths
+from gsmerge.io.cameras.npz_files import holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
+from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -284,6 +285,7 @@ def _make_load(
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], None if images is None else images[views]
+    gaussians = _color_from_photos(gaussians, images, files)
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]
     masks, described = check_masks(masks, files)
@@ -316,6 +318,16 @@ def _make_load(
         problem=result.problem,
         moves=result.moves,
     )
+
+
+def _color_from_photos(gaussians: Gaussians, images: np.ndarray | None, files: SceneFiles) -> Gaussians:
+    """Give Gaussians of depth maps without images the photos' colours; others stay. SceneError without photos."""
+    if input_format(files.ply) is not DEPTHS or holds_images(files.ply):
+        return gaussians
+    if images is None or images.size != 3 * len(gaussians):
+        problem = "expected images with the depth maps, found none, and no photos of their views"
+        raise SceneError(files.ply, problem, "name their folder with --images")
+    return replace(gaussians, sh0=rgb_to_sh0(images.reshape(-1, 1, 3)))
 
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:

@@ -25,6 +25,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras, read_sharp_camera
+from gsmerge.io.formats.depth_maps import is_frame, read_images
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
@@ -179,6 +180,8 @@ def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
     paths = _photo_paths(files, camera_file)
     if paths is not None or files.images is None:
         return decode_images(paths) if paths else None
+    if is_frame(files.images):
+        return read_images(files.plys)
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
     if same_file and stored is None and files.images.suffix == CHUNK:

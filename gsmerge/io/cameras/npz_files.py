@@ -14,6 +14,7 @@ import warnings
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -103,6 +104,37 @@ def read_depths(path: Path) -> np.ndarray | None:
     if depths is not None and depths.ndim == 4 and depths.shape[3] == 1:
         depths = depths[..., 0]
     return depths if depths is not None and depths.ndim == 3 and depths.dtype.kind in "fiu" else None
+
+
+class Frame(NamedTuple):
+    """One view with its depth map, as DA3-Streaming writes each into a file of its own."""
+
+    depth: np.ndarray  # ``[h,w]``, along z
+    image: np.ndarray  # ``[h,w,3]`` uint8
+    K: np.ndarray  # ``[3,3]``, pixels
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.depth.shape[1], self.depth.shape[0]
+
+
+def read_frame(path: Path) -> Frame:
+    """Read a frame of DA3-Streaming; SceneError if an array is missing or of another shape than the others."""
+    names = ("depth", "image", "intrinsics")
+    arrays = read_arrays(path, names)
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise _missing(path, missing, arrays)
+    depth, image, K = (arrays[name] for name in names)
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu":
+        raise SceneError(path, f"expected a depth map [h,w] of numbers, found {list(depth.shape)} of {depth.dtype}")
+    _check_poses(path, np.eye(4)[None], K[None], ("poses", "intrinsics [3,3]"))
+    image = _as_images(path, image[None], 1)[0]
+    if image.shape[:2] != depth.shape:
+        problem = f"expected an image of the depth map's size {list(depth.shape)}, found {list(image.shape[:2])}"
+        raise SceneError(path, problem)
+    return Frame(depth, image, K.astype(np.float64))
 
 
 def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:

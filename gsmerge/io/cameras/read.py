@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file, read_lines
+from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
     C2W_OPENGL,
     W2C_OPENCV,
     CameraFile,
-    View,
-    check_count,
-    make_pinhole,
 )
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
@@ -33,6 +27,7 @@ from gsmerge.io.cameras.json_files import (
     read_world_mirror,
 )
 from gsmerge.io.cameras.npz_files import array_names, holds_poses, is_da3, read_da3, read_dump
+from gsmerge.io.cameras.pose_lines import lists_poses, read_poses
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.re10k import read_re10k, read_scenes
 from gsmerge.types import StrPath
@@ -44,9 +39,6 @@ CAMERA_PLACES = (
     "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
     "results.npz", "cameras.npz", "camera_poses.txt", "0", ".",
 )  # fmt: skip
-INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
-_POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
-_MOST_COLUMNS = max(_POSE_COLUMNS)
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 
 
@@ -105,7 +97,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         path = inside
     if not path.is_dir():
         check_file(path)
-        if path.suffix in (".bin", ".txt") and not _lists_poses(path):
+        if path.suffix in (".bin", ".txt") and not lists_poses(path):
             if not is_colmap(path.parent):
                 raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
             path = path.parent
@@ -130,52 +122,6 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
     return _SHARP.cameras(source) if _SHARP.recognise(source) else None
 
 
-def _lists_poses(path: Path) -> bool:
-    with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
-        return len(np.array(_words(file.readline(4096)), np.float64)) in _POSE_COLUMNS
-    return False
-
-
-def _read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
-
-    A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
-    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the images
-    have the size. SceneError if a line has another number of numbers.
-    """
-    path, poses = source.path, _rows(source.path, _POSE_COLUMNS)
-    intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
-    if intrinsics is None:
-        return StoredCameras([View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
-    values = _rows(intrinsics, (4,))
-    if len(values) not in (1, len(poses)):
-        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
-    Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
-    views = [View(f"{i:06d}", pose.reshape(-1, 4), K) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
-    return StoredCameras(views)
-
-
-def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
-    rows: list[np.ndarray] = []
-    for number, line in enumerate(read_lines(path), 1):
-        words = _words(line)
-        if words and len(words) not in lengths:
-            counts = " or ".join(map(str, lengths))
-            found = len(words) if len(words) <= _MOST_COLUMNS else f"more than {_MOST_COLUMNS}"
-            raise SceneError(path, f"line {number}: expected {counts} numbers, found {found}")
-        try:
-            rows += [np.array(words, np.float64)] if words else []
-        except ValueError as error:
-            raise SceneError(path, f"line {number}: expected numbers ({error})") from error
-        check_count(path, len(rows))
-    return rows
-
-
-def _words(line: str) -> list[str]:
-    """Split a line into words; the last has all that follows the most that a pose has."""
-    return line.replace(",", " ").split(maxsplit=_MOST_COLUMNS)
-
-
 _SHARP = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
@@ -190,7 +136,7 @@ CAMERA_FORMATS = (
                  W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin")),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(read_colmap, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses"),
-    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _read_poses,
+    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", read_poses,
                  C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms,

@@ -11,9 +11,9 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import arrays, ply, streamed
+from gsmerge.io.formats import arrays, depth_maps, ply, streamed
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import PLY, SCENE_SUFFIXES, input_format
+from gsmerge.io.formats.table import DEPTHS, PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, make_array
@@ -124,10 +124,11 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read one PLY file, or several with the same columns as one, in their order; see :func:`read_ply`."""
+    """Read one PLY file, or several of the same columns or of depth maps as one, in order; see :func:`read_ply`."""
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    parts = [ply.read_rows(path) for path in paths]
+    read = depth_maps.read_rows if input_format(paths[0]) is DEPTHS else ply.read_rows
+    parts = [read(path) for path in paths]
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -9,7 +10,7 @@ from pathlib import Path
 
 from gsmerge.errors import UsageError
 from gsmerge.io.cameras import colmap_model
-from gsmerge.io.formats import compressed, glb, ply, sog, splat, spz, streamed, usd
+from gsmerge.io.formats import compressed, depth_maps, glb, ply, sog, splat, spz, streamed, usd
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.types import Gaussians, StrPath
 
@@ -23,10 +24,11 @@ class Format:
     read: Callable[[Path], StoredRows] | None  # None: it is only written
     # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
-    max_degree: int  # of the harmonics that there is room for
+    max_degree: int  # of the harmonics that there is room for; -1: it is only read
     version: int | None = None  # where several are written
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
     each: Sequence[float] = ()  # bytes of a Gaussian by degree: of a .sog or .spz those of results, as measured
+    holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
     def names(self, path: StrPath) -> bool:
         """Return whether a path ends as files of this format do."""
@@ -63,7 +65,7 @@ FILES = (  # of endings that end alike the longest first
     Format(".splat", "antimatter15's format", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE,
-        each=(52.1, 88.1, 148.1, 232.2),
+        holds=glb.holds_gaussians, each=(52.1, 88.1, 148.1, 232.2),
     ),
     Format(
         ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, usd.usdc_bytes, usd.MAX_DEGREE,
@@ -77,9 +79,13 @@ FILES = (  # of endings that end alike the longest first
         ".usdz", "USD, a .usdc in an archive", None, usd.usdz_bytes, usd.MAX_DEGREE, require=usd.require_usd, each=_USD,
     ),
 )  # fmt: skip
-FORMATS = (*FILES, LEVELS, COLMAP)
+DEPTHS = Format(
+    depth_maps.SUFFIX, "depth maps with images and cameras: a Gaussian for each pixel", depth_maps.read_rows, None, -1,
+    holds=depth_maps.holds_depth_maps, each=(6.0,),
+)  # fmt: skip
+FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS)
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FILES))
-SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in FILES if row.read is not None))
+SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
 
 
 def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
@@ -95,9 +101,33 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
     return int(max_bytes / each)
 
 
+def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return about how many Gaussians files have together, and the most columns of harmonics above degree 0 of one.
+
+    Exact of a ``.ply`` by its header, of other formats by the bytes; zeros where nothing can be read.
+    """
+    counts = [
+        ply.header_counts(path) if input_format(path).read is ply.read_rows else _by_bytes(path) for path in paths
+    ]
+    return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
+
+
+def _by_bytes(path: Path) -> tuple[int, int]:
+    """Return about how many Gaussians a file has, at degree 0, and no columns of harmonics."""
+    try:
+        return int(path.stat().st_size / (input_format(path).each or (math.inf,))[0]), 0
+    except OSError:
+        return 0, 0
+
+
 def input_format(path: StrPath) -> Format:
     """Return the format of a path to read; PLY for unknown endings."""
     return next((row for row in FORMATS if row.names(path)), PLY)
+
+
+def may_hold_gaussians(path: Path) -> bool:
+    """Return whether a file has an ending of Gaussians, and content where the ending has others, too."""
+    return path.suffix.lower() in SCENE_SUFFIXES and input_format(path).holds(path)
 
 
 def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, cameras: bool = False) -> Format:
@@ -106,7 +136,7 @@ def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, 
     ``levels``: the name may be that of an index of levels of detail; ``cameras``: or that of a COLMAP model, which
     holds cameras. ValueError if there is no such version.
     """
-    rows = [row for row in FORMATS if row.names(path)]
+    rows = [row for row in FORMATS if row.names(path) and row.max_degree >= 0]
     if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):
         rows = []
     if not rows and not cameras and Path(path).name in (colmap_model.FOLDER, colmap_model.POINTS):

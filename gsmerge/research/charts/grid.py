@@ -11,12 +11,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from gsmerge.batch.find import Job, find_scenes, main_file
+from gsmerge.batch.find import Job, find_scenes, main_file, scene_plys
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_table
 from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.read import find_cameras
-from gsmerge.io.formats.ply import header_counts
+from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, RunRecord, describe
@@ -223,7 +223,7 @@ def make_jobs(
         if len(runs) < len(chosen):
             few = len(chosen) - len(runs)
             notes.append(f"{source.name} has fewer views than asked for: {few} run(s) left out")
-        num_gaussians, num_rest = header_counts(main_file(source.path))
+        num_gaussians, num_rest = estimate_counts(scene_plys(source.path))
         for method, settings, views, options in runs:
             label = describe(method, settings, views)
             name = re.sub(r"[^\w.%+=, -]", "_", label)[:MAX_NAME]  # which file systems and shells take

@@ -103,16 +103,22 @@ def test_the_folder_of_gsplat_s_trainer(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "place", "said"),
     [
-        (f"{DA3}, npz", "out", ("results.npz", "npz-gs_ply")),
-        (f"{DA3}, results.npz", "results.npz", ("npz-gs_ply",)),
         (f"{DA3}, scene.glb", "scene.glb", ("npz-gs_ply",)),
-        ("MapAnything", "out", ("MapAnything", "--cameras")),
-        ("VGGT", "out", ("VGGT", "--cameras")),
+        ("MapAnything", "out", ("MapAnything", "predictions.npz")),
+        ("VGGT", "out", ("VGGT", "predictions.npz")),
     ],
 )
 def test_folders_without_gaussians(tmp_path: Path, name: str, place: str, said: tuple[str, ...]) -> None:
     with refuses(SceneError, place, *said):
         load(name, tmp_path)
+
+
+@pytest.mark.parametrize("name", [f"{DA3}, npz", f"{DA3}, results.npz"])
+def test_depth_maps_without_gaussians(tmp_path: Path, name: str) -> None:
+    loaded = load_scene(MODELS[name](tmp_path / "out").path)
+    assert loaded.scene.aligned
+    assert loaded.scene.images is not None
+    assert loaded.info.layout.startswith("depth maps")
 
 
 # Nothing but Gaussians

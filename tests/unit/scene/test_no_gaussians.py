@@ -39,7 +39,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
     """Leave a file of the kind that its name says."""
     path = folder / name
     if path.suffix == ".npz":
-        write_npz(path, tiny)
+        write_npz(path, tiny, depth=None)
     elif path.suffix == ".glb":
         write_mesh(path)
     elif path.suffix == ".ply":
@@ -54,18 +54,23 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
 @pytest.mark.parametrize(
     ("left", "found", "said"),
     [
-        (("exports/npz/results.npz", "scene.glb"), "exports/npz/results.npz", ("Depth Anything 3", "infer_gs=True")),
-        (("exports/mini_npz/results.npz",), "exports/mini_npz/results.npz", ("mini_npz-gs_ply", "giant")),
+        (
+            ("exports/npz/results.npz", "scene.glb"),
+            "exports/npz/results.npz",
+            ("depth maps", "infer_gs=True"),
+        ),
+        (("exports/mini_npz/results.npz",), "exports/mini_npz/results.npz", ("npz-gs_ply", "giant")),
         (("scene.glb", "scene.jpg"), "scene.glb", ("Depth Anything 3", "npz-gs_ply")),
         (("results.npz",), "results.npz", ("Depth Anything 3", "npz-gs_ply")),
-        (("sparse/cameras.bin", "sparse/points.ply"), "sparse/points.ply", ("MapAnything", "--cameras")),
-        (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "--cameras")),
+        (("sparse/cameras.bin", "sparse/points.ply"), "sparse/points.ply", ("MapAnything", "predictions.npz")),
+        (("predictions.npz", "glbscene_50.glb"), "glbscene_50.glb", ("VGGT", "intrinsic")),
         (("sparse/0/cameras.bin",), "sparse/0/cameras.bin", ("COLMAP", "--cameras")),
         (("cameras.bin",), "cameras.bin", ("COLMAP", "--cameras")),
         (("cfg.yml", "ckpts/ckpt_29999_rank0.pt"), "ckpts/ckpt_29999_rank0.pt", ("gsplat", "save_ply")),
         (("config.yml", "nerfstudio_models/step-000029999.ckpt"), "nerfstudio_models", ("ns-export",)),
         (("pred.npz",), "pred.npz", ("FLARE",)),
-        (("output.glb",), "output.glb", ("npz-gs_ply", "VGGT")),
+        (("camera_poses.txt", "pcd/0_pcd.ply"), "camera_poses.txt", ("DA3-Streaming", "save_depth_conf_result")),
+        (("output.glb",), "output.glb", ("depth", "Depth Anything 3")),
         (("mesh.ply",), "mesh.ply", ("points", "name")),
         (("notes.txt",), "none", ()),
     ],
@@ -91,10 +96,10 @@ def test_a_folder_without_gaussians(
     ("name", "said"),
     [
         ("results.npz", ("Depth Anything 3", "npz-gs_ply")),
-        ("predictions.npz", ("VGGT", "--cameras")),
-        ("any.npz", ("npz-gs_ply", "VGGT")),
+        ("predictions.npz", ("VGGT", "extrinsic")),
+        ("any.npz", ("depth", "Depth Anything 3")),
         ("scene.glb", ("Depth Anything 3", "infer_gs=True")),
-        ("OUTPUT.GLB", ("npz-gs_ply", "VGGT")),
+        ("OUTPUT.GLB", ("depth", "Depth Anything 3")),
     ],
 )
 def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]) -> None:
