@@ -10,7 +10,7 @@ import os
 import secrets
 import socket
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,6 +53,7 @@ class Task:
     job: Job  # the scene
     known: DoneResult | None  # its result of former runs; None without one
     attempt: int = 1  # from 1
+    earlier: str | None = None  # in a sequence: name of the result before it in the output folder
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     """Skip or compact a scene, and return its record."""
     job, options = task.job, context.options
     files = _files_of(job, options)
-    key = _key_of(job, files, options)
+    key = _key_of(task, files, context)
     before, since = task.known, new_records.known.get(job.output)
     for done in (since, None if options.rerun else before):
         if done is not None and done.holds(context.folder, key):
@@ -147,6 +148,7 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
                 opacity=options.opacity,
                 hints=options.hints,
                 hashed=True,
+                earlier=None if task.earlier is None else context.folder / task.earlier,
             )
             written = [out, *(Path(level["path"]) for level in document["levels"])]
         else:
@@ -167,8 +169,10 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
     return find_scene_files(scene, cameras=filled(options.cameras, scene), images=filled(options.images, scene))
 
 
-def _key_of(job: Job, files: SceneFiles, options: BatchOptions) -> str:
-    return scene_key(files, options) if job.work is None else job.work.key(options)
+def _key_of(task: Task, files: SceneFiles, context: BatchContext) -> str:
+    job, options = task.job, context.options
+    key = scene_key(files, options) if job.work is None else job.work.key(options)
+    return key if task.earlier is None else digest({"key": key, "earlier": file_sha256(context.folder / task.earlier)})
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
@@ -180,12 +184,22 @@ def scene_key(files: SceneFiles, options: BatchOptions) -> str:
     return digest({**content, "tool_version": __version__, "schema_version": SCHEMA_VERSION})
 
 
-def is_done(job: Job, done: DoneResult, context: BatchContext) -> bool:
-    """Return whether a result is up to date, so that its scene is skipped."""
+def is_done(task: Task, context: BatchContext) -> bool:
+    """Return whether a scene's known result is up to date, so that the scene is skipped."""
     try:
-        return done.holds(context.folder, _key_of(job, _files_of(job, context.options), context.options))
+        files = _files_of(task.job, context.options)
+        return task.known is not None and task.known.holds(context.folder, _key_of(task, files, context))
     except SceneError:
         return False
+
+
+def make_tasks(jobs: Iterable[Job], known: Mapping[str, DoneResult], context: BatchContext) -> Iterator[Task]:
+    """Yield the task of each job; in a sequence with the result before it, if there is one when the task is taken."""
+    earlier = None
+    for job in jobs:
+        yield Task(job, known.get(job.output), earlier=earlier)
+        if context.options.sequence and (context.folder / job.output).is_file():
+            earlier = job.output
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:
