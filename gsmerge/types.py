@@ -357,7 +357,9 @@ class Scene:
 def grid_ids(valid: np.ndarray) -> np.ndarray:
     """Return the ``pixel_ids [n]`` of an aligned scene, given a mask ``[v,h,w]`` of its finite Gaussians."""
     flat = np.asarray(valid).reshape(-1)
-    return np.where(flat, np.arange(len(flat), dtype=np.int32), np.int32(-1))
+    ids = np.arange(len(flat), dtype=np.int32)
+    ids[~flat] = -1
+    return ids
 
 
 @dataclass(frozen=True)

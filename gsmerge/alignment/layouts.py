@@ -53,9 +53,9 @@ class Layout:
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
     def pixel_ids(self, count: int) -> np.ndarray:
-        """Return the pixel ``(block·H + y)·W + x`` of each of ``count`` rows, int64; -1 for rows without one."""
+        """Return the pixel ``(block·H + y)·W + x`` of each of ``count`` rows; -1 for rows without one."""
         if self.is_plain:
-            return np.arange(count, dtype=np.int64)
+            return np.arange(count, dtype=_row_type(count))
         ids = np.full(count, -1, np.int64)
         for block, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
             ids[rows.reshape(-1)] = block * self.width * self.height + pixels
@@ -144,10 +144,15 @@ def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterato
     return _orders(views * per_pixel * width * height, whole, per_pixel, tuple(range(views)), width, height)
 
 
+def _row_type(count: int) -> type[np.signedinteger[Any]]:
+    """Return the smallest type that numbers ``count`` rows, of which there may be hundreds of millions."""
+    return np.int32 if count <= np.iinfo(np.int32).max else np.int64
+
+
 def _orders(
     count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
-    index, grid = np.arange(count, dtype=np.int64), box.pixels(width, height)
+    index, grid = np.arange(count, dtype=_row_type(count)), box.pixels(width, height)
     rows, columns, blocks = *grid.shape, len(views)
     arranged = {
         "view-major": index.reshape(blocks, rows, columns, per_pixel).transpose(0, 3, 1, 2),

@@ -15,6 +15,7 @@ from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Scene
 
 _SAMPLES = 3000  # pixels per view whose surface is used
+_MOST_VIEWS = 200  # whose surfaces are used
 _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface
 _MIN_TESTED = 300  # Gaussians
@@ -170,7 +171,8 @@ def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     v, h, w = scene.valid.shape
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
     step = spread_step(len(inner) // _SAMPLES, w - 2 * _STEP)
-    rows = (h * w * np.arange(v)[:, None] + inner[::step]).reshape(-1)
+    views = np.arange(0, v, -(-v // _MOST_VIEWS))
+    rows = (h * w * views[:, None] + inner[::step]).reshape(-1)
     valid, means = scene.valid.reshape(-1), scene.gaussians.means
     good = valid[rows]
     for offset in (_STEP, -_STEP, _STEP * w, -_STEP * w):

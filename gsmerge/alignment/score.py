@@ -18,7 +18,7 @@ from gsmerge.geometry import IDENTITY, Similarity, camera_centres, median, robus
 from gsmerge.kernels import reproject
 from gsmerge.kernels.elementary import arccos, log
 from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
-from gsmerge.runtime.memory import free_pages
+from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
@@ -227,7 +227,7 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -
     good = valid[rows]
     rows, pixels, blocks = rows[good], pixels[good], blocks[good]
     y, x = np.divmod(pixels, layout.width)
-    points = means[rows].astype(np.float64)
+    points = gather(means, rows).astype(np.float64)
     return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
 
 
@@ -287,9 +287,10 @@ def color_error(inputs: AlignmentInput, layout: Layout) -> float:
 def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
     if inputs.images is None or not len(pairs.rows):
         return math.nan
-    base = sh0_to_rgb(inputs.gaussians.sh0[pairs.rows, 0])
+    base = sh0_to_rgb(gather(inputs.gaussians.sh0, pairs.rows)[:, 0])
     x, y = pairs.pixels.astype(np.int64).T
-    return float(np.abs(base.clip(0, 1) - inputs.images[pairs.views, y, x]).mean(1).mean())
+    colors = gather(inputs.images, pairs.views, y, x)
+    return float(np.abs(base.clip(0, 1) - colors).mean(1).mean())
 
 
 @dataclass(frozen=True)

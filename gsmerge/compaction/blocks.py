@@ -171,6 +171,7 @@ def without_gaussians(prepared: Prepared) -> Prepared:
         if images is not None and id(images) not in moved:
             moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
             moved[id(images)][:] = images
+            free_pages([moved[id(images)]])
         images = None if images is None else moved[id(images)]
         return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixel_ids=None, missing=None)
 
@@ -223,9 +224,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
         at_seam, views = find_seams(joined, owners, parts)
         if not any(views):
             return joined
-        chosen = ((part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids)
-        scene = concat_scenes([take_views(part_scene, ids) for part_scene, ids in chosen])
-        scene = replace(scene, cameras=in_float64(scene.cameras))
+        scene = join_views([(part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids])
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
     options = replace(
@@ -257,6 +256,20 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
         if place in parts[number].prepared.photo_views and of_seam > SEAM_SHARE * of_all:
             views[number].append(place)
     return at_seam, views
+
+
+def join_views(chosen: Sequence[tuple[Scene, list[int]]]) -> Scene:
+    """Join views of several scenes without Gaussians into one scene, whose photos are in a file if they are many."""
+    total, cameras = sum(len(ids) for _, ids in chosen), chosen[0][0].cameras
+    images, first = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
+    for scene, ids in chosen:
+        assert scene.images is not None
+        for view in ids:
+            images[first] = scene.images[view]
+            first += 1
+        free_pages([scene.images, images])
+    joined = concat_scenes([subset(replace(scene, images=None), ids) for scene, ids in chosen], images)
+    return replace(joined, cameras=in_float64(joined.cameras))
 
 
 def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, int, np.ndarray]]:

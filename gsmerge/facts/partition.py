@@ -13,6 +13,7 @@ import numpy as np
 
 from gsmerge.geometry import camera_centres, project
 from gsmerge.kernels.matrices import matmul
+from gsmerge.runtime.memory import free_pages
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
@@ -80,6 +81,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
     ids = np.arange(len(scene))[:, None] * scene.pixels_per_view + picked
     means = scene.gaussians.means[ids].astype(np.float64)
+    free_pages([scene.gaussians.means])
     valid = scene.valid.reshape(len(scene), -1)[:, picked]
 
     def one_depth(view: int) -> np.ndarray:

@@ -151,7 +151,7 @@ class _CpuEngine:
         options = self.plan.job.options
         if options.fit == "none":
             return float("nan")
-        return holdout_psnr(images, self.photos[1], self.plan.weights[1], options.tuning.min_gain)
+        return holdout_psnr(images, self.photos[1], self.plan.weights, options.tuning.min_gain)
 
     def error_masses(self, state: State) -> np.ndarray:
         photos = self.photos[1]

@@ -69,9 +69,9 @@ class FitPlan:
     """Plan of a full fit: weights of the pixels, dropout, and the share of steps at half size."""
 
     job: FitJob
-    # [h,w] float32 of each photo at full and at half size: 0 on held-out blocks, `HIDDEN` on pixels
-    # that neither steps nor scores use, 1 elsewhere
-    weights: tuple[list[np.ndarray], list[np.ndarray]]
+    # [h,w] float32 of each photo at half size: 0 on held-out blocks, if the fit is judged by them, `HIDDEN`
+    # on pixels that neither steps nor scores use, 1 elsewhere
+    weights: list[np.ndarray]
     # The same as a step uses them, at every size: 0 on hidden pixels; at full size 1 on held-out
     # blocks, too, and larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
@@ -107,16 +107,17 @@ class FitPlan:
 def plan_run(job: FitJob) -> FitPlan:
     """Plan a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
     photos, options = job.photos, job.options
-    full = training_weights(photos[0], options.holdout, job.seed)
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
     default = DROPOUT if few else LONG_DROPOUT if long else 0.0
     dropout = default if options.dropout is None else options.dropout
-    weights = full, reduced(full, photos[1])
     everywhere, *larger = (_weights_of(level) for level in (photos[0], *photos[2:]))
-    trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights[1]]
-    if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
-        weights = weights[0], [np.where(weight == 1, np.float32(0), weight) for weight in weights[1]]
+    weights = trained = _weights_of(photos[1])
+    if options.judged:
+        weights = reduced(training_weights(photos[0], options.holdout, job.seed), photos[1])
+        trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
+        if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
+            weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
     half_part = options.half_res_part
     if len(photos) > 2 and options.half_res_share is None:
         half_part -= EARLIER

@@ -15,6 +15,7 @@ from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import psnr
 from gsmerge.raster.view_plan import Splats, plan_view, prepare
+from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -129,8 +130,12 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
     blank = blank_photos(cameras, level)
     if level == 1:
         return replace(blank, images=images)
-    size = blank.width, blank.height
-    small = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
+    small = make_array((len(images), blank.height, blank.width, 3), images.dtype.type)
+
+    def shrink(view: int) -> None:
+        small[view] = cv2.resize(images[view], (blank.width, blank.height), interpolation=cv2.INTER_AREA)
+
+    parallel_map(shrink, range(len(images)))
     return replace(blank, images=small)
 
 

@@ -80,6 +80,18 @@ def free_pages(arrays: Iterable[np.ndarray]) -> None:
             pages.madvise(mmap.MADV_DONTNEED)
 
 
+def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
+    """Copy ``array[ids]``; of a mapped array, memory has only what a part of the ids, best in order, looks up."""
+    parts = -(-array.nbytes // MAPPED_BYTES)
+    if parts <= 1:
+        return array[ids]
+    values = []
+    for part in zip(*(np.array_split(index, parts) for index in ids), strict=True):
+        values.append(array[part])
+        free_pages([array])
+    return np.concatenate(values)
+
+
 def human_bytes(count: float) -> str:
     """Format bytes with powers of ten: ``1234567`` -> ``1.2 MB``."""
     for unit in ("B", "kB", "MB"):

@@ -52,6 +52,7 @@ from gsmerge.scene.views import (
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
+_PART = 1 << 20  # numbers that are compared at once
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
@@ -362,7 +363,7 @@ def _place_rows(
         return ply.gaussians[keep], None, None, notes
     grid = len(result.views), result.cameras.height, result.cameras.width
     size, ids = int(np.prod(grid)), result.pixel_ids
-    if len(ids) == size and np.array_equal(ids, np.arange(size)):
+    if len(ids) == size and _counts_up(ids):
         return ply.gaussians, grid_ids(ply.valid), None, []
     source = np.full(size, -1, np.int64)
     rows = np.flatnonzero(ids >= 0)
@@ -377,6 +378,12 @@ def _place_rows(
         values[missing] = 0
     out.quats[missing] = (1, 0, 0, 0)
     return out, grid_ids(valid), missing.reshape(grid), []
+
+
+def _counts_up(ids: np.ndarray) -> bool:
+    """Return whether numbers are those from 0 on; compared in parts, as there may be hundreds of millions."""
+    parts = range(0, len(ids), _PART)
+    return all(np.array_equal(ids[i : i + _PART], np.arange(i, min(i + _PART, len(ids)))) for i in parts)
 
 
 def _with_rotations(

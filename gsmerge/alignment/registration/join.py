@@ -99,8 +99,11 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
     return replace(scene, gaussians=place.move_gaussians(scene.gaussians), cameras=place.move(scene.cameras))
 
 
-def concat_scenes(scenes: Sequence[Scene]) -> Scene:
-    """Concatenate the views of scenes of one size and frame; either all are aligned, or none is."""
+def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
+    """Concatenate the views of scenes of one size and frame; either all are aligned, or none is.
+
+    ``photos``: those of all views, where they are together already.
+    """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
         np.concatenate([scene.cameras.Ks for scene in scenes]),
@@ -108,6 +111,8 @@ def concat_scenes(scenes: Sequence[Scene]) -> Scene:
         scenes[0].cameras.height,
     )
     images = [scene.images for scene in scenes if scene.images is not None]
+    if photos is None and len(images) == len(scenes):
+        photos = np.concatenate(images)
     gaps = [scene.missing for scene in scenes]
     incomplete = any(gap is not None for gap in gaps)
     filled = [np.zeros(_grid(scene), bool) if gap is None else gap for scene, gap in zip(scenes, gaps, strict=True)]
@@ -115,12 +120,12 @@ def concat_scenes(scenes: Sequence[Scene]) -> Scene:
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
         cameras=cameras,
-        images=np.concatenate(images) if len(images) == len(scenes) else None,
+        images=photos,
         pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
         names=tuple(name for scene in scenes for name in scene.names),
         missing=np.concatenate(filled) if incomplete else None,
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=_concat_masks(scenes) if len(images) == len(scenes) else None,
+        masks=None if photos is None else _concat_masks(scenes),
     )
 
 

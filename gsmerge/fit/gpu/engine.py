@@ -165,7 +165,7 @@ class _GpuEngine:
         options = self.plan.job.options
         if options.fit == "none":
             return float("nan")
-        weights = to_device(np.stack(self.plan.weights[1]), self.device)
+        weights = to_device(np.stack(self.plan.weights), self.device)
         return score_blocks(torch.stack(images), self.photos[1].images, weights, options.tuning.min_gain)
 
     def error_masses(self, state: State) -> np.ndarray:

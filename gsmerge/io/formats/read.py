@@ -16,7 +16,7 @@ from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import DEPTHS, PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
-from gsmerge.runtime.memory import free_pages, make_array
+from gsmerge.runtime.memory import free_pages, gather, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
@@ -128,7 +128,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     read = depth_maps.read_rows if input_format(paths[0]) is DEPTHS else ply.read_rows
-    parts = [read(path) for path in paths]
+    parts = parallel_map(read, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
@@ -373,18 +373,18 @@ def _guess_encoding(opacities: np.ndarray) -> str:
 
 def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarray) -> str:
     """Explain why ``scales [n,3]`` are likely wrong for ``means [n,3]``; "" where they are not."""
-    rows = np.flatnonzero(valid)
+    rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
     if len(rows) < _MIN_JUDGED:
         return ""
-    sample = rows[:: max(1, len(rows) // _SCALE_SAMPLES)]
-    low, high = np.quantile(means[sample].astype(np.float64), (0.05, 0.95), axis=0)
-    width = float((high - low).max())
-    size = float(np.median(scales[sample].max(1)))
+    sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_SAMPLES)])
+    low, high = np.quantile(gather(means, sample).astype(np.float64), (0.05, 0.95), axis=0)
+    width, sizes = float((high - low).max()), gather(scales, sample)
+    size = float(np.median(sizes.max(1)))
     text = f"half of the Gaussians have a standard deviation above {size:.3g}"
     text += f" in a scene of a width of {width:.3g}"
     most = _MAX_SPACINGS * width / float(np.sqrt(len(rows)))
     linear = float(log(size))
-    if linear <= most < size and scales.min(where=valid[:, None], initial=np.inf) >= 1:
+    if linear <= most < size and sizes.min() >= 1 and scales.min(where=valid[:, None], initial=np.inf) >= 1:
         start = f"no stored scale is negative (median {linear:.3g}), as if linear"
         return f"{start}: {text}; logarithms are expected"
     if size > _MAX_WIDTH * width:

@@ -11,6 +11,7 @@ import scenes
 from messages import refuses
 
 from gsmerge import CompactOptions, compact
+from gsmerge.compaction.blocks import join_views
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.row_colors import ROW_COLORS
@@ -18,6 +19,7 @@ from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
+from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES, Device
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Scene
@@ -170,3 +172,20 @@ def test_what_is_fixed_stays(scene: Scene) -> None:
         moved = (getattr(fitted, name) != getattr(frame_start, name)).reshape(len(start), -1).any(1)
         assert moved[~fixed].any()
     assert np.abs(fitted.means - frame_start.means)[fixed].max() == 0
+
+
+def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they are one after the other, with photos in a file or not."""
+    masks = np.random.default_rng(0).random((len(scene), 30, 40)) < 0.9
+    chosen = [([6, 1], None), ([3], masks)]
+    bare = [replace(scene, gaussians=scene.gaussians[:0], pixel_ids=None, masks=mask) for _, mask in chosen]
+    for size in (1, 1 << 40):
+        monkeypatch.setattr(memory, "MAPPED_BYTES", size)
+        joined = join_views([(part, ids) for part, (ids, _) in zip(bare, chosen, strict=True)])
+        assert scene.images is not None
+        assert np.array_equal(joined.images, scene.images[[6, 1, 3]])
+        assert np.array_equal(joined.cameras.viewmats, scene.cameras.viewmats[[6, 1, 3]])
+        assert joined.names == tuple(scene.names[view] for view in (6, 1, 3))
+        assert joined.masks is not None
+        assert joined.masks[:2].all()
+        assert np.array_equal(joined.masks[2], masks[3])

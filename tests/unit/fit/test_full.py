@@ -201,7 +201,7 @@ def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
-    weights = plan_run(FitJob(photos, options)).weights[1]
+    weights = plan_run(FitJob(photos, options)).weights
     painted = photos[1].images.copy()
     for image, weight in zip(painted, weights, strict=True):
         image[weight == 0] = 1 - image[weight == 0]

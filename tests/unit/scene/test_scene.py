@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from exports import export_rows, save_export, smooth_scene
 from messages import names, noted, refuses
 from tiny_scene import (
@@ -20,6 +21,7 @@ from tiny_scene import (
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.measure.inspect import inspect
+from gsmerge.scene import read
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.scene.views import stored_photos
@@ -171,3 +173,13 @@ def test_rows_that_only_fill_a_file_up_are_left_out(tmp_path: Path) -> None:
     loaded = load_scene(save_export(tmp_path, smooth, rows), order="none")
     assert len(loaded.scene.gaussians) == len(rows) - 39
     assert noted(loaded.notes, "39 rows")
+
+
+def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(read, "_PART", 4)
+    ids = np.arange(11, dtype=np.int32)
+    assert read._counts_up(ids)
+    for wrong in (0, 4, 10):
+        changed = ids.copy()
+        changed[wrong] += 1
+        assert not read._counts_up(changed)
