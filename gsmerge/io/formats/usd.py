@@ -6,11 +6,14 @@ read: its parser asks for memory and time as it likes, and opens whatever files 
 
 from __future__ import annotations
 
+import struct
 import tempfile
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from zipfile import ZIP_STORED, ZipFile, ZipInfo
 
 import numpy as np
 
@@ -22,6 +25,8 @@ from gsmerge.types import Gaussians
 MAX_DEGREE = 3  # as far as renderers go
 PRIM = "Gaussians"
 INSTALL = 'pip install "usd-core>=26.3,<27"'  # as the extra usd asks for; works beside a wheel and in a checkout
+# USDZ: contents begin at multiples of 64 bytes, behind an extra field of this kind; a file's header has 30 bytes
+_ALIGNMENT, _PADDING, _ZIP_HEADER, _UNIX, _EXTRA = 64, 0x1986, 30, 3, struct.Struct("<HH")
 _REACH = 3.0  # standard deviations about a centre that the extent holds
 
 
@@ -36,13 +41,16 @@ def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def usdz_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.usdz``, an archive of one ``.usdc``; ValueError if there is NaN or inf."""
-    with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
-        layer, package = Path(folder) / "scene.usdc", Path(folder) / "scene.usdz"
-        layer.write_bytes(usdc_bytes(gaussians))
-        with require_usd().Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
-            archive.AddFile(str(layer), layer.name)
-        return package.read_bytes()
+    """Encode a ``.usdz``, an archive of one ``.usdc``; ValueError if there is NaN or inf.
+
+    The archive is written here, since USD's own writer puts the time of day into it.
+    """
+    package, layer = BytesIO(), ZipInfo("scene.usdc")  # at the first time that the format knows
+    padding = -(_ZIP_HEADER + len(layer.filename) + _EXTRA.size) % _ALIGNMENT
+    layer.extra, layer.create_system = _EXTRA.pack(_PADDING, padding) + bytes(padding), _UNIX
+    with ZipFile(package, "w", ZIP_STORED) as archive:
+        archive.writestr(layer, usdc_bytes(gaussians))
+    return package.getvalue()
 
 
 def require_usd() -> SimpleNamespace:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from made_gaussians import random_gaussians
 from messages import refuses
-from pxr import Usd, UsdGeom, UsdVol
+from pxr import Sdf, Usd, UsdGeom, UsdVol
 
 from gsmerge import Gaussians
 from gsmerge.errors import SceneError, UsageError
@@ -65,6 +66,17 @@ def test_the_stage_says_what_viewers_ask_for(tmp_path: Path) -> None:
     means = np.array(splats.GetPositionsAttr().Get())
     assert (low < means.min(0)).all()
     assert (high > means.max(0)).all()
+
+
+def test_an_archive_holds_no_time_of_day_and_is_aligned(tmp_path: Path) -> None:
+    """By the rules of USDZ: not compressed, and contents at multiples of 64 bytes."""
+    write_gaussians(tmp_path / "a.usdz", random_gaussians(50, 1))
+    package = Sdf.ZipFile.Open(str(tmp_path / "a.usdz"))
+    info = package.GetFileInfo(*package.GetFileNames())
+    assert (info.compressionMethod, info.dataOffset % 64, info.encrypted) == (0, 0, False)
+    with ZipFile(tmp_path / "a.usdz") as archive:
+        assert archive.testzip() is None
+        assert [one.date_time for one in archive.infolist()] == [(1980, 1, 1, 0, 0, 0)]
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
