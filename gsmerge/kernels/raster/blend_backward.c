@@ -116,14 +116,21 @@ API int32_t blend_backward(const float *restrict conics, const int32_t *restrict
   return 0;
 }
 
+// Intersections of other ranges' Gaussians are left out without a branch, which would be mispredicted.
 API int32_t gather_slots(const int32_t *restrict flatten_ids, const float *restrict slots, int64_t first, int64_t last,
                          float *restrict sums, int64_t n, int64_t m) {
   if (first < 0 || last > m) return OUTSIDE;
-  for (int64_t i = 0; i < n; i++) {
-    int64_t k = flatten_ids[i];
-    __builtin_prefetch(sums + SUMS * (int64_t)flatten_ids[mini(i + BATCH, n - 1)]);
-    if (k < first || k >= last) continue;
-    for (int c = 0; c < SUMS; c++) sums[SUMS * k + c] += slots[SUMS * i + c];
+  for (int64_t start = 0; start < n; start += PLANE) {
+    int64_t stop = mini(n, start + PLANE), inside[PLANE], count = 0;
+    for (int64_t i = start; i < stop; i++) {
+      inside[count] = i;
+      count += (flatten_ids[i] >= first) & (flatten_ids[i] < last);
+    }
+    for (int64_t j = 0; j < count; j++) {
+      const float *slot = slots + SUMS * inside[j];
+      float *sum = sums + SUMS * (int64_t)flatten_ids[inside[j]];
+      for (int c = 0; c < SUMS; c++) sum[c] += slot[c];
+    }
   }
   return 0;
 }
