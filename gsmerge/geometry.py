@@ -38,7 +38,7 @@ def rotation_entries(w: Array, x: Array, y: Array, z: Array) -> list[Array]:
 def normalize(vectors: np.ndarray) -> np.ndarray:
     """Return vectors ``[...,d]`` scaled to length 1; zero stays zero."""
     with np.errstate(over="ignore"):  # what is too long becomes zero
-        norms = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
+        norms = _lengths(vectors)
     return vectors / np.maximum(norms, norms.dtype.type(1e-12))
 
 
@@ -182,7 +182,9 @@ def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    return np.sqrt((vectors * vectors).sum(-1, keepdims=True))
+    """Return the lengths ``[...,1]`` of vectors ``[...,d]``, by columns: reducing short rows takes thrice as long."""
+    columns = np.moveaxis(vectors * vectors, -1, 0)
+    return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
 
 
 def median(values: np.ndarray) -> float:

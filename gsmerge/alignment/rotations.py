@@ -11,6 +11,7 @@ from gsmerge.geometry import multiply_quats, normalize, quat_to_rotmat, rotmat_t
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import convolve
 from gsmerge.runtime.memory import free_pages
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Scene
 
@@ -84,7 +85,7 @@ def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[Quat
     free_pages([scene.gaussians.quats])
     as_xyzw = from_xyzw(quats)
     single = [quats, as_xyzw, multiply_quats(_camera_quats(scene, turn)[views], quats)]
-    means = (float(_cosines(read, thinnest, normals).mean()) for read in single)
+    means = parallel_map(lambda read: float(_cosines(read, thinnest, normals).mean()), single)
     cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
     if _is_root(scene, rows, single, thinnest, normals):
@@ -119,7 +120,8 @@ def _is_root(
     """
     pairs = [square_roots(single[0]), *((quats, _half_a_turn_more(quats)) for quats in single)]
     roots = square_roots(single[1])
-    if _better_of(roots, thinnest, normals, 0.0) <= max(_better_of(pair, thinnest, normals, 0.0) for pair in pairs):
+    of_roots, *others = parallel_map(lambda pair: _better_of(pair, thinnest, normals, 0.0), [roots, *pairs])
+    if of_roots <= max(others):
         return False
     smooth = _smooth_normals(scene)[rows]
     best_other = max(_better_of(pair, thinnest, smooth, _FOLLOWS) for pair in pairs)

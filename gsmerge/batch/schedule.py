@@ -20,8 +20,9 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
+from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
-from gsmerge.runtime.work import SMALL_STORE, Cluster, Lost, ProcessPool, RayPool
+from gsmerge.runtime.work import SMALL_STORE, Cluster, Lost, RayPool
 from gsmerge.scene.content_hash import cameras_of
 from gsmerge.scene.files import find_scene_files
 from gsmerge.stages.segment import SceneSize

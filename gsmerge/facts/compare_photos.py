@@ -35,7 +35,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights
 from gsmerge.runtime.record import choose, note
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.types import Scene
 
 # On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
@@ -115,10 +115,14 @@ def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
     curves = _find_tones(small, flat)
     drawing: np.ndarray | None = None
     clear = small.clear
-    for view in views:
+
+    def find_cover(view: int) -> tuple[PhotoChange, np.ndarray, np.ndarray | None]:
         change = replace(changes[view], tones=curves[view])
-        picture, photo = small.pictures[view], change(shown.photos[view], None)
-        cover = _covered(picture, photo, clear[view], flat[view], drawn=small.drawn)
+        photo = change(shown.photos[view], None)
+        return change, photo, _covered(small.pictures[view], photo, clear[view], flat[view], drawn=small.drawn)
+
+    for view, (change, photo, cover) in enumerate(in_turn(find_cover, views)):
+        picture = small.pictures[view]
         if (curves[view] is None and cover is None) or (cover is not None and cover.mean() > MAX_COVER):
             continue
         if drawing is None:

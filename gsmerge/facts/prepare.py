@@ -95,10 +95,14 @@ def scene_depth(scene: Scene) -> float:
 
 def _sample_rows(scene: Scene) -> np.ndarray:
     """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
-    rows = np.arange(len(scene.gaussians)) if scene.pixel_ids is None else np.flatnonzero(scene.pixel_ids >= 0)
-    if len(rows) == 0:
+    valid = None if scene.pixel_ids is None else scene.pixel_ids >= 0
+    count = len(scene.gaussians) if valid is None else int(np.count_nonzero(valid))
+    if count == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
-    return rows[:: max(1, len(rows) // SAMPLES)]
+    step = max(1, count // SAMPLES)
+    if valid is None or count == len(valid):
+        return np.arange(0, count, step)
+    return np.flatnonzero(valid)[::step]
 
 
 def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:

@@ -382,8 +382,9 @@ def _place_rows(
 
 def _counts_up(ids: np.ndarray) -> bool:
     """Return whether numbers are those from 0 on; compared in parts, as there may be hundreds of millions."""
-    parts = range(0, len(ids), _PART)
-    return all(np.array_equal(ids[i : i + _PART], np.arange(i, min(i + _PART, len(ids)))) for i in parts)
+    starts = range(0, len(ids), _PART)
+    parts = ((first, ids[first : first + _PART]) for first in starts)
+    return all(np.array_equal(part, np.arange(first, first + len(part), dtype=ids.dtype)) for first, part in parts)
 
 
 def _with_rotations(

@@ -85,7 +85,7 @@ def holders(folder: Path) -> list[int]:
 
 
 class InlinePool:
-    """In place of :class:`gsmerge.runtime.work.ProcessPool`: one call after the other in this process."""
+    """In place of :class:`gsmerge.runtime.processes.ProcessPool`: one call after the other in this process."""
 
     def __init__(self, *_: object, **__: object) -> None:
         make_index.cache_clear()  # as in a new process
