@@ -28,8 +28,8 @@ LOST = 0.5  # share of changed pixels from which on an earlier result is of no u
 def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequence[int]) -> Decoded | None:
     """Replace decoded Gaussians by those of an earlier result wherever it shows the photos of ``views`` as they are.
 
-    ``earlier``: in the frame of the scene. Of both together as many stay as were decoded for, those with the largest
-    weights. None, with a note, where the earlier result shows most pixels wrong.
+    ``earlier``: in the frame of the scene. Of both together as many stay as were decoded for: what has changed, and of
+    the rest those with the largest weights. None, with a note, where the earlier result shows most pixels wrong.
     """
     earlier = _with_harmonics(earlier, decoded.gaussians.shN.shape[1])
     changed = find_changes(earlier, scene, views)
@@ -39,8 +39,8 @@ def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequenc
         return None
     old, old_changed = sum_weights(earlier, cameras, changed)
     new, new_changed = sum_weights(decoded.gaussians, cameras, changed)
-    kept = _largest(old_changed <= MOSTLY * old, old, decoded.count)
-    added = _largest((new_changed > MOSTLY * new) & (new > 0), new, decoded.count - len(kept))
+    added = _largest((new_changed > MOSTLY * new) & (new > 0), new, decoded.count)  # else holes where things moved
+    kept = _largest(old_changed <= MOSTLY * old, old, decoded.count - len(added))
     choose(taken_over={"kept": len(kept), "new": len(added), "changed": round(share, 4)})
     return replace(decoded, gaussians=Gaussians.concat([earlier[kept], decoded.gaussians[added]]), baseline_start=None)
 

@@ -91,6 +91,20 @@ def test_no_more_than_were_decoded_for(scene: Scene) -> None:
     )
 
 
+def test_what_has_changed_goes_before_what_stays(scene: Scene) -> None:
+    """Without room for both: an earlier result that fills the budget alone would leave holes where things moved."""
+    now, start = painted(scene), start_of(scene)
+    with record_run(None) as record:
+        whole = take_over(scene.gaussians, start, now, range(len(now)))
+        room = replace(start, count=len(start.gaussians))
+        tight = take_over(scene.gaussians, room, now, range(len(now)))
+    assert whole is not None
+    assert tight is not None
+    new = record.choices["taken_over"]["new"]
+    assert 0 < new < len(tight.gaussians) == room.count < len(whole.gaussians)
+    assert np.array_equal(tight.gaussians.means[-new:], whole.gaussians.means[-new:])
+
+
 def test_another_place_is_of_no_use(scene: Scene) -> None:
     assert scene.images is not None
     other = replace(scene, images=1 - scene.images)
