@@ -59,6 +59,11 @@ def is_frame(path: Path) -> bool:
     return path.suffix == SUFFIX and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
 
 
+def own_cameras(path: Path) -> Path:
+    """Return the file of the cameras that depth maps are placed by."""
+    return path.parent.parent / POSES if is_frame(path) else path
+
+
 def holds_depth_maps(path: Path) -> bool:
     """Return whether an ``.npz`` has depth maps with cameras; False if it cannot be read."""
     return not array_names(path).isdisjoint(("depth", "depths")) and (holds_poses(path) or is_frame(path))

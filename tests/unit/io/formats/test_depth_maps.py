@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from messages import refuses
-from tiny_scene import Tiny, make_tiny, write_images, write_npz
+from tiny_scene import Tiny, make_tiny, write_images, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians
@@ -100,6 +101,19 @@ def test_photos_color_depth_maps_without_images(tmp_path: Path) -> None:
     write_images(tmp_path / "images", tiny)
     load = load_scene(tmp_path)
     assert np.allclose(0.5 + SH_C0 * load.scene.gaussians.sh0[:, 0], tiny.images.reshape(-1, 3) / 255, atol=1e-5)
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_cameras_of_the_depth_maps_go_before_others(tmp_path: Path, tiny: Tiny, frames: bool) -> None:
+    """Others beside them may be in another world, as COLMAP's are."""
+    if frames:
+        write_frames(tmp_path, tiny)
+    else:
+        write_npz(tmp_path / "predictions.npz", tiny, depth=depths_of(tiny))
+    write_transforms(tmp_path / "transforms.json", replace(tiny, c2w=tiny.c2w @ np.diag([2.0, 2.0, 2.0, 1.0])))
+    files = find_scene_files(tmp_path)
+    assert files.cameras == tmp_path / ("camera_poses.txt" if frames else "predictions.npz")
+    assert load_scene(tmp_path).scene.images is not None
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
@@ -194,6 +208,8 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
     poses.write_text("\n".join((*lines[:2], "1 2 3")))
     with refuses(SceneError, poses.name, "line 3", "12 or 16"):
         read_gaussians(frames[2])
+    with refuses(SceneError, "frame_2.npz", "one frame", "results_output"):
+        find_scene_files(frames[2])
     frames[1].unlink()
     with refuses(SceneError, "results_output", "number 1"):
         find_scene_files(tmp_path)
