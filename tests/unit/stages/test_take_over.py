@@ -132,6 +132,7 @@ def test_compact_goes_on_from_an_earlier_result(scene: Scene) -> None:
     first = compact(scene, **settings)
     second = compact(scene, earlier=first.gaussians, **settings)
     assert second.report.choices["fit"]["steps"] == 20
+    assert np.isnan(second.report.choices["fit"]["holdout_after"])  # nothing is held out
     assert second.report.choices["taken_over"]["kept"] > 250
     assert second.report.choices["flicker"] < 0.02
     assert len(second.gaussians) <= 300
