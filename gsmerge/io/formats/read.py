@@ -139,9 +139,9 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``; of a ``lod-meta.json``, it is
-    the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
-    cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps; of a
+    ``lod-meta.json``, it is the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is.
+    SceneError if the file cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
