@@ -11,6 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import plan_view, prepare, render
 from gsmerge.raster.composite import splat_adjoint
 from gsmerge.raster.photos import NEAR
@@ -48,24 +49,16 @@ def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequenc
 def find_changes(gaussians: Gaussians, scene: Scene, views: Sequence[int]) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of pixels around which Gaussians show something else than the photos of ``views``."""
     assert scene.images is not None
-    changed = np.empty((len(views), *scene.images.shape[1:3]), np.bool_)
+    changed, taps = np.empty((len(views), *scene.images.shape[1:3]), np.bool_), np.full(AROUND, 1 / AROUND)
     for i, view in enumerate(views):
         drawn = render(gaussians, scene.cameras[[view]], near=NEAR).images[0]
         error = np.abs(drawn - scene.images[view]).mean(2)
         if scene.masks is not None:
             error[~scene.masks[view]] = 0
-        error = _mean_around(error)
+        error = convolve(error, taps, taps)
         large = error > np.clip(TYPICAL * float(np.median(error)), LEAST, MOST)
         changed[i] = cv2.dilate(large.astype(np.uint8), np.ones((AROUND, AROUND), np.uint8)) > 0
     return changed
-
-
-def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average values ``[h,w]`` over squares around each pixel; the order of the sums is the same on every processor."""
-    height, width = values.shape
-    padded = np.pad(values, AROUND // 2, mode="edge")
-    rows = sum((padded[y : y + height] for y in range(1, AROUND)), start=padded[:height])
-    return np.asarray(sum((rows[:, x : x + width] for x in range(1, AROUND)), start=rows[:, :width]) / AROUND**2)
 
 
 def sum_weights(gaussians: Gaussians, cameras: Cameras, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
