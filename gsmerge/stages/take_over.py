@@ -22,6 +22,7 @@ AROUND = 5  # pixels, side of the square over which errors are averaged, and by 
 # an error, 0 to 1, that means a change: times the photo's median error, but at least and at most
 TYPICAL, LEAST, MOST = 3.0, 0.04, 0.12
 MOSTLY = 0.5  # share of a Gaussian's blending weights in changed pixels from which on it is one of what has changed
+MOST_TIMES = 8  # times as many Gaussians as are decoded: those that are left of more start worse than the scene's own
 LOST = 0.5  # share of changed pixels from which on an earlier result is of no use
 
 
@@ -30,8 +31,12 @@ def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequenc
     """Replace decoded Gaussians by those of an earlier result wherever it shows the photos of ``views`` as they are.
 
     ``earlier``: in the frame of the scene. Of both together as many stay as were decoded for: what has changed, and of
-    the rest those with the largest weights. None, with a note, where the earlier result shows most pixels wrong.
+    the rest those with the largest weights. None, with a note, where the earlier result shows most pixels wrong, or has
+    too many Gaussians.
     """
+    if len(earlier) > MOST_TIMES * decoded.count:
+        note(f"the earlier result has {len(earlier):,} Gaussians for {decoded.count:,}: nothing is taken over")
+        return None
     earlier = _with_harmonics(earlier, decoded.gaussians.shN.shape[1])
     changed = find_changes(earlier, scene, views)
     share, cameras = float(changed.mean()), scene.cameras[list(views)]

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.raster import contributions, plan_view, prepare, render
@@ -81,13 +82,13 @@ def test_masked_pixels_have_not_changed(scene: Scene) -> None:
 
 
 def test_no_more_than_were_decoded_for(scene: Scene) -> None:
-    start = replace(start_of(scene), count=100)
+    start = replace(start_of(scene), count=1500)
     taken = take_over(scene.gaussians, start, scene, range(len(scene)))
     assert taken is not None
     weights, _ = sum_weights(scene.gaussians, scene.cameras, np.zeros((len(scene), 48, 64), np.bool_))
-    assert len(taken.gaussians) == 100
+    assert len(taken.gaussians) == 1500
     assert np.array_equal(
-        taken.gaussians.means, scene.gaussians.means[np.sort(np.argsort(-weights, kind="stable")[:100])]
+        taken.gaussians.means, scene.gaussians.means[np.sort(np.argsort(-weights, kind="stable")[:1500])]
     )
 
 
@@ -103,6 +104,14 @@ def test_what_has_changed_goes_before_what_stays(scene: Scene) -> None:
     new = record.choices["taken_over"]["new"]
     assert 0 < new < len(tight.gaussians) == room.count < len(whole.gaussians)
     assert np.array_equal(tight.gaussians.means[-new:], whole.gaussians.means[-new:])
+
+
+def test_far_too_many_are_of_no_use(scene: Scene) -> None:
+    """Such as all Gaussians of a scene: what is left of them has holes."""
+    with record_run(None) as record:
+        start = replace(start_of(scene), count=len(scene.gaussians) // 9)
+        assert take_over(scene.gaussians, start, scene, range(len(scene))) is None
+    assert noted(record.notes, f"{len(scene.gaussians):,}", "nothing is taken over")
 
 
 def test_another_place_is_of_no_use(scene: Scene) -> None:
