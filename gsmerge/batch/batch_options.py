@@ -8,6 +8,7 @@ from string import Formatter
 from typing import Any
 
 from gsmerge.io import OUTPUT_FORMATS
+from gsmerge.io.formats.table import input_format
 from gsmerge.scene.content_hash import digest
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -64,6 +65,8 @@ class BatchOptions(Settings):
                 raise ValueError(f"output: expected {expected}, got {self.output!r}")
         if self.sequence and (self.engine != "local" or self.jobs not in (None, 1)):
             raise ValueError("sequence: expected engine local and one job, as each scene waits for the one before it")
+        if self.sequence and input_format(example.lower()).read is None:
+            raise ValueError(f"sequence: expected an output that is read again, not one in USD, got {self.output!r}")
         if Engine(self.engine, self.address).name == "ray" and self.max_memory is not None:
             raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
 

@@ -259,11 +259,11 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def _is_scene(folder: Path, names: list[str]) -> bool:
     """Return whether a folder with these names in it is a scene."""
     try:
-        if SCENE_NAMES.isdisjoint(names):
+        if SCENE_NAMES.isdisjoint(names) and folder.name != depth_maps.FRAMES:
             return False
         if named_ply(folder) is not None:
             return True
-        return not any(name.endswith(".ply") for name in names) and bool(depth_maps.find_depth_maps(folder))
+        return not other_plys(folder) and bool(depth_maps.find_depth_maps(folder))
     except SceneError:  # a frame is missing: reading the scene says which
         return True
     except OSError:  # its names can be read, and nothing else

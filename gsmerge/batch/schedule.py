@@ -131,7 +131,8 @@ def dispatch(tasks: Iterator[Task], pool: ProcessPool | RayPool, context: BatchC
     active = 0
 
     def next_task() -> Task | None:
-        task = retried.popleft() if retried else next(tasks, None)
+        waits = bool(busy) and context.options.sequence  # for the result that the next one starts from
+        task = retried.popleft() if retried else None if waits else next(tasks, None)
         if task is None and busy and busy[0][0] <= time.monotonic():
             return busy.popleft()[1]
         return task

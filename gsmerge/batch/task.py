@@ -194,12 +194,14 @@ def is_done(task: Task, context: BatchContext) -> bool:
 
 
 def make_tasks(jobs: Iterable[Job], known: Mapping[str, DoneResult], context: BatchContext) -> Iterator[Task]:
-    """Yield the task of each job; in a sequence with the result before it, if there is one when the task is taken."""
-    earlier = None
+    """Yield the task of each job; in a sequence with the last result before it when the task is taken."""
+    earlier, new_records = None, RecordIndex(context.folder, context.start)
     for job in jobs:
         yield Task(job, known.get(job.output), earlier=earlier)
         if context.options.sequence and (context.folder / job.output).is_file():
-            earlier = job.output
+            new_records.read_on()
+            made = job.output in new_records.known or job.output in known  # files of others are no results
+            earlier = job.output if made else earlier
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:

@@ -198,7 +198,11 @@ def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: R
 
     shared = BatchContext(out, options, 0)
     tasks = make_tasks(jobs, {} if options.rerun else index.known, shared)
-    return [task.job for task in tasks if not is_done(task, shared)]
+    pending: dict[str, Job] = {}
+    for task in tasks:
+        if task.earlier in pending or not is_done(task, shared):  # what a result starts from may be another then
+            pending[task.job.output] = task.job
+    return list(pending.values())
 
 
 def print_plan(

@@ -54,6 +54,7 @@ def compact(args: opt.Args) -> None:
     start = perf_counter()
     hints = args.hints()
     from gsmerge.compaction.files import level_output
+    from gsmerge.io.bounds import check_file
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.placement import PlacementOptions
@@ -71,6 +72,8 @@ def compact(args: opt.Args) -> None:
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     earlier = () if args.earlier is None else (args.earlier,)
+    for path in earlier:
+        check_file(path)
     inputs = (*input_files(files), *earlier, *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
     named = (out, *model, *levels, args.report, beside, args.save_cameras)

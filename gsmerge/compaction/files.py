@@ -91,6 +91,7 @@ def compact_files(
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
+        start_from = None if earlier is None else read_earlier(earlier, outputs)
         load = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(load.scene, outputs)
         views = _views_once(load.scene)
@@ -101,7 +102,6 @@ def compact_files(
             raise _other_cameras(cameras_path)
         cameras_path = cameras_path if len(load.scene) else None
         read = perf_counter()
-        start_from = None if earlier is None else read_earlier(earlier, outputs)
         result = compact(load.scene, settings, earlier=start_from, progress=progress)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
@@ -257,7 +257,8 @@ def read_earlier(path: Path, outputs: Outputs) -> Gaussians:
     """Read a result of another moment; UsageError where this one is to be written in another frame than the scene's."""
     if outputs.placement.moves:
         raise UsageError(f"{path}: expected no change of the frame (--up, --scale, --rotate, --translate) with it")
-    return read_gaussians(path).gaussians
+    file = read_gaussians(path)
+    return file.gaussians[file.valid]
 
 
 def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:

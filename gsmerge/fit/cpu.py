@@ -149,7 +149,7 @@ class _CpuEngine:
 
     def _score_images(self, images: Sequence[np.ndarray]) -> float:
         options = self.plan.job.options
-        if options.fit == "none":
+        if options.fit == "none" or not options.judged:  # nothing is held out
             return float("nan")
         return holdout_psnr(images, self.photos[1], self.plan.weights, options.tuning.min_gain)
 

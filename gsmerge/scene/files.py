@@ -17,7 +17,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
-from gsmerge.io.formats.depth_maps import FRAMES, find_depth_maps, is_frame
+from gsmerge.io.formats.depth_maps import FRAMES, SUFFIX, find_depth_maps, is_frame, own_cameras
 from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.image_names import list_images
 from gsmerge.scene.no_gaussians import check_scene_file, no_gaussians
@@ -85,7 +85,8 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names are not searched.
 
-    Cameras inside the ``.ply`` go before others beside it, those of a result, ``NAME.cameras.json``, before any other.
+    Cameras inside the ``.ply``, or of the depth maps, go before others beside it, those of a result,
+    ``NAME.cameras.json``, before any other.
 
     The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/``, ``ply/`` and
     ``gaussians/``, and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``,
@@ -100,6 +101,9 @@ def find_scene_files(
     path = Path(path)
     plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
     ply = plys[0]
+    if ply == path and is_frame(path):
+        problem = "expected the folder of all frames of DA3-Streaming, found one frame"
+        raise SceneError(path, problem, f"name {path.parent}")
     for part in plys:
         check_file(part)
         check_scene_file(part)
@@ -110,7 +114,7 @@ def find_scene_files(
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-    camera_path = _named(cameras) or result_cameras(ply)
+    camera_path = _named(cameras) or (own_cameras(ply) if ply.suffix == SUFFIX else result_cameras(ply))
     camera_path = camera_path or next((place for place in places if place is not None), None)
     image_path = _named(images)
     if image_path is None and is_frame(ply):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
+from gsmerge.io.cameras.npz_files import array_names
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import may_hold_gaussians
 
@@ -100,6 +101,8 @@ def check_scene_file(path: Path) -> None:
     """Raise SceneError with the remedy for a file that is known to hold no Gaussians, such as ``results.npz``."""
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".glb") or not check_file(path) or may_hold_gaussians(path):
+        return
+    if suffix == ".npz" and not array_names(path):  # damaged, which its reader says
         return
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])

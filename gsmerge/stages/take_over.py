@@ -11,6 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import plan_view, prepare, render
 from gsmerge.raster.composite import splat_adjoint
 from gsmerge.raster.photos import NEAR
@@ -21,6 +22,7 @@ AROUND = 5  # pixels, side of the square over which errors are averaged, and by 
 # an error, 0 to 1, that means a change: times the photo's median error, but at least and at most
 TYPICAL, LEAST, MOST = 3.0, 0.04, 0.12
 MOSTLY = 0.5  # share of a Gaussian's blending weights in changed pixels from which on it is one of what has changed
+MOST_TIMES = 8  # times as many Gaussians as are decoded: those that are left of more start worse than the scene's own
 LOST = 0.5  # share of changed pixels from which on an earlier result is of no use
 
 
@@ -28,9 +30,13 @@ LOST = 0.5  # share of changed pixels from which on an earlier result is of no u
 def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequence[int]) -> Decoded | None:
     """Replace decoded Gaussians by those of an earlier result wherever it shows the photos of ``views`` as they are.
 
-    ``earlier``: in the frame of the scene. Of both together as many stay as were decoded for, those with the largest
-    weights. None, with a note, where the earlier result shows most pixels wrong.
+    ``earlier``: in the frame of the scene. Of both together as many stay as were decoded for: what has changed, and of
+    the rest those with the largest weights. None, with a note, where the earlier result shows most pixels wrong, or has
+    too many Gaussians.
     """
+    if len(earlier) > MOST_TIMES * decoded.count:
+        note(f"the earlier result has {len(earlier):,} Gaussians for {decoded.count:,}: nothing is taken over")
+        return None
     earlier = _with_harmonics(earlier, decoded.gaussians.shN.shape[1])
     changed = find_changes(earlier, scene, views)
     share, cameras = float(changed.mean()), scene.cameras[list(views)]
@@ -39,8 +45,8 @@ def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequenc
         return None
     old, old_changed = sum_weights(earlier, cameras, changed)
     new, new_changed = sum_weights(decoded.gaussians, cameras, changed)
-    kept = _largest(old_changed <= MOSTLY * old, old, decoded.count)
-    added = _largest((new_changed > MOSTLY * new) & (new > 0), new, decoded.count - len(kept))
+    added = _largest((new_changed > MOSTLY * new) & (new > 0), new, decoded.count)  # else holes where things moved
+    kept = _largest(old_changed <= MOSTLY * old, old, decoded.count - len(added))
     choose(taken_over={"kept": len(kept), "new": len(added), "changed": round(share, 4)})
     return replace(decoded, gaussians=Gaussians.concat([earlier[kept], decoded.gaussians[added]]), baseline_start=None)
 
@@ -48,24 +54,16 @@ def take_over(earlier: Gaussians, decoded: Decoded, scene: Scene, views: Sequenc
 def find_changes(gaussians: Gaussians, scene: Scene, views: Sequence[int]) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of pixels around which Gaussians show something else than the photos of ``views``."""
     assert scene.images is not None
-    changed = np.empty((len(views), *scene.images.shape[1:3]), np.bool_)
+    changed, taps = np.empty((len(views), *scene.images.shape[1:3]), np.bool_), np.full(AROUND, 1 / AROUND)
     for i, view in enumerate(views):
         drawn = render(gaussians, scene.cameras[[view]], near=NEAR).images[0]
         error = np.abs(drawn - scene.images[view]).mean(2)
         if scene.masks is not None:
             error[~scene.masks[view]] = 0
-        error = _mean_around(error)
+        error = convolve(error, taps, taps)
         large = error > np.clip(TYPICAL * float(np.median(error)), LEAST, MOST)
         changed[i] = cv2.dilate(large.astype(np.uint8), np.ones((AROUND, AROUND), np.uint8)) > 0
     return changed
-
-
-def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average values ``[h,w]`` over squares around each pixel; the order of the sums is the same on every processor."""
-    height, width = values.shape
-    padded = np.pad(values, AROUND // 2, mode="edge")
-    rows = sum((padded[y : y + height] for y in range(1, AROUND)), start=padded[:height])
-    return np.asarray(sum((rows[:, x : x + width] for x in range(1, AROUND)), start=rows[:, :width]) / AROUND**2)
 
 
 def sum_weights(gaussians: Gaussians, cameras: Cameras, changed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

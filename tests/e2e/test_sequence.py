@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -79,6 +80,7 @@ def test_what_follows_a_change_is_made_again(moments: Path, tmp_path: Path, run:
     assert statuses(out) == {f"walk-{i}.ply": ["done"] for i in range(MOMENTS)}
     shutil.rmtree(scenes / "scene_0001/images")
     shutil.copytree(scenes / "scene_0002/images", scenes / "scene_0001/images")
+    assert json.loads(run(*call, "--dry-run", "--json", code=0).out)["num_pending"] == 2
     run(*call, code=0)
     assert statuses(out) == {"walk-0.ply": ["done"], "walk-1.ply": ["done"] * 2, "walk-2.ply": ["done"] * 2}
 
@@ -90,6 +92,15 @@ def test_a_moment_that_cannot_be_read_is_passed_over(moments: Path, tmp_path: Pa
     chosen = {record["output"]: record["report"] for record in records(out)}
     assert chosen["walk-1.ply"] is None
     assert "taken_over" in chosen["walk-2.ply"]["choices"]
+
+
+def test_a_file_of_others_is_no_result(moments: Path, tmp_path: Path, run: Any) -> None:
+    """It stays, its scene fails, and the next scene starts anew."""
+    (tmp_path / "walk-0.ply").write_bytes(b"ply\n")
+    run("batch", moments, "-o", tmp_path, "--sequence", *QUICK, "--effort", "draft", code=5)
+    assert statuses(tmp_path) == {"walk-0.ply": ["failed"], "walk-1.ply": ["done"], "walk-2.ply": ["done"]}
+    chosen = [record["report"]["choices"] for record in records(tmp_path)[1:]]
+    assert ["taken_over" in choices for choices in chosen] == [False, True]
 
 
 @pytest.mark.parametrize("wrong", [("--jobs", 2), ("--engine", "ray")])
@@ -105,5 +116,7 @@ def test_compact_goes_on_from_a_result(moments: Path, tmp_path: Path, run: Any) 
     call = ("compact", second, "-o", tmp_path / "b.ply", "--earlier", tmp_path / "a.ply", "--effort", "draft")
     run(*call, "--report", tmp_path / "b.json", code=0)
     assert "taken_over" in (tmp_path / "b.json").read_text()
+    missing = run("compact", second, "-o", tmp_path / "c.ply", "--earlier", tmp_path / "no.ply", "--dry-run", code=3)
+    assert "no.ply" in missing.err
     assert "--up" in run(*call, "--overwrite", "--up=-y", code=2).err
     assert "a.ply" in run("compact", second, "-o", tmp_path / "a.ply", "--earlier", tmp_path / "a.ply", code=2).err

@@ -163,7 +163,7 @@ class _GpuEngine:
 
     def _score_images(self, images: list[Tensor]) -> float:
         options = self.plan.job.options
-        if options.fit == "none":
+        if options.fit == "none" or not options.judged:  # nothing is held out
             return float("nan")
         weights = to_device(np.stack(self.plan.weights), self.device)
         return score_blocks(torch.stack(images), self.photos[1].images, weights, options.tuning.min_gain)

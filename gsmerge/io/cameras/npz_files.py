@@ -14,7 +14,7 @@ import warnings
 import zipfile
 from collections.abc import Collection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -206,6 +206,15 @@ def array_names(path: Path) -> frozenset[str]:
         return frozenset()
 
 
+def array_shape(path: Path, name: str) -> tuple[int, ...]:
+    """Read the shape of an array in an ``.npz`` from its header; empty if it is missing or cannot be read."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _read_header(archive, _members(archive)[name])[0]
+    except Exception:  # whatever a damaged archive makes the libraries raise
+        return ()
+
+
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name; names that it lacks are left out.
 
@@ -232,12 +241,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    name = info.filename
-    with archive.open(info) as file:
-        start = io.BytesIO(file.read(_MAX_HEADER))
-    first = np.lib.format.read_magic(start) == (1, 0)
-    read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read_header(start)
+    name, (shape, dtype) = info.filename, _read_header(archive, info)
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
         raise SceneError(path, f"{name}: expected numbers, found {kind}")
@@ -245,3 +249,12 @@ def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         raise SceneError(path, f"{name}: expected as many bytes as shape {list(shape)} needs, found fewer")
     with archive.open(info) as file:
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    with archive.open(info) as file:
+        start = io.BytesIO(file.read(_MAX_HEADER))
+    first = np.lib.format.read_magic(start) == (1, 0)
+    read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read_header(start)
+    return shape, dtype

@@ -18,7 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_lines
 from gsmerge.io.cameras.camera_file import View, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.cameras.npz_files import array_names, read_frame
+from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.photo_files import Size
 
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
@@ -87,8 +87,8 @@ def pose_of_frame(frame: Path) -> np.ndarray:
 
 def _frame_size(poses: Path) -> Size:
     """Return (width, height) of the frames beside a file of poses; zeros without any."""
-    frame = poses.parent / FRAMES / "frame_0.npz"
-    return read_frame(frame).size if "depth" in array_names(frame) else (0, 0)
+    shape = array_shape(poses.parent / FRAMES / "frame_0.npz", "depth")
+    return (shape[1], shape[0]) if len(shape) == 2 else (0, 0)
 
 
 def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:

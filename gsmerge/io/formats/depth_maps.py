@@ -7,6 +7,7 @@ along z. Nothing but position and colour is known of a pixel: its Gaussian is a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +16,12 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.bounds import read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, to_viewmats
+from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, read_budget
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.io.cameras.camera_format import CameraSource
 from gsmerge.io.cameras.npz_files import (
     array_names,
+    array_shape,
     holds_poses,
     read_da3,
     read_depths,
@@ -31,6 +33,7 @@ from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, 
 from gsmerge.io.photo_files import PhotoReader, Photos, keep_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.runtime.threads import parallel_map
 
 SUFFIX = ".npz"
 PLACES = (  # in a folder, besides the frames
@@ -38,7 +41,7 @@ PLACES = (  # in a folder, besides the frames
 )  # fmt: skip
 SIGMA, OPACITY = 0.6, 0.7  # of a Gaussian: pixels, 0 to 1
 _GREY = 128
-_ROW_BYTES = 40  # of a pixel while it is unpacked: its ray and position
+_PIXEL_BYTES = 11  # that are kept of a pixel until it is unpacked, at most: a float64 and three colours
 _KEPT_BYTES = 128 << 20  # of images; more are read at each use
 
 
@@ -56,6 +59,11 @@ def is_frame(path: Path) -> bool:
     return path.suffix == SUFFIX and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
 
 
+def own_cameras(path: Path) -> Path:
+    """Return the file of the cameras that depth maps are placed by."""
+    return path.parent.parent / POSES if is_frame(path) else path
+
+
 def holds_depth_maps(path: Path) -> bool:
     """Return whether an ``.npz`` has depth maps with cameras; False if it cannot be read."""
     return not array_names(path).isdisjoint(("depth", "depths")) and (holds_poses(path) or is_frame(path))
@@ -68,21 +76,27 @@ def read_rows(path: Path) -> StoredRows:
     ``mini_npz``, Gaussians are grey. SceneError if the file is damaged, lacks an array, or images and depth maps differ
     in size.
     """
-    images: np.ndarray | None
-    if is_frame(path):
-        frame = read_frame(path)
-        depths, images, Ks = frame.depth[None], frame.image[None], frame.K[None]
-        viewmats = to_viewmats(_squared([pose_of_frame(path)]), C2W_OPENCV)
-    else:
-        depths, images, Ks, viewmats = _read_views(path)
+    depths, cameras = _read_frame(path) if is_frame(path) else _read_views(path)
+    images = None if cameras.images is None else np.asarray(cameras.images)
     if images is not None and images.shape[:3] != depths.shape:
         problem = f"expected images of the depth maps' size {list(depths.shape)}, found {list(images.shape[:3])}"
         raise SceneError(path, problem)
-    check_count(read_budget(path), depths.size, 0, _ROW_BYTES)
+    check_pixels(path, depths.shape[2], depths.shape[1])
+    check_count(read_budget(path), depths.size, 0, _PIXEL_BYTES)
     pictures = np.full((*depths.shape, 3), _GREY, np.uint8) if images is None else images
-    parts = [_pack(*view) for view in zip(depths, pictures, Ks, viewmats, strict=True)]
+    parts = [_pack(*view) for view in zip(depths, pictures, cameras.Ks, cameras.viewmats, strict=True)]
     sizes = {"means": depths.nbytes, "sh0": 0 if images is None else images.nbytes}
     return replace(to_stored(parts, "depth maps", sizes), format=str(depths.dtype))
+
+
+def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
+    """Read DA3-Streaming's frames as :func:`read_rows`; SceneError if they need more memory than all their bytes allow.
+
+    What each alone may need is much for thousands of small ones.
+    """
+    budget = ReadBudget(frames[0].parent, sum(map(check_file, frames)))
+    check_count(budget, sum(math.prod(array_shape(frame, "depth")) for frame in frames), 0, _PIXEL_BYTES)
+    return parallel_map(read_rows, frames)
 
 
 def read_images(frames: Sequence[Path]) -> Photos:
@@ -100,22 +114,23 @@ def read_images(frames: Sequence[Path]) -> Photos:
     return keep_photos(photos) if 3 * width * height * len(frames) <= _KEPT_BYTES else photos
 
 
-def _read_views(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]:
-    """Read depth maps ``[v,h,w]``, images ``[v,h,w,3]`` or None, intrinsics and world-to-camera matrices of a file."""
+def _read_frame(path: Path) -> tuple[np.ndarray, CameraFile]:
+    """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image."""
+    frame = read_frame(path)
+    view = View(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
+    return frame.depth[None], make_camera_file(path, "", C2W_OPENCV, [view], frame.image[None])
+
+
+def _read_views(path: Path) -> tuple[np.ndarray, CameraFile]:
+    """Read the depth maps ``[v,h,w]`` of a file, and the cameras of its v views, with images where it has some."""
     dumped = "c2w" in array_names(path)
     stored, depths = (read_dump if dumped else read_da3)(CameraSource(path)), read_depths(path)
-    if depths is None or len(depths) != len(stored.views) or any(view.K is None for view in stored.views):
-        problem = f"expected depth maps [{len(stored.views)},h,w], one for each pose, with intrinsics, found others"
-        raise SceneError(path, problem, "write all of them, or name a .ply of Gaussians")
     convention = stored.convention or (C2W_OPENCV if dumped else W2C_OPENCV)
-    Ks = np.array([view.K for view in stored.views], np.float64)
-    viewmats = to_viewmats(_squared([view.pose for view in stored.views]), convention)
-    return depths, None if stored.images is None else np.asarray(stored.images), Ks, viewmats
-
-
-def _squared(poses: Sequence[np.ndarray]) -> np.ndarray:
-    """Return poses ``[3,4]`` or ``[4,4]`` as ``[c,4,4]``."""
-    return np.stack([np.concatenate([pose[:3], [[0, 0, 0, 1]]]) for pose in poses]).astype(np.float64)
+    cameras = make_camera_file(path, "", convention, stored.views, stored.images)
+    if depths is None or len(depths) != len(cameras) or cameras.focal is None:
+        problem = f"expected depth maps [{len(cameras)},h,w], one for each pose, with intrinsics, found others"
+        raise SceneError(path, problem, "write all of them, or name a .ply of Gaussians")
+    return depths, cameras
 
 
 def _pack(depth: np.ndarray, image: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> Packed:

@@ -127,8 +127,8 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     """Read one PLY file, or several of the same columns or of depth maps as one, in order; see :func:`read_ply`."""
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    read = depth_maps.read_rows if input_format(paths[0]) is DEPTHS else ply.read_rows
-    parts = parallel_map(read, paths)
+    is_depth = input_format(paths[0]) is DEPTHS
+    parts = depth_maps.read_frames(paths) if is_depth else parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
@@ -139,9 +139,9 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a file of Gaussians; the ending of its name tells the format.
 
-    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``; of a ``lod-meta.json``, it is
-    the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is. SceneError if the file
-    cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
+    Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps; of a
+    ``lod-meta.json``, it is the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is.
+    SceneError if the file cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)

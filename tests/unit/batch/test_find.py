@@ -6,8 +6,10 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from messages import refuses
+from tiny_scene import Tiny, write_npz
 
 from gsmerge.batch import BatchOptions, find_jobs
 from gsmerge.batch.find import find_scenes, output_name
@@ -47,6 +49,16 @@ def test_what_is_no_scene_is_passed_by() -> None:
     touch("all/a.ply", "all/a.compact.ply", "all/a.compact.level1.ply", "all/.a-00112233.ply", "all/.hidden/b.ply")
     touch("all/points3D.ply", "all/c/scene.ply", "all/c/images/mask.ply", "all/input/d.ply")
     assert actual("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
+
+
+def test_depth_maps_are_scenes(tiny: Tiny) -> None:
+    """Also beside a result that was made of them, or a point cloud; and a .ply of Gaussians goes before them."""
+    for name in ("a/results.npz", "b/predictions.npz", "c/predictions.npz", "d/results_output/frame_0.npz"):
+        write_npz(Path("all", name), tiny, depth=np.ones((3, tiny.height, tiny.width)))
+    touch("all/b/predictions.compact.ply", "all/b/points3D.ply", "all/c/x.ply")
+    Path("all/d/camera_poses.txt").touch()
+    assert actual("all") == ["all/a", "all/b", "all/c/x.ply", "all/d"]
+    assert actual("all/d/results_output") == ["all/d/results_output"]
 
 
 def test_a_scene_s_own_folders_are_no_scenes_of_their_own() -> None:

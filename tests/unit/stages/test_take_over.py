@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.raster import contributions, plan_view, prepare, render
@@ -81,14 +82,36 @@ def test_masked_pixels_have_not_changed(scene: Scene) -> None:
 
 
 def test_no_more_than_were_decoded_for(scene: Scene) -> None:
-    start = replace(start_of(scene), count=100)
+    start = replace(start_of(scene), count=1500)
     taken = take_over(scene.gaussians, start, scene, range(len(scene)))
     assert taken is not None
     weights, _ = sum_weights(scene.gaussians, scene.cameras, np.zeros((len(scene), 48, 64), np.bool_))
-    assert len(taken.gaussians) == 100
+    assert len(taken.gaussians) == 1500
     assert np.array_equal(
-        taken.gaussians.means, scene.gaussians.means[np.sort(np.argsort(-weights, kind="stable")[:100])]
+        taken.gaussians.means, scene.gaussians.means[np.sort(np.argsort(-weights, kind="stable")[:1500])]
     )
+
+
+def test_what_has_changed_goes_before_what_stays(scene: Scene) -> None:
+    """Without room for both: an earlier result that fills the budget alone would leave holes where things moved."""
+    now, start = painted(scene), start_of(scene)
+    with record_run(None) as record:
+        whole = take_over(scene.gaussians, start, now, range(len(now)))
+        room = replace(start, count=len(start.gaussians))
+        tight = take_over(scene.gaussians, room, now, range(len(now)))
+    assert whole is not None
+    assert tight is not None
+    new = record.choices["taken_over"]["new"]
+    assert 0 < new < len(tight.gaussians) == room.count < len(whole.gaussians)
+    assert np.array_equal(tight.gaussians.means[-new:], whole.gaussians.means[-new:])
+
+
+def test_far_too_many_are_of_no_use(scene: Scene) -> None:
+    """Such as all Gaussians of a scene: what is left of them has holes."""
+    with record_run(None) as record:
+        start = replace(start_of(scene), count=len(scene.gaussians) // 9)
+        assert take_over(scene.gaussians, start, scene, range(len(scene))) is None
+    assert noted(record.notes, f"{len(scene.gaussians):,}", "nothing is taken over")
 
 
 def test_another_place_is_of_no_use(scene: Scene) -> None:
@@ -118,6 +141,7 @@ def test_compact_goes_on_from_an_earlier_result(scene: Scene) -> None:
     first = compact(scene, **settings)
     second = compact(scene, earlier=first.gaussians, **settings)
     assert second.report.choices["fit"]["steps"] == 20
+    assert np.isnan(second.report.choices["fit"]["holdout_after"])  # nothing is held out
     assert second.report.choices["taken_over"]["kept"] > 250
     assert second.report.choices["flicker"] < 0.02
     assert len(second.gaussians) <= 300

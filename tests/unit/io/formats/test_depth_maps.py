@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from messages import refuses
-from tiny_scene import Tiny, make_tiny, write_images, write_npz
+from tiny_scene import Tiny, make_tiny, write_images, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians
@@ -57,15 +58,16 @@ def check_rows(file: GaussianFile, tiny: Tiny, depths: np.ndarray, *, grey: bool
     assert np.allclose(file.gaussians.opacities, OPACITY)
 
 
-@pytest.mark.parametrize("kind", ["DA3", "DA3 without images", "VGGT", "dump"])
+@pytest.mark.parametrize("kind", ["DA3", "DA3 without images", "VGGT", "dump", "dump, divided by the size"])
 def test_all_views_in_one_file(tmp_path: Path, tiny: Tiny, kind: str) -> None:
     path, depths = tmp_path / "results.npz", depths_of(tiny)
     if kind == "VGGT":
         images = (tiny.images.transpose(0, 3, 1, 2) / 255).astype(np.float32)
         arrays = {"images": images, "extrinsic": tiny.w2c[:, :3], "intrinsic": np.tile(tiny.K, (3, 1, 1))}
         np.savez(path, depth=depths[..., None], **arrays)
-    elif kind == "dump":
-        np.savez(path, c2w=tiny.c2w, K=np.tile(tiny.K, (3, 1, 1)), images=tiny.images, depth=depths)
+    elif kind.startswith("dump"):
+        K = tiny.K / ([[tiny.width], [tiny.height], [1]] if "divided" in kind else 1)
+        np.savez(path, c2w=tiny.c2w, K=np.tile(K, (3, 1, 1)), images=tiny.images, depth=depths)
     else:
         write_npz(path, tiny, depth=depths, image=None if "without" in kind else tiny.images)
     assert holds_depth_maps(path)
@@ -101,6 +103,19 @@ def test_photos_color_depth_maps_without_images(tmp_path: Path) -> None:
     assert np.allclose(0.5 + SH_C0 * load.scene.gaussians.sh0[:, 0], tiny.images.reshape(-1, 3) / 255, atol=1e-5)
 
 
+@pytest.mark.parametrize("frames", [False, True])
+def test_cameras_of_the_depth_maps_go_before_others(tmp_path: Path, tiny: Tiny, frames: bool) -> None:
+    """Others beside them may be in another world, as COLMAP's are."""
+    if frames:
+        write_frames(tmp_path, tiny)
+    else:
+        write_npz(tmp_path / "predictions.npz", tiny, depth=depths_of(tiny))
+    write_transforms(tmp_path / "transforms.json", replace(tiny, c2w=tiny.c2w @ np.diag([2.0, 2.0, 2.0, 1.0])))
+    files = find_scene_files(tmp_path)
+    assert files.cameras == tmp_path / ("camera_poses.txt" if frames else "predictions.npz")
+    assert load_scene(tmp_path).scene.images is not None
+
+
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_pixel_without_depth_has_no_gaussian(tmp_path: Path, tiny: Tiny, value: float) -> None:
     depths = depths_of(tiny)
@@ -132,9 +147,48 @@ def test_damaged_depth_maps(tmp_path: Path, tiny: Tiny) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"depth": np.empty((3, 0, 0), np.float32), "image": None}, "0 x 0"),
+        ({"intrinsics": np.zeros((3, 3, 3))}, "focal"),
+        ({"intrinsics": np.ones((3, 3, 3))}, "0 0 1"),
+        ({"extrinsics": np.zeros((3, 3, 4))}, "orthonormal"),
+    ],
+)
+def test_impossible_depth_maps(tmp_path: Path, tiny: Tiny, changes: dict[str, Any], said: str) -> None:
+    path = tmp_path / "results.npz"
+    write_npz(path, tiny, **{"depth": depths_of(tiny), **changes})
+    with refuses(SceneError, path.name, said):
+        read_gaussians(path)
+
+
+def test_small_files_of_many_pixels(tmp_path: Path, tiny: Tiny) -> None:
+    """Depths of 16 bits with images take 3.8 bytes a pixel; frames that pack to nothing may not take more together."""
+    path, (views, height, width) = tmp_path / "results.npz", (4, 700, 800)
+    image = np.random.default_rng(0).integers(0, 256, (views, height, width, 3), np.uint8)
+    depth = np.tile(np.linspace(1, 2, width, dtype=np.float16), (views, height, 1))
+    poses, K = np.tile(np.eye(4), (views, 1, 1)), np.array([[800, 0, 400], [0, 800, 350], [0, 0, 1]], np.float64)
+    np.savez_compressed(path, extrinsics=poses, intrinsics=np.tile(K, (views, 1, 1)), depth=depth, image=image)
+    assert len(read_gaussians(path).gaussians) == views * height * width
+    large = {"depth": np.ones((height, width), np.float32), "image": np.zeros((height, width, 3), np.uint8)}
+    frames = write_frames(tmp_path / "out", tiny, **large)
+    assert len(read_gaussians(frames[0]).gaussians) == height * width
+    with refuses(SceneError, "results_output", "memory"):
+        read_parts(frames)
+
+
+def test_damaged_npz_says_so(tmp_path: Path, tiny: Tiny) -> None:
+    frames = write_frames(tmp_path, tiny)
+    frames[1].write_bytes(frames[1].read_bytes()[:200])
+    with refuses(SceneError, frames[1].name, "readable"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
         ({"depth": np.ones((5, 5), np.float32)}, "size"),
         ({"depth": np.ones((5, 5, 2), np.float32)}, "[h,w]"),
         ({"intrinsics": np.ones((2, 3))}, "intrinsics"),
+        ({"intrinsics": np.zeros((3, 3))}, "focal"),
         ({"image": np.array(["text"])}, "images"),
     ],
 )
@@ -154,6 +208,8 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
     poses.write_text("\n".join((*lines[:2], "1 2 3")))
     with refuses(SceneError, poses.name, "line 3", "12 or 16"):
         read_gaussians(frames[2])
+    with refuses(SceneError, "frame_2.npz", "one frame", "results_output"):
+        find_scene_files(frames[2])
     frames[1].unlink()
     with refuses(SceneError, "results_output", "number 1"):
         find_scene_files(tmp_path)
