@@ -60,6 +60,7 @@ FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which
 SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to
 SEAM_STEPS = 100  # at least
 SEAM_LOOKS = 2  # at each view, at least
+MOSTLY_SEAMS, ROOM_LOOKS = 0.5, 4  # share of Gaussians at seams from which on a scene is one room, and then the looks
 SEAM_RATE = 0.6  # times the usual first steps: what is there is fitted, but not beside its neighbours as they are now
 SEAM_DECAY = 0.1  # factor on the steps at the end
 MOST_DENSITY = 2.0  # times the superpixels of one piece, where a scene's views see so much of each other's
@@ -227,15 +228,16 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
         scene = join_views([(part.prepared.scene, ids) for part, ids in zip(parts, views, strict=True) if ids])
     rows = np.flatnonzero(peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution)
     tuning = replace(plan.fit.tuning.scaled(SEAM_RATE), decay=SEAM_DECAY)
+    looks = SEAM_LOOKS if at_seam.mean() < MOSTLY_SEAMS else ROOM_LOOKS
     options = replace(
-        plan.fit, fit_steps=max(SEAM_STEPS, SEAM_LOOKS * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
+        plan.fit, fit_steps=max(SEAM_STEPS, looks * len(scene)), photo_scale=1.0, judged=False, dropout=0.0,
         half_res_share=0.0, min_contribution=0.0, tuning=tuning,
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
         fitted = fit_scene(decoded, scene, range(len(scene)), options, seed, plan.backend)
     add_seconds(record.seconds)
-    choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum())})
+    choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}
     moved = at_seam[rows]  # what was fixed comes back rounded
     for name, column in columns.items():

@@ -59,6 +59,14 @@ def test_blocks_are_as_good_as_one_piece() -> None:
     assert parts.report.num_output == len(parts.gaussians)
 
 
+@pytest.mark.parametrize(("reach", "looks"), [(0.15, 4), (1.0, 2)])
+def test_rooms_that_all_views_see_take_more_steps_at_seams(reach: float, looks: int) -> None:
+    """Where most Gaussians are seen from several blocks, each was fitted by a part of the photos alone."""
+    seams = compact(along(np.linspace(0, reach, 60)), blocks=2, **SETTINGS).report.choices["seams"]
+    assert seams["steps"] == max(100, looks * seams["views"])
+    assert seams["steps"] > 100 or looks == 2
+
+
 def test_a_budget_is_met_exactly(scene: Scene) -> None:
     result = compact(scene, blocks=2, budget=700, **SETTINGS)
     assert len(result.gaussians) == 700
