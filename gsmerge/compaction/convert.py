@@ -28,10 +28,11 @@ from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.npz_files import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP
+from gsmerge.io.formats.table import COLMAP, DEPTHS, input_format
 from gsmerge.io.formats.write import add_levels
 from gsmerge.io.image_names import match_images
 from gsmerge.io.photo_files import read_images
@@ -97,6 +98,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     infos = [file.info for file in files]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
+    grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
+    notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     notes += output_notes(options.output, gaussians.sh_degree, options.spz_version, options.images)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):

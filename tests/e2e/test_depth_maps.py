@@ -51,3 +51,13 @@ def test_a_batch_finds_depth_maps(frames: Path, tmp_path: Path, run: Any) -> Non
     document = json.loads(out)
     assert [scene["scene"] for scene in document["scenes"]] == [str(frames)]
     assert document["scenes"][0]["num_gaussians"] > 0
+
+
+def test_converting_depth_maps_without_images_says_that_they_are_grey(tmp_path: Path, run: Any) -> None:
+    poses, K = np.tile(np.eye(4)[:3], (2, 1, 1)), np.array([[20.0, 0, 8], [0, 20, 6], [0, 0, 1]])
+    arrays = {"depth": np.ones((2, 12, 16), np.float32), "extrinsics": poses, "intrinsics": np.tile(K, (2, 1, 1))}
+    np.savez(tmp_path / "results.npz", **arrays)
+    message = run("convert", tmp_path / "results.npz", tmp_path / "a.ply", code=0).err
+    assert "results.npz: depth maps without images: all Gaussians are grey" in message
+    np.savez(tmp_path / "results.npz", image=np.full((2, 12, 16, 3), 9, np.uint8), **arrays)
+    assert "grey" not in run("convert", tmp_path / "results.npz", tmp_path / "b.ply", code=0).err
