@@ -17,7 +17,7 @@ from shared_scenes import LEFT_OUT, Targets, exporter, read_held_out, scene_fold
 import gsmerge
 from gsmerge.measure.sizes import resize_mask, resize_photo, zoom_cameras
 from gsmerge.raster.metrics import psnr, ssim
-from gsmerge.types import Cameras, LargePhotos
+from gsmerge.types import Cameras, LargePhotos, grid_ids
 
 HALF = 2
 
@@ -44,7 +44,7 @@ def half_export(folder: Path) -> gsmerge.Scene:
     large = LargePhotos(K, width, height, tuple(range(len(views))), photos.__getitem__)
     cameras = Cameras(np.stack([np.linalg.inv(view["c2w"]) for view in views]), Ks, *size)
     names, valid = tuple(view["name"] for view in views), np.ones((len(views), size[1], size[0]), bool)
-    return gsmerge.PixelScene(gaussians, cameras, images, valid, names, None, large)
+    return gsmerge.Scene(gaussians, cameras, images, grid_ids(valid), names, None, large)
 
 
 def score(gaussians: gsmerge.Gaussians, targets: Targets, zoom: float) -> tuple[float, float]:

@@ -16,7 +16,6 @@ from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
 from gsmerge.types import Gaussians
 
-EARLIER = 0.1  # share of the steps by which half-size photos end sooner where larger ones follow
 GROWTH = 0.5  # part of the run after which Gaussians are added
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
 MANY_STEPS = 150
@@ -118,10 +117,7 @@ def plan_run(job: FitJob) -> FitPlan:
         trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
-    half_part = options.half_res_part
-    if len(photos) > 2 and options.half_res_share is None:
-        half_part -= EARLIER
-    return FitPlan(job, weights, (everywhere, trained, *larger), dropout, half_part)
+    return FitPlan(job, weights, (everywhere, trained, *larger), dropout, options.half_res_part)
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:

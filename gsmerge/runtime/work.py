@@ -1,7 +1,7 @@
-"""Engines that make calls: in this process, or in those of a Ray cluster (:mod:`gsmerge.runtime.processes`: in others).
+"""Engines that make calls: in this process, or in those of a Ray cluster.
 
 Ray is an extra, which schedules by threads and memory. A process that dies takes one call with it. Of work in parts,
-such a call is made again, elsewhere, and gives the same.
+such a call is made again, elsewhere, and gives the same. Processes of this machine: :mod:`gsmerge.runtime.processes`.
 """
 
 from __future__ import annotations

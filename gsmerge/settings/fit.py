@@ -10,7 +10,7 @@ from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]
 STEPS = 320  # of the full fit
-LONG_STEPS = 600  # from here on full-size photos and a little dropout pay
+LONG_STEPS = 600  # from here on a little dropout pays
 USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show well
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
 CONTINUED_STEPS, CONTINUED_HALF, CONTINUED_RATE = 0.5, 0.15, 0.7  # of runs from a fitted start, see FitOptions
@@ -84,8 +84,8 @@ class FitOptions(Settings):
         "By default 0.1 for five views or fewer and 150 steps or more, where the fit would memorise the photos, "
         "otherwise 0.05 from 600 steps and 30 looks at each view on, and 0 below.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
-        "By default 0.7, from 600 steps on 0.5, below 20 all; less for more than 4.4 % of the Gaussians, and 0.1 less "
-        "where `photo_scale` is above 1.", least=0, most=1)  # fmt: skip
+        "By default 0.5, below 150 steps 0.7, below 20 all; less for more than 8.6 % of the Gaussians.",
+        least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' blocks that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
@@ -115,10 +115,9 @@ class FitOptions(Settings):
             return self.half_res_share
         if self.steps < HASTY_STEPS:
             return 1.0
-        part = 0.5 if self.steps >= LONG_STEPS else 0.7
-        if self.share is None or not self.grows:
-            return part
-        return min(part, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
+        if not self.grows:
+            return 0.7
+        return 0.5 if self.share is None else min(0.5, 0.7 * math.sqrt(USUAL_SHARE / max(self.share, USUAL_SHARE)))
 
     @property
     def needs_photos(self) -> bool:

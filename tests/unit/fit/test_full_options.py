@@ -19,7 +19,7 @@ from gsmerge.raster import plan_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import gradients_of
 from gsmerge.raster.photos import Photos
-from gsmerge.settings.fit import LONG_STEPS, USUAL_SHARE, Tuning
+from gsmerge.settings.fit import GROW_STEPS, LONG_STEPS, USUAL_SHARE, Tuning
 
 
 @pytest.mark.parametrize("coarse", [0.5, 1.0])
@@ -65,7 +65,12 @@ def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> Non
     assert plan_run(FitJob(photos, replace(LONG, dropout=0.0))).dropout == 0
     very_long = replace(LONG, fit_steps=LONG_STEPS)
     assert 0 < plan_run(FitJob(pair, very_long)).dropout < plan_run(FitJob(photos, very_long)).dropout
-    assert very_long.half_res_part < LONG.half_res_part < replace(LONG, half_res_share=0.9).half_res_part
+
+
+def test_shorter_runs_have_more_steps_on_half_size_photos() -> None:
+    parts = [FitOptions(fit_steps=steps).half_res_part for steps in (10, 60, GROW_STEPS, 1000)]
+    assert 1 == parts[0] > parts[1] > parts[2] == parts[3]
+    assert replace(LONG, half_res_share=0.9).half_res_part == 0.9
 
 
 def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
