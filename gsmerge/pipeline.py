@@ -5,10 +5,10 @@ from __future__ import annotations
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
+from gsmerge.runtime.record import choose
 from gsmerge.stages.assign import assign
-from gsmerge.stages.choose_start import choose_start
 from gsmerge.stages.decode import decode_merged, keep_all
-from gsmerge.stages.encode import correct, encode, make_context
+from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.pair_merge import merge_neighbors
@@ -43,17 +43,10 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     """Merge the superpixels of all views; compacting, encoding and adding views in batches share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
-    members = assign(scene, segmentation.groups, draws=plan.checkpoint is None)
-    pooled, matches = encode(scene, members, segmentation.groups), None
-    starts = list[MergedViews]()
-    for networks in plan.networks:
-        context = make_context(networks, members, scene.cameras, plan.seed)
-        features = correct(pooled, members, scene.cameras, context, weaken=plan.weakens)
-        if matches is None:
-            matches = match(features, plan.match, context)
-        merged = refine(merge(features, matches, context), context)
-        unlearned = None if context is None or plan.fit.fit == "none" else pooled
-        starts.append(MergedViews(merged, members, segmentation, len(features), context, unlearned))
-        if context is not None and (context.options.encoder or plan.match.geometry == "decoded"):
-            matches = None  # they are of what networks made of the geometry
-    return choose_start(starts, scene, plan.decode, plan.checkpoint)  # of one: that one
+    members = assign(scene, segmentation.groups, draws=plan.networks is None)
+    networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
+    pooled = encode(scene, members, segmentation.groups)
+    features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)
+    merged = refine(merge(features, match(features, plan.match, networks), networks), networks)
+    choose(groups=len(features), clusters=len(merged), **plan.network_facts)
+    return MergedViews(merged, members, segmentation, len(features), networks)

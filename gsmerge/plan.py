@@ -56,14 +56,14 @@ class Effort:
     rectangles: float  # Rectangles per superpixel of `rdseg`
     early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
     merges: bool = True  # Whether Gaussians of different views are merged
-    networks: bool = True  # Whether `checkpoint="auto"` may run networks before a fit, and without one more than heads
+    refines: bool = True  # Whether `checkpoint="auto"` runs more of the networks than the heads
     prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
 
 EFFORTS = {
-    "draft": Effort(30, 1.0, 0, merges=False, networks=False, prunes=False, large_photos=False),
-    "fast": Effort(55, 1.0, 0, networks=False, large_photos=False),
+    "draft": Effort(30, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False),
+    "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(320, 2.0, 0),
     "best": Effort(1000, 3.0, 1),
 }
@@ -74,7 +74,6 @@ class Plan:
     """All decisions about a run, made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
-    networks: tuple[NetworkWeights | None, ...]  # Networks, None for the analytic start, or both
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -89,13 +88,23 @@ class Plan:
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
-    checkpoint: Checkpoint | None  # Where the networks come from; None without any
+    checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+
+    @property
+    def networks(self) -> NetworkWeights | None:
+        """Networks that correct the stages' results; None: closed formulas alone."""
+        return None if self.checkpoint is None else self.checkpoint.networks
+
+    @property
+    def network_facts(self) -> dict[str, Any]:
+        """Facts about the networks, for reports, by name; empty without networks."""
+        return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
 
     @property
     def weakens(self) -> bool:
         """Whether groups that other views see through start with less opacity, because a long fit follows."""
-        return self.superpixels.start_share < 1
+        return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
     def limits(self) -> CountLimits:
@@ -150,12 +159,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
-    networks: tuple[NetworkWeights | None, ...] = (None,)
-    if checkpoint is not None:
-        networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
         superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
-        networks=networks,
         match=replace(options.match, match=whole.match),
         decode=options.decode,
         fit=fit,
@@ -274,16 +279,14 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
-    under an effort that has time for both, and others with photos to choose the start by if no fit follows
-    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    The shipped networks improve scenes with one Gaussian per pixel (``aligned``), and others that have photos, if no
+    fit follows; a fit takes more from its steps (docs/laboratory/networks.md). ``photos``: whether there are any to fit
+    to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
-    short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
-    bare = not photos or options.fit.fit == "none"
-    return "shipped" if (aligned and (bare or short)) or (photos and options.fit.fit == "none") else "none"
+    unfitted = options.fit.fit == "none"
+    return "shipped" if (aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
 def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
@@ -303,7 +306,7 @@ def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Che
         note(text)
     if checkpoint is None:
         return None
-    if options.checkpoint == "auto" and not EFFORTS[options.effort].networks:
+    if options.checkpoint == "auto" and not EFFORTS[options.effort].refines:
         checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
     outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":

@@ -72,9 +72,8 @@ class CompactOptions(Settings):
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped ones where they improve the result.",
         "`shipped`: those that come with the package; `paper`: those with absolute outputs; `none`: the analytic "
-        "stages alone. `auto`: the shipped ones where no fit follows or a short one, unless the analytic start shows "
-        "the views better; of these, a draft or a fast run without a fit takes the decoder heads alone, one with a fit "
-        "none.", metavar="FILE|NAME")  # fmt: skip
+        "stages alone. `auto`: the shipped ones where no fit follows, of which a draft or a fast run takes the decoder "
+        "heads alone.", metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "

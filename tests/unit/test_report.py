@@ -27,7 +27,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
         "seconds": {"segment": 1.0, "encode": 0.5},
         "psnr_before": 20.0,
         "psnr_after": 24.5,
-        "choices": {"scored_views": 4, "start_scores": {"analytic": float("inf")}},
+        "choices": {"scored_views": 4, "agreement": {"share": float("inf")}},
         "notes": ["a note"],
         "options": CompactOptions(seed=5).to_dict(),
         "peak_memory_bytes": 10**9,
@@ -43,7 +43,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
 
 def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
     document = json.loads(report.to_json(make_document(files)))
-    assert document["choices"]["start_scores"]["analytic"] is None  # infinity is no JSON
+    assert document["choices"]["agreement"]["share"] is None  # infinity is no JSON
     assert document["input"]["sha256"] == hashlib.sha256(b"x" * 2_500_000).hexdigest()
     assert document["ratio"] == 0.025
     assert list(document["seconds"]) == ["read", "segment", "encode", "write"]
