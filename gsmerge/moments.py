@@ -37,6 +37,10 @@ class Members:
     # [v,h,w] int32, the member that each pixel shows, -1 for none; None: the one of its own number
     fronts: np.ndarray | None = None
 
+    def pixels_of(self, rows: np.ndarray) -> np.ndarray:
+        """Return the pixels of some members, -1 for none."""
+        return rows if self.pixels is None else self.pixels[rows]
+
 
 def _array(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float32)

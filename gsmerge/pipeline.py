@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
@@ -11,10 +13,11 @@ from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
-from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.take_over import take_over
 from gsmerge.types import Decoded, Gaussians
+
+Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None, earlier: Gaussians | None = None) -> Fitted:
@@ -22,14 +25,11 @@ def build(prepared: Prepared, plan: Plan, count: int | None, earlier: Gaussians 
 
     ``earlier``: canonical Gaussians of a result of another moment to start from.
     """
-    if prepared.alone:  # no view to cut into superpixels, and no photo to fit to
-        scene, most = prepared.scene, plan.limits.default if count is None else count
-        return Fitted(merge_neighbors(scene.gaussians, most), scene.cameras, None)
     decoded, options = start(prepared, plan, count), plan.fit
     if earlier is not None:
-        taken = take_over(earlier, decoded, prepared.scene, prepared.photo_views)
+        taken = take_over(earlier, decoded, prepared.scene, prepared.reference.fit_views)
         decoded, options = (decoded, options) if taken is None else (taken, options.continued())
-    return fit_scene(decoded, prepared.scene, prepared.photo_views, options, plan.seed, plan.backend)
+    return fit_scene(decoded, prepared.scene, prepared.reference.fit_views, options, plan.seed, plan.backend)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

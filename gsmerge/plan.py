@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.budget import FileSize, exact_count, file_size
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
-from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.prepare import Prepared, Reference
+from gsmerge.facts.row_colors import RENDERS
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import report_views, scored_views
 from gsmerge.fit import FitBackend, photo_scale, start_share
 from gsmerge.fit.gpu import choose_backend
@@ -34,7 +36,7 @@ from gsmerge.settings.stages import (
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import clean
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import CountLimits, SceneSize, SuperpixelPlan, count_limits, measure_size, scene_tree
+from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -78,7 +80,7 @@ class Plan:
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
     clean: CleanOptions  # What is left out of the result
-    unseen: Gaussians | None  # Merged canonical Gaussians that no view sees; None without any
+    unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the input photos have to reach; None: no target
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
@@ -125,33 +127,27 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
     ``checkpoint``: networks to use instead of those that the options name.
     """
-    input_scene, scene, effort = prepared.input_scene, prepared.scene, EFFORTS[options.effort]
-    alone = prepared.alone
-    _check_photos(input_scene, options, judged=alone)
-    cuts = options.method == OURS and not alone  # views into superpixels
+    scene, reference, size = prepared.scene, prepared.reference, prepared.size
+    _check_photos(reference, options)
+    cuts = options.method == OURS and size.num_views > 0  # views into superpixels
     with stage("prepare"):
-        has_photos = bool(prepared.photo_views)
         if checkpoint is None and cuts:  # baselines learn nothing
-            checkpoint = load_networks(options, input_scene, photos=has_photos)
-        asked, options = options, options if alone else resolve_budget(options, scene)
-        segment = options.segment if alone else _resolve_superpixels(options.segment, scene, effort)
+            checkpoint = load_networks(options, photos=reference.of_views, aligned=size.aligned)
+        asked, options = options, resolve_budget(options, scene)
+        segment = _resolve_superpixels(options.segment, scene, EFFORTS[options.effort])
         clean_options = options.clean
-        if "sky" in clean_options.drops and not prepared.photo_views:
+        if "sky" in clean_options.drops and not reference.fit_views:
             note("drop sky: no photo is used that could say where the sky is, so it stays")
             left = ",".join(name for name in clean_options.drops if name != "sky")
             clean_options = replace(clean_options, drop=left or None)
-        size = measure_size(input_scene if alone else scene, photos=has_photos)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        whole = plan_whole(
-            size, replace(options, segment=segment), num_input=num_input,
-            num_reserved=0 if unseen is None else len(unseen),
-        )  # fmt: skip
+        whole = plan_whole(size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen))
         limits = whole.limits
-        backend, problem = choose_backend(options.device, input_scene.num_gaussians)
+        backend, problem = choose_backend(options.device, prepared.input_scene.num_gaussians)
         if problem is not None:
             note(problem)
         fit = _fit_photos(prepared, options, whole.fit, backend)
@@ -263,11 +259,11 @@ def _whole_needed(options: CompactOptions) -> list[str]:
     return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
 
 
-def _check_photos(scene: Scene, options: CompactOptions, *, judged: bool) -> None:
+def _check_photos(reference: Reference, options: CompactOptions) -> None:
     """Refuse settings that need photos where there are none."""
-    if scene.images is None and options.budget.quality is not None and not judged:
+    if not reference.score_views and options.budget.quality is not None:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    if scene.images is None and "sky" in options.clean.drops:
+    if reference.name == RENDERS and "sky" in options.clean.drops:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
@@ -281,7 +277,7 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
 
     The shipped networks improve scenes with one Gaussian per pixel (``aligned``), and others that have photos, if no
     fit follows; a fit takes more from its steps (docs/laboratory/networks.md). ``photos``: whether there are any to fit
-    to.
+    to that are not drawings of the scene itself.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -289,14 +285,13 @@ def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = Tr
     return "shipped" if (aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
-def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
+def load_networks(options: CompactOptions, *, photos: bool, aligned: bool) -> Checkpoint | None:
     """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
 
-    ``photos``: whether there are any to fit to. SceneError if it is required and cannot be used,
-    UsageError if it does not fit.
+    ``photos``, ``aligned``: see :func:`choose_networks`. SceneError if it is required and cannot be used, UsageError if
+    it does not fit.
     """
-    shows = photos and (scene.aligned or scene.images is not None)  # no pictures drawn of the scene itself
-    name = choose_networks(options, photos=shows, aligned=scene.aligned)
+    name = choose_networks(options, photos=photos, aligned=aligned)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint
@@ -352,19 +347,19 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
 
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
-) -> tuple[Gaussians | None, int | None]:
+) -> tuple[Gaussians, int | None]:
     """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
     num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
-    if unseen is None:
-        return None, num_input
+    if len(unseen) == 0:
+        return unseen, num_input
     num_input = scene.num_gaussians + len(unseen)
     exact = exact_count(options.budget, num_input, unseen.sh_degree)
     rate = segment.share * options.decode.mean_k if exact is None else exact / num_input
     visible = unseen[unseen.opacities >= options.decode.min_opacity]
     count = min(len(visible), int(rate * len(unseen)))
     if count == 0:
-        return None, num_input
+        return unseen[:0], num_input
     merged = merge_unseen(visible, scene, count)
     return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
 
@@ -417,15 +412,16 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, ba
     if problem is not None:
         note(problem)
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.input_scene.images is not None  # which only the CPU can do
+    moves = free and fit.fit == "full" and prepared.reference.of_views  # which only the CPU can do
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
     """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
-    if prepared.alone:
-        return tuple(range(len(prepared.scene)))
-    views = prepared.photo_views or range(len(prepared.scene))
+    reference = prepared.reference
+    if reference.placed:
+        return reference.score_views
+    views = reference.fit_views or range(len(prepared.scene))
     candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
     choose_some = report_views if options.budget.target_psnr is None else scored_views
     return tuple(candidates[i] for i in choose_some(len(candidates)))

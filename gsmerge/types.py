@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from gsmerge.errors import refuse_without_torch
 if TYPE_CHECKING:
     import torch
 
+SceneT = TypeVar("SceneT", bound="Scene")
 StrPath = str | os.PathLike[str]
 Array = Any  # a NumPy array, or a torch tensor where a docstring allows one
 
@@ -339,6 +340,11 @@ class Scene:
         return len(self.gaussians) - self.num_missing
 
     @property
+    def finite_gaussians(self) -> Gaussians:
+        """Gaussians without the rows that stand in for those that are not finite in the file."""
+        return self.gaussians if self.pixel_ids is None else self.gaussians[self.pixel_ids >= 0]
+
+    @property
     def stored(self) -> np.ndarray:
         """Mask ``[v,h,w]`` of an aligned scene's pixels whose Gaussian is finite and comes from the file."""
         return self.valid if self.missing is None else self.valid & ~self.missing
@@ -352,6 +358,23 @@ class Scene:
     def pixels_per_view(self) -> int:
         """Number of pixels of a view, H·W."""
         return self.cameras.height * self.cameras.width
+
+
+@dataclass(frozen=True)
+class PicturedScene(Scene):
+    """A scene that has a picture of every view: its photo, or what stands in for it."""
+
+    images: np.ndarray
+
+    @staticmethod
+    def of(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:
+        """Return a scene with pictures ``[v,h,w,3]``, sRGB in [0, 1], and the masks of the pixels that count."""
+        columns = {field.name: getattr(scene, field.name) for field in fields(Scene)}
+        return PicturedScene(**columns | {"images": images, "masks": masks})
+
+    def without_pictures(self) -> Scene:
+        """Return the scene without its pictures."""
+        return Scene(**{field.name: getattr(self, field.name) for field in fields(Scene)} | {"images": None})
 
 
 def grid_ids(valid: np.ndarray) -> np.ndarray:

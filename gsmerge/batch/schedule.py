@@ -17,6 +17,7 @@ from gsmerge.batch.find import Job
 from gsmerge.batch.records import BUSY, RECORDS, STUCK, RecordIndex, check_folder
 from gsmerge.batch.task import BatchContext, Task, clean_up, make_tasks, record_failure, run_lock, run_recorded
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import human_bytes, machine_memory
@@ -25,7 +26,6 @@ from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Cluster, Lost, RayPool
 from gsmerge.scene.content_hash import cameras_of
 from gsmerge.scene.files import find_scene_files
-from gsmerge.stages.segment import SceneSize
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that is used by default
 POLL_SECONDS = 0.5  # between two queries of the pool

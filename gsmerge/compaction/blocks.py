@@ -19,7 +19,7 @@ from gsmerge.compaction.result import (
     Covered,
     measure_covered,
     measure_input,
-    measure_psnr,
+    measure_result,
 )
 from gsmerge.facts.partition import (
     WHOLE_GAUSSIANS,
@@ -34,6 +34,7 @@ from gsmerge.facts.partition import (
 )
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
 from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
@@ -52,8 +53,7 @@ from gsmerge.settings.budget import DEVICES, parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.stages.segment import measure_size
-from gsmerge.types import Decoded, Gaussians, Scene
+from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
 FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
@@ -167,14 +167,14 @@ def without_gaussians(prepared: Prepared) -> Prepared:
     """Return a prepared scene without Gaussians and with photos in a file, to free their memory."""
     moved: dict[int, np.ndarray] = {}  # photos that both scenes share are moved once
 
-    def bare(scene: Scene) -> Scene:
-        images = scene.images
-        if images is not None and id(images) not in moved:
+    def bare(scene: SceneT) -> SceneT:
+        images = np.asarray(scene.images)  # rows with pixels always have pictures
+        if id(images) not in moved:
             moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
             moved[id(images)][:] = images
             free_pages([moved[id(images)]])
-        images = None if images is None else moved[id(images)]
-        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixel_ids=None, missing=None)
+        none = scene.gaussians[np.zeros(0, int)]
+        return replace(scene, gaussians=none, images=moved[id(images)], pixel_ids=None, missing=None)
 
     return replace(prepared, scene=bare(prepared.scene), input_scene=bare(prepared.input_scene))
 
@@ -199,7 +199,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
-    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    fitted = fit_scene(decoded, scene, part.prepared.reference.fit_views, plan.fit, plan.seed, plan.backend)
     if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
         return fitted.gaussians
     assert fitted.report.origins is not None
@@ -208,7 +208,8 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
 
 def score_part(part: Part, gaussians: Gaussians, _: int) -> tuple[float | None, Covered | None]:
     """Measure the PSNR (dB) of the whole result on a block's scored photos, and where the input covers them."""
-    psnr = measure_psnr("score", gaussians, part.prepared.result_views(), part.prepared, part.plan)
+    measured = measure_result(gaussians, part.prepared, part.plan)
+    psnr = None if measured is None else measured.psnr
     return psnr, measure_covered(part.before, gaussians, part.prepared, part.plan)
 
 
@@ -255,23 +256,22 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
     at_seam = foreign > FOREIGN * total
     for number, place, weights in _view_weights(splats, parts):  # again: those of all views would not fit into memory
         of_seam, of_all = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam], weights))
-        if place in parts[number].prepared.photo_views and of_seam > SEAM_SHARE * of_all:
+        if place in parts[number].prepared.reference.fit_views and of_seam > SEAM_SHARE * of_all:
             views[number].append(place)
     return at_seam, views
 
 
-def join_views(chosen: Sequence[tuple[Scene, list[int]]]) -> Scene:
+def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
     """Join views of several scenes without Gaussians into one scene, whose photos are in a file if they are many."""
     total, cameras = sum(len(ids) for _, ids in chosen), chosen[0][0].cameras
     images, first = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
     for scene, ids in chosen:
-        assert scene.images is not None
         for view in ids:
             images[first] = scene.images[view]
             first += 1
         free_pages([scene.images, images])
-    joined = concat_scenes([subset(replace(scene, images=None), ids) for scene, ids in chosen], images)
-    return replace(joined, cameras=in_float64(joined.cameras))
+    joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in chosen], images)
+    return PicturedScene.of(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
 def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, int, np.ndarray]]:

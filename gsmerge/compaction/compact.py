@@ -10,21 +10,21 @@ from typing import Any
 
 from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
-from gsmerge.compaction.methods import Build, choose_method
+from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.overdraw import meet_overdraw
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
+from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, make_plan, note_engine, plan_whole, stands_alone
+from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
-from gsmerge.stages.segment import measure_size
 from gsmerge.stages.take_over import measure_flicker
 from gsmerge.types import Gaussians, Scene, StrPath
 
@@ -73,13 +73,12 @@ def compact(
 
 def compact_piece(scene: Scene, options: CompactOptions, earlier: Gaussians | None = None) -> CompactResult:
     """Compact a scene in one piece, from an ``earlier`` result of another moment if there is one."""
-    method = choose_method(options, scene, build)  # ours, or a baseline
-    alone = stands_alone(scene, options)  # facts: frame, photos, poses, unseen
-    prepared = prepare_alone(scene.numpy()) if alone else prepare(scene.numpy(), options.prepare)
+    method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
+    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
     earlier = enter_earlier(earlier, prepared, options)
     method = method if earlier is None else partial(build, earlier=earlier)
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
-    search = search_count(prepared, plan)  # one count, or counts until a quality is met
+    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
     rebuild = partial(build_scored, method, prepared, plan)
@@ -88,7 +87,7 @@ def compact_piece(scene: Scene, options: CompactOptions, earlier: Gaussians | No
     levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
     if earlier is not None:
-        choose(flicker=measure_flicker(earlier, best.fitted.gaussians, prepared.scene, prepared.photo_views))
+        choose(flicker=measure_flicker(earlier, best.fitted.gaussians, prepared.scene, prepared.reference.fit_views))
     return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 
@@ -96,19 +95,19 @@ def enter_earlier(earlier: Gaussians | None, prepared: Prepared, options: Compac
     """Return the canonical Gaussians of an earlier result; None, with a note, where no fit to photos can go on."""
     if earlier is None:
         return None
-    if prepared.scene.images is None or not prepared.photo_views or options.fit.fit == "none" or options.method != OURS:
+    if not prepared.reference.fit_views or options.fit.fit == "none" or options.method != OURS:
         note("the earlier result is not used: there is no fit to photos that could go on from it")
         return None
     return prepared.frame.enter(earlier.numpy())
 
 
 @record_part()
-def build_scored(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+def build_scored(method: Method, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
     return score(count, build_cleaned(method, prepared, plan, count), prepared, plan)
 
 
-def build_cleaned(method: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+def build_cleaned(method: Method, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
 
     More are built than are asked for, and the faintest of what is too many are left out. UsageError if the crop holds
@@ -116,9 +115,9 @@ def build_cleaned(method: Build, prepared: Prepared, plan: Plan, count: int | No
     """
     options = plan.clean
     if not options.asked:
-        return method(prepared, plan, count)
+        return method.build(prepared, plan, count)
     scene, to_world = prepared.scene, prepared.frame.leave
-    input_gaussians = scene.gaussians[scene.valid.reshape(-1)] if scene.aligned else scene.gaussians
+    input_gaussians = scene.finite_gaussians
     most, asked = len(input_gaussians), count
     share = 1.0 if options.crop is None else float(inside_crop(to_world(input_gaussians).means, options.crop).mean())
     if share == 0:
@@ -129,7 +128,7 @@ def build_cleaned(method: Build, prepared: Prepared, plan: Plan, count: int | No
     best: tuple[Fitted, dict[str, int], Record] | None = None
     for _ in range(MAX_BUILDS):
         with record_part() as record:
-            fitted = method(prepared, plan, asked)
+            fitted = method.build(prepared, plan, asked)
             gaussians, counts = clean(fitted.gaussians, options, scene, to_world)
         add_seconds(record.seconds)
         if best is None or count is None or len(best[0].gaussians) < len(gaussians):

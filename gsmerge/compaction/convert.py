@@ -46,7 +46,7 @@ from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, PicturedScene
 
 NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
@@ -194,7 +194,7 @@ def _clean(
         raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --images")
     images = read_images(options.images, stored.names)
     cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
-    scene = Scene(gaussians, cameras, images, None, stored.names)
+    scene = PicturedScene(gaussians, cameras, images, None, stored.names)
     frame = scene_frame(scene)
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     seen = replace(scene, gaussians=canonical, cameras=frame.enter_cameras(cameras))

@@ -24,6 +24,7 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, output_format, read_gaussians, write_gaussians
 from gsmerge.io.atomic import AddOutput
@@ -46,7 +47,6 @@ from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Gaussians, Scene
 
 
@@ -151,7 +151,8 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
         if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
-            load_networks(settings, scene, photos=measure_size(scene).photos)
+            size = measure_size(scene)
+            load_networks(settings, photos=size.photos, aligned=size.aligned)
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
     return {

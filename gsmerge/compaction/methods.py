@@ -10,15 +10,18 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
+from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.stages import PrepareOptions
+from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import Gaussians, Scene
 
-Build = Callable[[Prepared, Plan, int | None], Fitted]
 Need = Literal["photos", "pixels"]
 COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
 COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop"}  # that every method uses
@@ -26,7 +29,7 @@ COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop"}  # that every me
 
 @dataclass(frozen=True)
 class Method:
-    """A method besides our own, such as a baseline.
+    """A way to compact a scene: our own, one for scenes without cameras, or another, such as a baseline.
 
     Args:
         name: As on the command line.
@@ -35,6 +38,7 @@ class Method:
         needs: What the scene has to have: ``"photos"``; ``"pixels"``: one Gaussian per pixel.
         uses: Settings that it uses, by flat name, besides those that all methods use.
         check: Raises a UsageError where a program that it runs is missing.
+        prepare: Scene and options -> the prepared scene that ``run`` gets.
     """
 
     name: str
@@ -42,6 +46,7 @@ class Method:
     needs: tuple[Need, ...] = ()
     uses: tuple[str, ...] = COUNTS
     check: Callable[[], object] = lambda: None
+    prepare: Callable[[Scene, PrepareOptions], Prepared] = prepare
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         """Build ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
@@ -49,27 +54,44 @@ class Method:
         return Fitted(gaussians, prepared.scene.cameras, None)
 
 
-def find_method(options: CompactOptions) -> Method | None:
-    """Load the method that the options name; None for our own. Raises UsageError if a program is missing."""
+@dataclass(frozen=True)
+class _Superpixels(Method):
+    """Our own method, which fits what it builds."""
+
+    def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+        """Build and fit ``count`` canonical Gaussians."""
+        return build(prepared, plan, count)
+
+
+SUPERPIXELS = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
+PAIRS = Method(  # by positions and colours alone
+    "pairs", lambda prepared, _, count: merge_neighbors(prepared.scene.gaussians, count), prepare=prepare_alone
+)
+
+
+def find_method(options: CompactOptions) -> Method:
+    """Load the method that the options name. Raises UsageError if a program is missing."""
     if options.method == OURS:
-        return None
+        return SUPERPIXELS
     method: Method = load_plugin(METHODS, options.method)
     method.check()
     return method
 
 
-def check_method(options: CompactOptions, scene: Scene) -> tuple[Method | None, list[str]]:
-    """Load the method that the options name, and note changed settings that the method ignores.
+def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[str]]:
+    """Choose the method for a scene by its options, and note changed settings that the method ignores.
 
     Raises UsageError if the scene lacks what the method needs, or a program is missing.
     """
-    method = find_method(options)
-    if method is None:
-        return None, _unused_alone(options) if stands_alone(scene, options) else []
+    if stands_alone(scene, options):
+        return PAIRS, _unused_alone(options)
+    method, size = find_method(options), measure_size(scene)
+    if options.method == OURS:
+        return method, []
     place = f"method {method.name}"
-    if "photos" in method.needs and scene.images is None and not scene.aligned:
+    if "photos" in method.needs and not size.photos:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
-    if "pixels" in method.needs and not scene.aligned:
+    if "pixels" in method.needs and not size.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
     default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
     unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
@@ -85,12 +107,12 @@ def _unused_alone(options: CompactOptions) -> list[str]:
     return [f"without cameras these are not used: {', '.join(unused)}"] if unused else []
 
 
-def choose_method(options: CompactOptions, scene: Scene, ours: Build) -> Build:
-    """Choose the function that builds the Gaussians: ``ours`` or another method's, with a note on ignored settings.
+def choose_method(options: CompactOptions, scene: Scene) -> Method:
+    """Choose the method for a scene by its options, with a note on ignored settings.
 
     Raises as :func:`check_method` does.
     """
     method, notes = check_method(options, scene)
     for text in notes:
         note(text)
-    return ours if method is None else method.build
+    return method

@@ -161,7 +161,7 @@ class Candidate:
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
     """Move canonical Gaussians into the world, add Gaussians that no view sees, and measure the PSNR on the photos."""
     gaussians, moved = fitted.gaussians, move_views(prepared, fitted.cameras)
-    if plan.unseen is not None:
+    if len(plan.unseen):
         gaussians = Gaussians.concat([gaussians, plan.unseen])
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
@@ -180,14 +180,15 @@ def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan:
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
     """Measure the PSNR (dB) of Gaussians on the scored photos, or against the input; None without photos and pixels."""
-    if moved.alone:
+    if moved.reference.placed:
         fidelity = _fidelity(moved.frame.enter(gaussians), moved.scene, plan)
         choose(fidelity={"psnr": fidelity, "views": len(moved.scene)})
         return fidelity
-    psnr = measure_psnr("score", gaussians, moved.result_views(), moved, plan)
-    if psnr is not None:
-        choose(scored_views=len(plan.scored_views))
-    return psnr
+    measured = measure_result(gaussians, moved, plan)
+    if measured is None:
+        return None
+    choose(scored_views=len(plan.scored_views))
+    return measured.psnr
 
 
 @stage("score")
@@ -220,26 +221,36 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     note(f"{cause}: cameras were moved by {describe_moves(moves)}")
 
 
-def measure_psnr(name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan) -> float | None:
-    """Measure the mean PSNR (dB) of Gaussians on the scored photos; see :func:`measure_score`."""
-    measured = measure_score(name, gaussians, views, prepared, plan)
-    return None if measured is None else measured.psnr
+def measure_result(
+    gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
+) -> PhotoScore | None:
+    """Score a result's Gaussians on the scored photos, and over ``covered`` pixels of each; None without photos."""
+    if not prepared.reference.of_views:
+        return None
+    return _score_photos("score", gaussians, prepared.result_views(), prepared, plan, covered)
 
 
-def measure_score(
+def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
+    """Score the input's own Gaussians; they cover the pixels that have a row where those are known."""
+    if not prepared.reference.of_views:
+        return None
+    scene = prepared.input_scene
+    covered = None if scene.missing is None else list(scene.stored[list(plan.scored_views)])
+    return _score_photos("input", scene.file_gaussians, scene, prepared, plan, covered)
+
+
+def _score_photos(
     name: str,
     gaussians: Gaussians,
     views: Scene,
     prepared: Prepared,
     plan: Plan,
-    covered: Sequence[np.ndarray] | None = None,
-) -> PhotoScore | None:
-    """Score Gaussians on the scored photos, and over ``covered`` pixels of each; None where no photo shows the scene.
+    covered: Sequence[np.ndarray] | None,
+) -> PhotoScore:
+    """Score Gaussians on the scored photos of ``views``, only a quarter of each unless a quality was asked for.
 
-    Only a quarter of each photo is scored unless a quality was asked for. ``name``: of the stage in the record.
+    ``name``: of the stage in the record.
     """
-    if views.images is None or not prepared.photo_views:
-        return None
     with stage(name):
         photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
 
@@ -250,18 +261,11 @@ def measure_score(
         return run_on(plan.backend, "scores", score_on)
 
 
-def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score the input's own Gaussians; they cover the pixels that have a row where those are known."""
-    scene = prepared.input_scene
-    covered = None if scene.missing is None else list(scene.stored[list(plan.scored_views)])
-    return measure_score("input", scene.file_gaussians, scene, prepared, plan, covered)
-
-
 def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
     """Score a result where the input, whose score is ``before``, covers the views; None where it covers them all."""
     if before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr):
         return None
-    after = measure_score("score", gaussians, prepared.result_views(), prepared, plan, before.covered)
+    after = measure_result(gaussians, prepared, plan, before.covered)
     return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
 
 
@@ -281,7 +285,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
-    comparable = prepared.photo_views and prepared.reference.name == PHOTOS and not plan.clean.hides
+    comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
@@ -289,7 +293,7 @@ def make_result(
 
     def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
-        shown = None if prepared.alone else candidate.psnr
+        shown = None if prepared.reference.placed else candidate.psnr
         made = CompactReport(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered, psnr_reference=None if before is None else prepared.reference.name,

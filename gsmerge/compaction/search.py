@@ -19,7 +19,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.pipeline import build
+from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
@@ -112,29 +112,29 @@ class CountSearch:
         return {"seconds": seconds, "choices": choices, "unmet": self.unmet}
 
 
-def search_count(prepared: Prepared, plan: Plan) -> CountSearch:
+def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Start a search for the number of Gaussians."""
     limits = plan.limits
     if plan.target_psnr is not None:
         return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count))
-    return CountSearch(plan, choose_count(prepared, plan))
+    return CountSearch(plan, choose_count(prepared, plan, build))
 
 
-def choose_count(prepared: Prepared, plan: Plan) -> int | None:
+def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's own curve; None: ``superpixels`` and K decide."""
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
-    if not prepared.alone and (prepared.input_scene.images is None or not prepared.photo_views):
+    if not prepared.reference.score_views:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
-        points = measure_curve(prepared, plan, SHORT if drop is None else LONG, counts)
+        points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
+def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
     """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
 
     The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
@@ -142,11 +142,10 @@ def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[i
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
-    photos = scene_photos(prepared.scene)
-    if prepared.alone:  # nothing is fitted to them
-        weights = [np.zeros((photos.height, photos.width), np.float32)] * len(photos)
-    else:
-        photos = photos[prepared.photo_views]
+    reference = prepared.reference
+    photos = scene_photos(prepared.scene)[reference.score_views]
+    weights = [np.zeros((photos.height, photos.width), np.float32)] * len(photos)  # all is left out
+    if reference.fit_views:
         weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
     report_progress(TRIED, 0, len(counts))

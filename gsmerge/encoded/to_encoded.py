@@ -17,7 +17,7 @@ from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.io import atomic_output
-from gsmerge.pipeline import merge_views
+from gsmerge.pipeline import build, merge_views
 from gsmerge.plan import Plan, make_plan, require_children
 from gsmerge.report import document_head, file_sha256, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, current_record, record_run, stage
@@ -75,7 +75,7 @@ def encode_scene(
         prepared = prepare(scene.numpy(), options.prepare)
         plan = make_plan(prepared, options)
         require_children("max_k", max_k or 1, plan.checkpoint)
-        count = choose_count(prepared, plan)
+        count = choose_count(prepared, plan, build)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no encoding; use compact")
         merged = merge_views(prepared, plan, count)

@@ -30,7 +30,7 @@ from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.raster.photos import NEAR, photos_of
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Scene
+from gsmerge.types import PicturedScene, SceneT
 
 SIDES = (60, 120, 240)  # longer side of the photos, pixels, one after the other
 MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photos say too little
@@ -82,7 +82,7 @@ class _Pair:
     flow: float  # median distance from where the given poses show them, pixels of the views
 
 
-def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> Scene | None:
+def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     ``views`` are those whose photos show the scene; the others stay. With ``always`` even small
@@ -108,7 +108,7 @@ def align_views(scene: Scene, views: Sequence[int], *, always: bool = False) -> 
     return move_views(scene, viewmats)
 
 
-def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
+def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
     """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
 
     Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change
@@ -128,7 +128,7 @@ def move_views(scene: Scene, viewmats: np.ndarray) -> Scene:
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
-def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
+def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> list[tuple[int, int]]:
     """Choose pairs of views, in both orders: each view with the neighbours that see most of it."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
     step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
@@ -145,9 +145,8 @@ def _choose_pairs(scene: Scene, views: Sequence[int]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _level_of(scene: Scene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
+def _level_of(scene: PicturedScene, pairs: list[tuple[int, int]], level: float, samples: int) -> _Level:
     """Shrink the photos by ``level``, and sample pixels of each where it changes most."""
-    assert scene.images is not None
     photos = photos_of(scene.images, scene.cameras, level)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)

@@ -36,7 +36,7 @@ from gsmerge.kernels.pictures import count_bars
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import in_turn, parallel_map
-from gsmerge.types import Scene
+from gsmerge.types import PicturedScene, Scene
 
 # On 14 captures right photos reach 0.99 and more with the colours of pixels, 0.13 to 0.8 with drawings; noise mostly
 # stays below 0.06, photos of other views below 0.3.
@@ -82,21 +82,19 @@ class Shown:
         return self.weights > (0.5 if self.drawn else 0.05)
 
 
-def compare_photos(scene: Scene) -> tuple[Scene, tuple[int, ...]]:
-    """Mend the photos of a canonical scene; replace or remove photos that do not show the scene.
+def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
+    """Mend the photos of a canonical scene, and replace those that do not show it.
 
-    All photos are removed where most do not show the scene. Returns the scene and the views whose photos a fit may use.
-    The record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos a fit may use: none where most do not show the scene. The record gets
+    notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
-    if scene.images is None:
-        return scene, tuple(range(len(scene)))
     shown = show_photos(scene)
     changes = find_changes(scene, shown)
     mended = mend_photos(scene, changes)
     return _leave_out(mended, _change_small(shown, changes))
 
 
-def find_changes(scene: Scene, shown: Shown) -> list[PhotoChange]:
+def find_changes(scene: PicturedScene, shown: Shown) -> list[PhotoChange]:
     """Find what needs mending in each photo; add notes about it."""
     views = range(len(scene))
     changes = [replace(UNCHANGED, bars=_find_bars(scene, shown))] * len(scene)
@@ -144,20 +142,17 @@ def _confirmed(
     return change
 
 
-def show_photos(scene: Scene) -> Shown:
+def show_photos(scene: PicturedScene) -> Shown:
     """Make small pictures of the photos of a canonical scene, and of what the Gaussians show there."""
-    assert scene.images is not None
-    side = SMALL_SIDE if scene.aligned else SMALL_DRAWN
+    drawn = not scene.aligned
+    side = SMALL_DRAWN if drawn else SMALL_SIDE
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / side)
     photos = photos_of(scene.images, scene.cameras, level)
-    if scene.aligned:
-        pictures, weights = _shrink_colors(scene, (photos.width, photos.height))
-    else:
-        pictures, weights = _draw(scene, side)
+    pictures, weights = _draw(scene, side) if drawn else _shrink_colors(scene, (photos.width, photos.height))
     inside = pixel_weights(scene.masks, photos.width, photos.height)
     if inside is not None:
         weights = weights * (inside == 1)
-    return Shown(photos.images, pictures, weights, not scene.aligned)
+    return Shown(photos.images, pictures, weights, drawn)
 
 
 def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -208,9 +203,8 @@ def _over_channels(combine: np.ufunc, image: np.ndarray) -> np.ndarray:
     return np.asarray(combine(combine(image[..., 0], image[..., 1]), image[..., 2]))
 
 
-def _find_bars(scene: Scene, shown: Shown) -> tuple[float, float, float, float]:
+def _find_bars(scene: PicturedScene, shown: Shown) -> tuple[float, float, float, float]:
     """Find bars around all pictures (shares of the sides) within which they show the scene better; zeros without."""
-    assert scene.images is not None
     height, width = scene.images.shape[1:3]
     none = (0.0, 0.0, 0.0, 0.0)
     sides = np.median([count_bars(image, BORDER) for image in scene.images], 0).astype(int)
@@ -349,18 +343,18 @@ def _box_means(image: np.ndarray) -> np.ndarray:
     return np.asarray((down[:, PATCH:] - down[:, :-PATCH]) / PATCH**2)
 
 
-def _leave_out(scene: Scene, shown: Shown) -> tuple[Scene, tuple[int, ...]]:
-    """Replace photos that do not show the scene by the Gaussians' own colours, or remove all photos."""
+def _leave_out(scene: PicturedScene, shown: Shown) -> tuple[PicturedScene, tuple[int, ...]]:
+    """Replace photos that do not show the scene by the Gaussians' own colours; return the views of the others."""
     views, odd = tuple(range(len(scene))), odd_photos(shown)
-    if not odd or scene.images is None:
+    if not odd:
         return scene, views
     choose(photos_left_out=[scene.names[view] for view in odd])
     problem = f"{len(odd)} of {len(views)} photos do not show what the Gaussians show"
     if 2 * len(odd) > len(views):
         which = list_names(scene.names, odd)
-        result = "" if scene.aligned else " and nothing is fitted"
+        result = " and nothing is fitted" if shown.drawn else ""
         note(f"{problem}, so none is used{result}: {which}; check their names and order")
-        return replace(scene, images=None, large_photos=None, masks=None), ()
+        return scene, ()
     note(f"{problem} and are not used: {list_names(scene.names, odd)}")
     images = scene.images.copy()
     images[odd] = own_pictures(scene, odd)

@@ -28,7 +28,7 @@ from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Cameras, PicturedScene, Scene
 
 SAMPLES = 2000  # pixels of a view that are looked up in the others
 SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
@@ -63,14 +63,14 @@ class _Pair:
     count: int
 
 
-def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) -> Scene:
+def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
     """Equalise the exposure: divide each view's photo and its pixels' Gaussians by the view's gain, where needed.
 
-    ``views`` are those whose photos show the scene. Clipped pixels of brighter photos no longer count where another
-    photo shows more. The record gets a note, and the choice ``exposure``: the gain of each view, red, green and blue;
-    where photos differ and stay, a note says why.
+    ``views`` of the aligned scene are those whose photos show it. Clipped pixels of brighter photos no longer count
+    where another photo shows more. The record gets a note, and the choice ``exposure``: the gain of each view, red,
+    green and blue; where photos differ and stay, a note says why.
     """
-    if exposure == "fixed" or not scene.aligned or scene.images is None or len(views) < 2:
+    if exposure == "fixed" or len(views) < 2:
         return scene
     pairs = _measure_pairs(scene, views)
     gains = _solve_gains(pairs, len(scene))
@@ -93,9 +93,8 @@ def equalise_exposure(scene: Scene, views: Sequence[int], exposure: Exposure) ->
     return _divide(scene, factors)
 
 
-def _find_objection(scene: Scene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
+def _find_objection(scene: PicturedScene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
     """Say why photos are better left as they are; an empty text where they are not."""
-    assert scene.images is not None
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if share_left(pairs, gains) > NEARER:
@@ -186,9 +185,8 @@ def _pixels_of(scene: Scene) -> _Pixels:
     return _Pixels(scene.cameras, scene.gaussians.means.reshape(*shape, 3), valid)
 
 
-def _measure_pairs(scene: Scene, views: Sequence[int]) -> list[_Pair]:
+def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between views that see the same surfaces."""
-    assert scene.images is not None
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:SAMPLES]
@@ -235,12 +233,11 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
     return gains
 
 
-def _find_clipped(scene: Scene, gains: np.ndarray) -> np.ndarray:
+def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
     Without that, what is clipped everywhere (a sky) would be left to no photo.
     """
-    assert scene.images is not None
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
     order = _order_others(camera_distances(scene.cameras))[:, :NEIGHBOURS]
@@ -256,9 +253,8 @@ def _find_clipped(scene: Scene, gains: np.ndarray) -> np.ndarray:
     return np.stack(parallel_map(confirm, range(len(scene)))).reshape(clipped.shape)
 
 
-def _divide(scene: Scene, gains: np.ndarray) -> Scene:
+def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     """Divide photos and colours of Gaussians by the gains ``[v,3]``; what is known to be clipped leaves the masks."""
-    assert scene.images is not None
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]
@@ -267,7 +263,7 @@ def _divide(scene: Scene, gains: np.ndarray) -> Scene:
         masks &= scene.masks
 
     def divide(view: int) -> None:
-        images[view] = (scene.images[view] * factors[view]).clip(0, 1)  # type: ignore[index]
+        images[view] = (scene.images[view] * factors[view]).clip(0, 1)
 
     parallel_map(divide, range(len(scene)))
     g, each = scene.gaussians, factors.repeat(scene.pixels_per_view, 0)[:, None]

@@ -10,9 +10,9 @@ import numpy as np
 
 from gsmerge.facts.views import subset
 from gsmerge.raster import render
-from gsmerge.raster.photos import scene_pictures
+from gsmerge.raster.photos import row_pictures
 from gsmerge.runtime.record import choose, note
-from gsmerge.types import LargePhotos, Scene
+from gsmerge.types import LargePhotos, PicturedScene, Scene
 
 CLIPPED = 0.985  # level from which on a pixel does not say how bright it is
 NAMED = 4  # views that a note names
@@ -75,9 +75,8 @@ def _enlarge(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(large > 0)
 
 
-def mend_photos(scene: Scene, changes: Sequence[PhotoChange]) -> Scene:
+def mend_photos(scene: PicturedScene, changes: Sequence[PhotoChange]) -> PicturedScene:
     """Mend the photos at view size and at full size; masked pixels get the Gaussians' colours."""
-    assert scene.images is not None
     masks = scene.masks
     if masks is not None and any(changes[0].bars):  # which all photos have alike
         cut = [changes[0].without_bars(mask.astype(np.uint8), cv2.INTER_NEAREST) for mask in masks]
@@ -150,7 +149,7 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
     if not scene.aligned:
         return np.asarray(render(scene.gaussians, scene.cameras[views]).images).clip(0, 1)
     part = subset(scene, views)
-    pictures = scene_pictures(replace(part, images=None))
+    pictures = row_pictures(part)
     valid = part.stored if part.missing is not None else part.valid
     return np.stack([fill_gaps(*pair) for pair in zip(pictures, valid, strict=True)])
 

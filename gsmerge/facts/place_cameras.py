@@ -12,7 +12,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster import contributions, plan_view, prepare, render
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24
 JUDGES, JUDGE_SIZE = 8, 320  # views that judge a result, and their pixels per side, at most
@@ -70,17 +70,15 @@ def add_judges(scene: Scene) -> Scene:
     return _with_cameras(scene, place_cameras(scene.gaussians, JUDGES, largest=JUDGE_SIZE, step=FEWER))
 
 
-def add_pictures(scene: Scene) -> Scene:
-    """Render the canonical scene in place of photos where it has none."""
-    if scene.images is not None:
-        return scene
-    note("no photos: views rendered from the scene itself stand in for them")
-    return draw_pictures(scene)
+def blank_pictures(scene: Scene) -> PicturedScene:
+    """Put black pictures that take no memory in the place of photos."""
+    shape = len(scene), scene.cameras.height, scene.cameras.width, 3
+    return PicturedScene.of(scene, np.broadcast_to(np.float32(0), shape), None)
 
 
-def draw_pictures(scene: Scene) -> Scene:
-    """Render a canonical scene into its views, as its images."""
-    return replace(scene, images=render(scene.gaussians, scene.cameras).images.clip(0, 1))
+def draw_pictures(scene: Scene) -> PicturedScene:
+    """Render a canonical scene into its views, as its pictures."""
+    return PicturedScene.of(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
 
 
 def place_cameras(

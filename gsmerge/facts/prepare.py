@@ -8,7 +8,7 @@ same at every scale. The unit is a power of two: scaling there and back changes 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +16,16 @@ import numpy as np
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
-from gsmerge.facts.place_cameras import NO_VIEWS, add_judges, add_pictures, add_views, draw_pictures, keep_finite
+from gsmerge.facts.place_cameras import (
+    NO_VIEWS,
+    add_judges,
+    add_views,
+    blank_pictures,
+    draw_pictures,
+    keep_finite,
+)
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
@@ -25,7 +33,7 @@ from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import PrepareOptions
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
@@ -105,7 +113,7 @@ def _sample_rows(scene: Scene) -> np.ndarray:
     return np.flatnonzero(valid)[::step]
 
 
-def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame]:
+def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:
     """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
     frame = frame or scene_frame(scene)
     return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
@@ -113,10 +121,17 @@ def canonicalise(scene: Scene, frame: Frame | None = None) -> tuple[Scene, Frame
 
 @dataclass(frozen=True)
 class Reference:
-    """Pictures that a result is fitted to and measured against."""
+    """Which of a canonical scene's pictures a result is fitted to and measured against."""
 
-    name: str  # What they are: "photos", or what stands in for them
-    views: tuple[int, ...]  # Views whose pictures a fit may use
+    name: str  # What the pictures are: "photos", or what stands in for them
+    fit_views: tuple[int, ...]  # Views whose pictures a fit may use
+    score_views: tuple[int, ...]  # Views whose pictures say how good a result is
+    placed: bool = False  # Whether these are views that the scene lacks, for judging alone
+
+    @property
+    def of_views(self) -> bool:
+        """Whether the scene's own views have pictures that results are fitted to and measured on."""
+        return bool(self.fit_views and self.score_views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,24 +139,20 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was given, in its own world frame, with photos that look as its Gaussians
-    # The canonical scene: every view once, photos that do not show it replaced; an unaligned one
-    # has cameras, pictures and only finite Gaussians that are seen, or all if none is set aside
-    scene: Scene
+    # The canonical scene: every view once, photos that do not show it replaced; one without pixels
+    # has cameras and only finite Gaussians that are seen, or all if none is set aside
+    scene: PicturedScene
     frame: Frame  # The canonical frame
-    reference: Reference  # The photos, or what stands in for them
+    reference: Reference  # What the pictures are for
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
-    unseen: Gaussians | None  # Canonical Gaussians that no view sees, if kept
+    unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
 
     @property
-    def alone(self) -> bool:
-        """Whether no view is known, and those of the canonical scene only judge results."""
-        return not self.photo_views and len(self.input_scene) == 0
-
-    @property
-    def photo_views(self) -> tuple[int, ...]:
-        """Views whose photos, or what stands in for them, a fit may use."""
-        return self.reference.views
+    def size(self) -> SceneSize:
+        """Sizes of the scene that the plan depends on."""
+        measured = self.input_scene if self.reference.placed else self.scene
+        return measure_size(measured, photos=bool(self.reference.fit_views))
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -169,26 +180,58 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
     Gaussian, or there are images without cameras.
     """
     options = options or PrepareOptions()
-    input_scene, (views, repeated) = scene, distinct_views(scene)
+    given, (views, repeated) = scene, distinct_views(scene)
     if len(views) < len(scene):
         note(f"{len(scene) - len(views)} views repeat others in every pixel and count once")
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
-    scene, photo_views = compare_photos(scene)
-    colored = scene.aligned and scene.images is None
-    if colored:
-        scene, photo_views = add_row_colors(scene), tuple(range(len(scene)))
-    input_scene = _with_photos(input_scene, scene, repeated)
-    scene, moved, unseen = equalise_exposure(scene, photo_views, options.exposure), None, None
-    if scene.aligned and options.poses != "fixed":
-        moved = align_views(scene, photo_views, always=options.poses == "free")
-        scene = moved or scene
+    finish = _prepare_pixels if scene.aligned else _prepare_others
+    return finish(given, scene, frame, tuple(repeated), options)
+
+
+def _prepare_pixels(
+    given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
+) -> Prepared:
+    """Prepare a scene whose rows belong to pixels: their own colours stand in for photos."""
+    scene, views = _with_pictures(canonical, add_row_colors)
+    every = tuple(range(len(scene)))
+    reference = Reference(PHOTOS, views, views) if views else Reference(ROW_COLORS, every, every)
+    given = _with_photos(given, scene, repeated)
+    scene = equalise_exposure(scene, reference.fit_views, options.exposure)
+    fixed, always = options.poses == "fixed", options.poses == "free"
+    moved = None if fixed else align_views(scene, reference.fit_views, always=always)
+    return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, scene.gaussians[:0])
+
+
+def _prepare_others(
+    given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
+) -> Prepared:
+    """Prepare a scene whose rows belong to no pixels: drawings of it stand in for photos, and judge nothing."""
+    scene, views = _with_pictures(canonical, blank_pictures)
+    reference = Reference(PHOTOS, views, views)
+    if given.images is None:
+        reference = Reference(RENDERS, tuple(range(len(scene))), ())
+    unseen = scene.gaussians[:0]
     if options.unseen == "keep":
         scene, unseen = _split_unseen(scene)
-    if not scene.aligned:  # pixels that are known have colours of their own
-        scene = add_pictures(scene)
-    reference = Reference(ROW_COLORS if colored else PHOTOS, photo_views)
-    return Prepared(input_scene, scene, frame, reference, tuple(repeated), moved is not None, unseen)
+    if views:
+        given = _with_photos(given, scene, repeated)
+    else:
+        note("no photos: views rendered from the scene itself stand in for them")
+        scene = draw_pictures(scene)
+    return Prepared(given, scene, frame, reference, repeated, moved=False, unseen=unseen)
+
+
+def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> tuple[PicturedScene, tuple[int, ...]]:
+    """Return a scene with photos that look as its Gaussians, and the views that a fit may use.
+
+    Where no photo shows the scene, it has what stands in for photos, and there are no such views.
+    """
+    if scene.images is not None:
+        pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks))
+        if views:
+            return pictured, views
+    return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
 
 
 def missing_notes(scene: Scene) -> list[str]:
@@ -208,7 +251,7 @@ def with_row_colors(scene: Scene) -> Scene:
 
 
 @stage("prepare")
-def prepare_alone(scene: Scene) -> Prepared:
+def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     """Bring a scene without views into its canonical frame, and add pictures of it by which results are judged.
 
     Nothing is fitted to these pictures: a fit to renders of the input shows other views worse. Raises ValueError if
@@ -217,7 +260,8 @@ def prepare_alone(scene: Scene) -> Prepared:
     finite = keep_finite(scene)
     note(NO_VIEWS)
     judged, frame = canonicalise(add_judges(finite))
-    return Prepared(scene, draw_pictures(judged), frame, Reference(RENDERS, ()), repeated=(), moved=False, unseen=None)
+    reference = Reference(RENDERS, (), tuple(range(len(judged))), placed=True)
+    return Prepared(scene, draw_pictures(judged), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
 
 
 def photos_count_as_they_are(scene: Scene) -> bool:
@@ -226,27 +270,26 @@ def photos_count_as_they_are(scene: Scene) -> bool:
         return True
     with record_part(silent=True):
         canonical, _ = canonicalise(add_views(scene))
-        compared, views = compare_photos(canonical)
-        return equalise_exposure(compared, views, "auto").images is canonical.images
+        compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
+        if canonical.aligned:
+            compared = equalise_exposure(compared, views, "auto")
+        return bool(views) and compared.images is scene.images
 
 
-def _with_photos(scene: Scene, source: Scene, repeated: Sequence[int]) -> Scene:
-    """Return the given scene with the photos and masks of its distinct views; itself where they are its own."""
-    drawn = scene.images is None and not scene.aligned  # what stands in there is for the fit alone
-    if source.images is None or drawn or (source.images is scene.images and source.masks is scene.masks):
-        return scene
-    images, masks = (None if array is None else array[list(repeated)] for array in (source.images, source.masks))
-    large = scene.large_photos if source.large_photos is not None else None
-    return replace(scene, images=images, masks=masks, large_photos=large)
+def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
+    """Return the given scene with the pictures and masks of its distinct views; itself where they are its own."""
+    if canonical.images is given.images and canonical.masks is given.masks:
+        return given
+    masks = None if canonical.masks is None else canonical.masks[list(repeated)]
+    large = None if canonical.large_photos is None else given.large_photos
+    return replace(given, images=canonical.images[list(repeated)], masks=masks, large_photos=large)
 
 
-def _split_unseen(scene: Scene) -> tuple[Scene, Gaussians | None]:
-    """Split a scene into what some view sees and the Gaussians that none does; None without any, or without others."""
-    if scene.aligned:
-        return scene, None
+def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
+    """Split a scene into what some view sees and the Gaussians that none does; none where it is all of them."""
     seen = seen_weights(scene) > 0
     num_unseen = int((~seen).sum())
     note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")
     if num_unseen in (0, len(seen)):
-        return scene, None
+        return scene, scene.gaussians[:0]
     return replace(scene, gaussians=scene.gaussians[seen]), scene.gaussians[~seen]

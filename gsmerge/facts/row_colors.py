@@ -7,8 +7,6 @@ faint that their colours mean little, the drawing takes their place if it is sol
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from gsmerge.facts.mend_photos import fill_gaps
@@ -20,7 +18,7 @@ from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.photos import COVERED, WHOLE, blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
-from gsmerge.types import Scene
+from gsmerge.types import PicturedScene, Scene
 
 PHOTOS = "photos"  # what results are fitted to and measured against, in messages
 ROW_COLORS = "the rows' own colours"  # the same where there are none
@@ -33,7 +31,7 @@ BLUR = 8.0  # standard deviation, pixels
 DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, from which on the drawing is taken
 
 
-def add_row_colors(scene: Scene) -> Scene:
+def add_row_colors(scene: Scene) -> PicturedScene:
     """Put the colours of each view's own Gaussians in the place of a canonical scene's photos; a note says so."""
     kinds, shape = camera_kinds(scene.cameras), scene.valid.shape
     images, masks, num_drawn = np.zeros((*shape, 3), np.float32), np.full(shape, False), 0
@@ -44,7 +42,7 @@ def add_row_colors(scene: Scene) -> Scene:
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
     note(NO_PHOTOS + detail)
-    return replace(scene, images=images, masks=None if masks.all() else masks)
+    return PicturedScene.of(scene, images, None if masks.all() else masks)
 
 
 def _picture(scene: Scene, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from gsmerge.fit.schedule import FitJob, plan_run
 from gsmerge.raster import prepare
 from gsmerge.runtime.record import choose, note, stage
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Decoded, Gaussians, Scene
+from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 ResultT = TypeVar("ResultT")
 CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
@@ -28,10 +28,10 @@ START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
 def fit_scene(
-    decoded: Decoded, scene: Scene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend
+    decoded: Decoded, scene: PicturedScene, views: Sequence[int], options: FitOptions, seed: int, backend: FitBackend
 ) -> Fitted:
-    """Fit decoded Gaussians to the photos of ``views`` of a canonical scene, if it has any and a fit is asked for."""
-    if scene.images is None or not options.needs_photos:
+    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for."""
+    if not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
         photos = fit_photos(scene, options, views)

@@ -13,6 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise, missing_notes
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
@@ -30,9 +31,9 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import largest_count, measure_size
+from gsmerge.stages.segment import largest_count
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import Gaussians, Scene, StrPath
+from gsmerge.types import Gaussians, PicturedScene, Scene, StrPath
 
 HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
 MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
@@ -121,7 +122,7 @@ def _photo_notes(scene: Scene) -> list[str]:
     """Say which photos do not look as their Gaussians, as a run would."""
     with record_part(silent=True) as record:
         if scene.images is not None and len(scene) and len(scene.gaussians):
-            compare_photos(canonicalise(scene)[0])
+            compare_photos(PicturedScene.of(canonicalise(scene)[0], scene.images, scene.masks))
     return record.notes
 
 

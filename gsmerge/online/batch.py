@@ -19,11 +19,11 @@ from gsmerge.networks.corrector import Corrector
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
 from gsmerge.plan import Plan
-from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_pictures
+from gsmerge.raster.photos import Photos, photo_errors, photos_of
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PicturedScene
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
@@ -66,7 +66,7 @@ class Batch:
     is_new: np.ndarray  # [v] bool, which views the state does not have yet
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> PicturedScene:
         """The canonical scene of the batch."""
         return self.prepared.scene
 
@@ -80,7 +80,7 @@ def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online
     """Make a batch: resize its photos to those of the state, and find out which views are new."""
     cameras = prepared.scene.cameras
     before = cameras[:0] if state is None else state.cameras
-    photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
+    photos = resize_photos(prepared.scene.images, cameras, before.width, before.height)
     ids = view_ids(before, photos.cameras)
     return Batch(prepared, plan, online, max_k, photos, ids, ids >= len(before))
 
@@ -203,7 +203,7 @@ def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) 
 def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarray) -> np.ndarray:
     """Average pixel errors ``[v,h,w]`` over each group's members, ``[g]``; a member without a pixel counts as 1."""
     starts, rows = features.starts, features.members
-    pixels = rows if members.pixels is None else members.pixels[rows]
+    pixels = members.pixels_of(rows)
     each = np.where(pixels >= 0, errors.reshape(-1)[pixels], 1.0)
     return np.add.reduceat(each, starts[:-1]) / np.diff(starts)
 

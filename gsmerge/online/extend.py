@@ -25,6 +25,7 @@ from gsmerge.online.extend_latents import LATENTS, keeps_latents, own_checkpoint
 from gsmerge.online.extend_moments import MOMENTS
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, OnlineState, no_photos, select_groups
+from gsmerge.pipeline import build
 from gsmerge.plan import make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
@@ -79,7 +80,7 @@ def extend(
         plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
         plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
         require_children("max_k", max_k, plan.checkpoint)
-        count = choose_count(prepared, plan)
+        count = choose_count(prepared, plan, build)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
         has_latents = keeps_latents(plan) if state is None else state.networks is not None

@@ -99,11 +99,12 @@ class Photos:
 
 
 def scene_pictures(scene: Scene) -> np.ndarray:
-    """Return the photos ``[v,h,w,3]``, or base colours of an aligned scene without photos; else raise ValueError."""
-    if scene.images is not None:
-        return scene.images
-    if not scene.aligned:
-        raise ValueError("expected a scene with images")
+    """Return the photos ``[v,h,w,3]``, or the base colours of an aligned scene without photos."""
+    return row_pictures(scene) if scene.images is None else scene.images
+
+
+def row_pictures(scene: Scene) -> np.ndarray:
+    """Return the base colours ``[v,h,w,3]`` of the Gaussians of an aligned scene's pixels."""
     shape = (len(scene), scene.cameras.height, scene.cameras.width, 3)
     return sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).reshape(shape)
 

@@ -11,7 +11,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, PicturedScene
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -98,7 +98,7 @@ def floater_share(gaussians: Gaussians) -> float:
 
 
 def clean(
-    gaussians: Gaussians, options: CleanOptions, scene: Scene | None, to_world: ToWorld
+    gaussians: Gaussians, options: CleanOptions, scene: PicturedScene | None, to_world: ToWorld
 ) -> tuple[Gaussians, Counts]:
     """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and those of ``drop``.
 
@@ -114,7 +114,6 @@ def clean(
         gaussians, counts["transparent"] = gaussians[~faint], int(faint.sum())
     if "sky" in options.drops:
         assert scene is not None, "sky is dropped where there are photos"
-        assert scene.images is not None, "the plan refuses to drop sky without photos"
         above = sky(gaussians, scene.cameras, scene.images)
         gaussians, counts["sky"] = gaussians[~above], int(above.sum())
     if "floaters" in options.drops:

@@ -10,13 +10,12 @@ import numpy as np
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Scene, as_array
+from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene, as_array
 
 GROUPS_PER_TASK = 8192
 REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
@@ -54,7 +53,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 
 @stage("decode")
-def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, grows: bool) -> Decoded:
+def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the exact count, unless the fit ``grows`` to it, or into K per group."""
     asked = merged.segmentation
     if asked.exact and not grows:
@@ -66,14 +65,14 @@ def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, 
     return Decoded(gaussians, asked.count, asked.exact)
 
 
-def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options: DecodeOptions) -> Gaussians:
+def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` Gaussians where they lower distortion most; None: K of each Feature Gaussian."""
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
         children = split_counts(features, members, max(0, count - len(features)), networks.max_children)
     elif options.k == MIXED:
-        children = mixed_counts(features, members, scene_saliency(scene_pictures(scene)), options)
+        children = mixed_counts(features, members, scene_saliency(scene.images), options)
     return decode(features, members, options, children, networks=networks)
 
 
@@ -117,7 +116,7 @@ def mixed_counts(
 ) -> np.ndarray:
     """Choose K = 1, 2 or 4 for every group by its rank in ``saliency`` (paper supplement, per-superpixel K)."""
     starts, ids = features.starts, features.members
-    pixels = ids if members.pixels is None else members.pixels[ids]
+    pixels = members.pixels_of(ids)
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     means = np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
     low, high = np.percentile(means, (options.k_low, options.k_high)) if len(means) else (0.0, 0.0)

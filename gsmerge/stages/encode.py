@@ -67,10 +67,9 @@ def correct(
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """List members by superpixel: ``starts [g+1]``, ``ids [m]`` int32, ``views [g]``, without empty superpixels."""
-    if scene.aligned:
+    if members.pixels is None:
         sizes, ids = _rows_by_view(scene, groups)
     else:
-        assert members.pixels is not None
         counts = np.asarray(groups.counts)
         first = np.cumsum(counts) - counts
         labels = groups.labels.reshape(-1)[members.pixels] + first[members.pixels // scene.pixels_per_view]

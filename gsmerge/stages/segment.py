@@ -14,7 +14,7 @@ import numpy as np
 
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.errors import UsageError
-from gsmerge.facts.views import camera_kinds
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import (
@@ -28,13 +28,12 @@ from gsmerge.kernels.superpixels.merge_tree import (
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.raster.images import seen_depths
-from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages.superpixels import MAX_FACTOR, count_for, segment
-from gsmerge.types import Groups, Scene, Segmentation
+from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 
 DEPTH_RANGE = 1e3  # depths are clipped to this factor of the view's median
 DEPTH_WEIGHT = 1.0  # of squared relative depth errors against squared colour errors (sRGB in [0, 1])
@@ -58,7 +57,7 @@ class SuperpixelPlan:
 
 
 @stage("segment")
-def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
+def segment_scene(scene: PicturedScene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
     """Cut every view into superpixels: as the options say, or as many as become exactly ``count`` Gaussians.
 
     An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many; a finer tree
@@ -67,7 +66,7 @@ def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segm
     """
     limits, options, views = plan.limits, plan.options, len(scene)
     if count is None:
-        pictures, each = scene_pictures(scene), max(1, int(limits.per_view * plan.start_share))
+        pictures, each = scene.images, max(1, int(limits.per_view * plan.start_share))
         if not options.adapts:
             return Segmentation(segment(pictures, options, each), limits.default, exact=False)
         # to the number in the end, of which the fit begins with a share
@@ -84,15 +83,15 @@ def segment_scene(scene: Scene, plan: SuperpixelPlan, count: int | None) -> Segm
 
 
 @stage("segment")
-def scene_tree(scene: Scene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
+def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
     """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians."""
-    pictures = scene_pictures(scene)
+    pictures = scene.images
     leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
     depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
     return region_tree(pictures, depths, segment(pictures, options, leaves), valid)
 
 
-def knee_count(scene: Scene, plan: SuperpixelPlan) -> int:
+def knee_count(scene: PicturedScene, plan: SuperpixelPlan) -> int:
     """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
     limits = plan.limits
     tree = plan.tree or scene_tree(scene, plan.options, limits, limits.default)
@@ -121,39 +120,6 @@ class CountLimits:
     def share(self) -> float:
         """Gaussians per pixel."""
         return (self.count or self.default) / max(1, self.num_pixels)
-
-
-@dataclass(frozen=True)
-class SceneSize:
-    """Sizes of a scene that a plan depends on, known before the scene is read in full."""
-
-    num_gaussians: int  # without rows that stand in for missing ones
-    num_views: int
-    height: int  # pixels
-    width: int
-    aligned: bool  # whether each Gaussian belongs to a pixel
-    photos: bool  # whether there are photos to fit to, or what stands in for them
-    num_cameras: int = 2  # views at different places; 1: one camera took all
-    sh_degree: int = 0
-
-    @property
-    def pixels_per_view(self) -> int:
-        """Pixels of each view."""
-        return self.height * self.width
-
-
-def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
-    """Return the sizes of a scene.
-
-    ``photos``: whether there are any to fit to; None: whether the scene has images, or pixels whose colours stand in.
-    """
-    cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
-    return SceneSize(
-        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
-        photos=scene.images is not None or scene.aligned if photos is None else photos,
-        num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
-        sh_degree=scene.gaussians.sh_degree,
-    )  # fmt: skip
 
 
 def count_limits(

@@ -18,7 +18,6 @@ from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.plan import Plan
 from gsmerge.raster import contributions, plan_view, prepare
-from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
@@ -78,7 +77,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """
     gaussians = own_gaussians(prepared.scene)
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
-    return fit_scene(start, prepared.scene, prepared.photo_views, options, plan.seed, plan.backend).gaussians
+    return fit_scene(start, prepared.scene, prepared.reference.fit_views, options, plan.seed, plan.backend).gaussians
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -139,7 +138,7 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     scene = prepared.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
     with stage("segment"):
-        pictures, views = scene_pictures(scene), range(len(scene))
+        pictures, views = scene.images, range(len(scene))
         labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], PAPER_SUPERPIXELS), views)
     return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), rule="paper")
 

@@ -15,13 +15,13 @@ from gsmerge.compaction.blocks import join_views
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.row_colors import ROW_COLORS
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES, Device
-from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}

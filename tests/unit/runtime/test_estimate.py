@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.plan import plan_whole
 from gsmerge.runtime import estimate, memory
 from gsmerge.runtime.estimate import memory_bytes, memory_problem, wall_seconds, work_seconds
 from gsmerge.runtime.memory import machine_memory, peak_memory
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.segment import SceneSize
 
 VIEW = 480 * 320
 

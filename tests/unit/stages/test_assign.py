@@ -12,6 +12,7 @@ from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.moments import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
@@ -25,7 +26,7 @@ from gsmerge.stages.assign import (
     owner_pixels,
 )
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.stages.segment import measure_size, superpixels_per_view
+from gsmerge.stages.segment import superpixels_per_view
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
 

@@ -10,13 +10,13 @@ import scenes
 
 from gsmerge import CompactOptions, Scene
 from gsmerge.facts.prepare import prepare
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.plan import make_plan
 from gsmerge.stages.segment import (
     SuperpixelPlan,
     count_limits,
     default_count,
     largest_count,
-    measure_size,
     segment_scene,
 )
 

@@ -1,0 +1,41 @@
+"""Scene -> the sizes of it that decide a plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsmerge.facts.views import camera_kinds
+from gsmerge.types import Scene
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """Sizes of a scene that a plan depends on, known before the scene is read in full."""
+
+    num_gaussians: int  # without rows that stand in for missing ones
+    num_views: int
+    height: int  # pixels
+    width: int
+    aligned: bool  # whether each Gaussian belongs to a pixel
+    photos: bool  # whether there are photos to fit to, or what stands in for them
+    num_cameras: int = 2  # views at different places; 1: one camera took all
+    sh_degree: int = 0
+
+    @property
+    def pixels_per_view(self) -> int:
+        """Pixels of each view."""
+        return self.height * self.width
+
+
+def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
+    """Return the sizes of a scene.
+
+    ``photos``: whether there are any to fit to; None: whether the scene has images, or pixels whose colours stand in.
+    """
+    cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
+    return SceneSize(
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
+        photos=scene.images is not None or scene.aligned if photos is None else photos,
+        num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
+        sh_degree=scene.gaussians.sh_degree,
+    )  # fmt: skip
