@@ -59,9 +59,8 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install
-    ".[cuda]"``), and the results are on their device; all others on the CPU. How the two differ:
-    :mod:`gsmerge.raster.cuda`.
+    Arrays give arrays, tensors give tensors. The CPU renders: tensors on a GPU are copied to it, and
+    the results, and gradients, back to where they were.
 
     Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians
     and the view matrices, where autograd is on and one of them asks for it; depths and intrinsics
@@ -81,7 +80,6 @@ def render(
 
     Raises:
         ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
-        GsmergeError: If CUDA tensors are given and gsplat is not installed.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -92,20 +90,17 @@ def render(
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     device = one_device(gaussians, cameras)
     if device is not None:  # torch is imported only for those who have tensors
-        gaussians, cameras = gaussians.to(device), cameras.to(device)
-        if device.type == "cuda":
-            from gsmerge.raster.cuda import render_cuda
+        gaussians, cameras = gaussians.to("cpu"), cameras.to("cpu")
+    if device is not None and _needs_gradient(gaussians, cameras):
+        from gsmerge.raster.autograd import render_tensors  # only for those who train
 
-            return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
-        if _needs_gradient(gaussians, cameras):
-            from gsmerge.raster.autograd import render_tensors  # only for those who train
-
-            return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
-    plan_one = _planner(gaussians, cameras, options)
-    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+        drawn = render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
+    else:
+        plan_one = _planner(gaussians, cameras, options)
+        drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
     if device is None:
         return drawn
-    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))
+    return Rendering(*(None if part is None else as_tensor(part, device) for part in vars(drawn).values()))
 
 
 def render_in_turn(

@@ -117,7 +117,6 @@ def test_help_fits_a_terminal(
 
 def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
-    assert "gsmerge[cuda]" in help_of(capsys, "compact", "--help")
     assert "gsmerge[ray]" in help_of(capsys, "batch", "--help-all")
 
 

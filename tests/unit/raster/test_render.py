@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from messages import refuse_all
+from messages import refuse_all, refuses
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.raster import composite, contributions, plan_view, prepare, render, render_in_turn, splat_adjoint
+from gsmerge.raster import images as render_module
 from gsmerge.types import SH_C0
 
 FOCAL = 100.0
@@ -161,6 +163,42 @@ def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int) -
             assert not tensor.requires_grad
             np.testing.assert_array_equal(tensor.numpy(), one)
     assert isinstance(render(gaussians, cameras, under).images, np.ndarray)
+
+
+def test_devices_must_agree() -> None:
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0)).to("cpu"), camera().to("cpu")
+    with refuses(ValueError, "", "cpu", "meta"):
+        render(gaussians, cameras.to("meta"))
+    with refuses(ValueError, "", "cpu", "meta"):
+        render(replace(gaussians, sh0=gaussians.sh0.to("meta")), cameras)
+
+
+@pytest.mark.parametrize("gradients", [False, True])
+def test_results_go_back_to_the_tensors_device(gradients: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A device without memory stands for a GPU."""
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0)).to("cpu"), camera().to("cpu")
+    gaussians.means.requires_grad_(gradients)
+    monkeypatch.setattr(render_module, "one_device", lambda *_: torch.device("meta"))
+    drawn = render(gaussians, cameras, with_depths=True)
+    assert all(part.is_meta for part in vars(drawn).values())
+    assert [part.requires_grad for part in vars(drawn).values()] == [gradients, gradients, False]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_tensors_on_a_gpu_are_those_of_the_cpu() -> None:
+    gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)).to("cpu"), camera().to("cpu")
+    images, slopes = [], []
+    for device in ("cpu", "cuda"):
+        some = gaussians.to(device)
+        some.means.requires_grad_()
+        drawn = render(some, cameras.to(device))
+        assert drawn.images.device.type == device
+        (slope,) = torch.autograd.grad(drawn.images.sum(), some.means)
+        assert slope.device.type == device
+        images.append(drawn.images.detach().cpu())
+        slopes.append(slope.cpu())
+    assert torch.equal(*images)
+    assert torch.equal(*slopes)
 
 
 def test_every_view_has_its_own_image() -> None:
