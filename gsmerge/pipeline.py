@@ -29,7 +29,7 @@ def build(prepared: Prepared, plan: Plan, count: int | None, earlier: Gaussians 
     if earlier is not None:
         taken = take_over(earlier, decoded, prepared.scene, prepared.photo_views)
         decoded, options = (decoded, options) if taken is None else (taken, options.continued())
-    return fit_scene(decoded, prepared.scene, prepared.photo_views, options, plan.seed, plan.backend)
+    return fit_scene(decoded, prepared.scene, prepared.photo_views, options, plan.seed)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

@@ -41,7 +41,7 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
     f"{opt.READING} masks earlier k superpixels budget quality levels blocks",
-    "effort fit exposure poses device method recipe checkpoint set crop drop up scale rotate translate",
+    "effort fit exposure poses method recipe checkpoint set crop drop up scale rotate translate",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
                "A folder named colmap: a COLMAP model.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",

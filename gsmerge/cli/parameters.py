@@ -227,7 +227,7 @@ def _change(parameter: Parameter, **changes: Any) -> Parameter:
 
 
 def _escape(help: str) -> str:
-    """Escape brackets, so that rich does not take ``[cuda]`` for markup, and leave out backticks."""
+    """Escape brackets, so that rich does not take ``[ray]`` for markup, and leave out backticks."""
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
@@ -315,7 +315,7 @@ _TABLE = (
     ),
     panel(
         METHOD,
-        *map(setting_option, ("effort", "fit", "exposure", "poses", "device", "method", "recipe", "checkpoint")),
+        *map(setting_option, ("effort", "fit", "exposure", "poses", "method", "recipe", "checkpoint")),
         option("set", list[str], f"Any other setting, such as match=aabb; may be repeated. {SETTINGS_PAGE} lists "
                "them.", metavar="NAME=VALUE"),
     ),

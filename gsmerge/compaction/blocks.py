@@ -199,7 +199,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
-    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed)
     if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
         return fitted.gaussians
     assert fitted.report.origins is not None
@@ -235,7 +235,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
-        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed, plan.backend)
+        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed)
     add_seconds(record.seconds)
     choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}

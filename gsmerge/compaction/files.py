@@ -24,7 +24,6 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
-from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_outputs, output_format, read_gaussians, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
@@ -144,9 +143,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs)
     _, unused = check_method(settings, scene)
-    backend, problem = choose_backend(settings.device, scene.num_gaussians)
-    settings = replace(settings, device=backend.device)
-    notes = [*load.notes, *unused, *missing_notes(scene), *([] if problem is None else [problem])]
+    notes = [*load.notes, *unused, *missing_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:

@@ -176,7 +176,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
     yield (
         "Render time",
-        ("", "device", "pixels", "ms/frame", "faster by", "earned back after"),
+        ("", "threads", "pixels", "ms/frame", "faster by", "earned back after"),
         [_speed_row(result, speed) for result in results for speed in result.get("speeds", ())],
     )
 
@@ -197,12 +197,11 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
 
 
 def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
-    threads = f", {speed['threads']} threads" if speed["threads"] else ""
     faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
     frames, merge = speed.get("break_even_frames"), result.get("merge_seconds")
     earned = "" if merge is None else "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
     size = f"{speed['width']} x {speed['height']}"
-    return result["name"], speed["device"] + threads, size, f"{1000 * speed['seconds']:.1f}", faster, earned
+    return result["name"], str(speed["threads"]), size, f"{1000 * speed['seconds']:.1f}", faster, earned
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:

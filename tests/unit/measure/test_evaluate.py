@@ -368,7 +368,7 @@ def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
 def document_of(actual: Evaluation) -> dict[str, Any]:
     """A document with facts of files and costs, under a name that is markup."""
     odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
-    speeds = [{"device": "cpu", "width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
+    speeds = [{"width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
     facts: dict[str, dict[str, Any]] = {
         "input": {"path": "in.ply", "bytes": 4000, "overdraw": 9.0, "speeds": speeds[:1]},
         "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)},
