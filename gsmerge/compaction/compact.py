@@ -11,7 +11,6 @@ from typing import Any
 from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 from gsmerge.compaction.methods import Build, choose_method
-from gsmerge.compaction.overdraw import meet_overdraw
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.errors import UsageError
@@ -83,7 +82,7 @@ def compact_piece(scene: Scene, options: CompactOptions, earlier: Gaussians | No
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
     rebuild = partial(build_scored, method, prepared, plan)
-    best = meet_overdraw(meet_bytes(search.best, rebuild, prepared, plan), rebuild, prepared, plan)
+    best = meet_bytes(search.best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
