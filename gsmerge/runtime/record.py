@@ -20,7 +20,7 @@ Progress = Callable[[str, int, int], None]
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "choose", "fit")
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "choose", "earlier", "join", "fit", "score", "input",
+    "cover", "decode", "choose", "join", "fit", "score", "input",
 )  # fmt: skip
 
 
