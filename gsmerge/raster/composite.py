@@ -51,10 +51,10 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     return image, transmittance
 
 
-def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Array:
-    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are at most ``least_alpha``."""
+def mean_depths(plan: ViewPlan, alphas: Array) -> Array:
+    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are 0."""
     weighted = blend(plan, np.repeat(plan.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
-    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > least_alpha)
+    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > 0)
 
 
 def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
