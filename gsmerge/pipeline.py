@@ -13,23 +13,16 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.stages.segment import segment_scene
-from gsmerge.stages.take_over import take_over
-from gsmerge.types import Decoded, Gaussians
+from gsmerge.types import Decoded
 
 
-def build(prepared: Prepared, plan: Plan, count: int | None, earlier: Gaussians | None = None) -> Fitted:
-    """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give.
-
-    ``earlier``: canonical Gaussians of a result of another moment to start from.
-    """
+def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+    """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
     if prepared.alone:  # no view to cut into superpixels, and no photo to fit to
         scene, most = prepared.scene, plan.limits.default if count is None else count
         return Fitted(merge_neighbors(scene.gaussians, most), scene.cameras, None)
-    decoded, options = start(prepared, plan, count), plan.fit
-    if earlier is not None:
-        taken = take_over(earlier, decoded, prepared.scene, prepared.photo_views)
-        decoded, options = (decoded, options) if taken is None else (taken, options.continued())
-    return fit_scene(decoded, prepared.scene, prepared.photo_views, options, plan.seed)
+    decoded = start(prepared, plan, count)
+    return fit_scene(decoded, prepared.scene, prepared.photo_views, plan.fit, plan.seed)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

@@ -17,7 +17,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import report_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, Device
+from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -83,7 +83,6 @@ class Plan:
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     size: FileSize | None  # What the output's file may have at most; None: any
-    device: Device | None  # What the result shall be drawn by fluidly; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
@@ -166,7 +165,6 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         size=file_size(options.budget),
-        device=DEVICES.get(str(options.budget.budget)),
         scored_views=_choose_scored_views(prepared, options),
         seed=options.seed,
         checkpoint=checkpoint,

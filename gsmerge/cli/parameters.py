@@ -294,8 +294,6 @@ _TABLE = (
         option("images", Path, "Folder of the input photos. Default: beside the .ply."),
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
                "beside the photos, and where these are transparent."),
-        option("earlier", Path, "Result of the same place at another moment: what it shows right is taken over, and "
-               "the fit takes half its steps."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "

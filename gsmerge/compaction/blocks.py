@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes
-from gsmerge.compaction.overdraw import report_overdraw
 from gsmerge.compaction.result import (
     CompactReport,
     CompactResult,
@@ -48,7 +47,7 @@ from gsmerge.runtime.memory import free_pages, make_array, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.runtime.work import start_work
-from gsmerge.settings.budget import DEVICES, parse_share, share_text
+from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
@@ -115,8 +114,6 @@ def compact_in_blocks(
             result = faintest_dropped(result, most)
         if asked := file_size(options.budget):
             result = drop_to_bytes(result, [], asked.num_bytes, asked.file)
-        shown_by = DEVICES.get(str(options.budget.budget))
-        report_overdraw(frame.enter(result), frame.enter_cameras(scene.cameras), shown_by)
         everything = work.share(result)
         scored = work.run("score", score_part, count, each_part(parts, everything))
         scores = [score for score, _ in adopt_records(scored)]
