@@ -14,22 +14,15 @@ from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
 from gsmerge.stages.segment import segment_scene
-from gsmerge.stages.take_over import take_over
-from gsmerge.types import Decoded, Gaussians
+from gsmerge.types import Decoded
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for
 
 
-def build(prepared: Prepared, plan: Plan, count: int | None, earlier: Gaussians | None = None) -> Fitted:
-    """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give.
-
-    ``earlier``: canonical Gaussians of a result of another moment to start from.
-    """
-    decoded, options = start(prepared, plan, count), plan.fit
-    if earlier is not None:
-        taken = take_over(earlier, decoded, prepared.scene, prepared.reference.fit_views)
-        decoded, options = (decoded, options) if taken is None else (taken, options.continued())
-    return fit_scene(decoded, prepared.scene, prepared.reference.fit_views, options, plan.seed, plan.backend)
+def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+    """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    decoded = start(prepared, plan, count)
+    return fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

@@ -1,4 +1,4 @@
-"""The plan of a run: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
+"""The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
 :func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no
 stage knows the options of another.
@@ -17,10 +17,9 @@ from gsmerge.facts.prepare import Prepared, Reference
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import report_views, scored_views
-from gsmerge.fit import FitBackend, photo_scale, start_share
-from gsmerge.fit.gpu import choose_backend
+from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, Device
+from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -86,9 +85,7 @@ class Plan:
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     size: FileSize | None  # What the output's file may have at most; None: any
-    device: Device | None  # What the result shall be drawn by fluidly; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
@@ -147,10 +144,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         whole = plan_whole(size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen))
         limits = whole.limits
-        backend, problem = choose_backend(options.device, prepared.input_scene.num_gaussians)
-        if problem is not None:
-            note(problem)
-        fit = _fit_photos(prepared, options, whole.fit, backend)
+        fit = _fit_photos(prepared, options, whole.fit)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if cuts and (searches or limits.count is not None):
@@ -167,12 +161,10 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         size=file_size(options.budget),
-        device=DEVICES.get(str(options.budget.budget)),
         scored_views=_choose_scored_views(prepared, options),
-        backend=backend,
         seed=options.seed,
         checkpoint=checkpoint,
-        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps, "device": backend.device},
+        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
     )
 
 
@@ -402,17 +394,16 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend) -> FitOptions:
+def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
     scene = prepared.scene
     if not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
-    auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"
-    scale, problem = photo_scale(scene, fit, auto=auto)
+    scale, problem = photo_scale(scene, fit, auto=EFFORTS[options.effort].large_photos)
     if problem is not None:
         note(problem)
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.reference.of_views  # which only the CPU can do
+    moves = free and fit.fit == "full" and prepared.reference.of_views
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 

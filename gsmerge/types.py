@@ -468,5 +468,4 @@ class Decoded:
     gaussians: Gaussians  # Canonical Gaussians
     count: int  # Number to which the fit may grow
     exact: bool  # Whether that number is to be met
-    baseline_start: Gaussians | None = None  # Another start that the fit may beat instead
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit leaves as they are; None: none

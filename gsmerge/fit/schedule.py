@@ -1,7 +1,4 @@
-"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes.
-
-An engine does the steps (:class:`gsmerge.fit.engine.Engine`); here is what engines have in common.
-"""
+"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes."""
 
 from __future__ import annotations
 
@@ -14,7 +11,6 @@ from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
-from gsmerge.types import Gaussians
 
 GROWTH = 0.5  # part of the run after which Gaussians are added
 FEW_VIEWS = 5  # views up to which a run of MANY_STEPS memorises the photos, unless Gaussians are dropped
@@ -48,8 +44,7 @@ class FitJob:
     options: FitOptions
     count: int = 0  # Gaussians to grow to, where the run is long enough
     seed: int = 0
-    progress: Progress | None = None  # Called after steps, on a GPU after some of them
-    baseline_start: Gaussians | None = None  # Another start to beat instead, see gsmerge.fit.full.judge
+    progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
     outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
 
@@ -142,9 +137,8 @@ class Step:
 class Schedule:
     """Draws the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    All engines follow it, so they take the same steps. One generator draws everything, a step's
-    dropout after its background: a generator of its own for dropout would change all results of
-    few views and of long runs.
+    One generator draws everything, a step's dropout after its background: a generator of its own
+    for dropout would change all results of few views and of long runs.
     """
 
     def __init__(self, plan: FitPlan):

@@ -203,8 +203,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
     cameras = encoded.cameras
     settings = replace(encoded.settings, target_count=None, num_slots=None)
     options = dict(encoded.about.get("options", {}))
-    for name in ("fit", "device"):  # there are no photos to fit to, and this may be another machine
-        options.pop(name, None)
+    options.pop("fit", None)  # there are no photos to fit to
     batch = {"num_views": len(cameras), "num_input": settings.num_input, "num_new": len(encoded)}
     batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": len(encoded)}
     about = {"gsmerge": __version__, "options": options, "batches": [batch]}

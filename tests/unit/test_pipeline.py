@@ -15,7 +15,7 @@ from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
 
-UNUSUAL = ("partition", "earlier", "curve", "reduce", "refine", "cover", "choose", "join", "overdraw")
+UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
 USUAL = [stage for stage in STAGES if stage not in UNUSUAL]
 UNFITTED = {"fit": "none", "checkpoint": "none"}
 

@@ -191,7 +191,7 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert not plan_of(scene, poses="fixed").fit.move_cameras
     unfitted = plan_of(scene, poses="free", fit="none").fit
     assert unfitted.needs_photos
-    assert not unfitted.move_cameras  # would keep the GPU from finding what no photo shows
+    assert not unfitted.move_cameras
 
 
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:

@@ -82,22 +82,6 @@ def test_result_table(files: tuple[Path, Path]) -> None:
     assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
 
 
-def test_overdraw_stands_beside_its_limit(files: tuple[Path, Path]) -> None:
-    """Of the kinds of pictures the worst, before and after."""
-    outside = {"mean": 9, "crowded": 70}
-    before, after = (
-        {"views": {"mean": mean, "crowded": crowded}, "outside": outside} for mean, crowded in ((50, 90), (39, 60))
-    )
-    drawn = {"before": before, "after": after, "limit": {"num_gaussians": 9000, "mean": 40, "crowded": 80}, "met": True}
-    document = make_document(files)
-    document["choices"] = {**document["choices"], "overdraw": drawn}
-    assert "; at most 9,000 Gaussians; overdraw 39.0 of 40, 95 %: 70 of 80; " in report.summary_line(document)
-    line, limit = report.result_table(document)[4:6]
-    assert limit.split() == ["limit", "9,000", "Gaussians"]
-    assert line.split() == ["overdraw", "50.0", "39.0", "at", "most", "40;", "95", "%:", "70,", "at", "most", "80"]
-    assert len(line) <= 80
-
-
 def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
     assert "dB" not in report.summary_line(make_document(files, psnr_before=None, psnr_after=None))
 

@@ -205,12 +205,12 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Scene
         assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
 
-def test_the_device_of_another_machine_is_not_asked_for(pixels: Scene) -> None:
+def test_a_setting_that_is_gone_is_passed_over(pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
     options = encoded.about["options"] | {"device": "cuda"}
     state = from_encoded(replace(encoded, about=encoded.about | {"options": options}))
     settings, _ = merge_settings({}, state.about["options"])
-    assert (settings.device, settings.segment.superpixels) == ("cpu", "5%")
+    assert settings.segment.superpixels == "5%"
 
 
 def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:
