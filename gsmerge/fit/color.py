@@ -59,19 +59,14 @@ def fit_colors(
     ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
     to. Geometry, opacities and higher harmonics stay.
     """
-    train = color_weights(photos, options, seed)
+    train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
     system = ColorSystem(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
     offsets, report = solve_colors(system, np.zeros((len(gaussians), 3)), options)
     if not report.accepted:
         return gaussians, report
-    sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
+    sh0 = _add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
     return replace(gaussians, sh0=sh0.astype(np.float32)), report
-
-
-def color_weights(photos: Photos, options: FitOptions, seed: int) -> list[np.ndarray]:
-    """Return training weights ``[h,w]`` of every photo for a fit of colours alone."""
-    return training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +179,7 @@ def conjugate_gradients(system: ColorSystem, x: np.ndarray, iterations: int, pri
     return x
 
 
-def add_offsets(sh0: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def _add_offsets(sh0: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Add offsets to base colours; keep them in [-0.05, 1.05], or no farther outside than before."""
     before = sh0_to_rgb(sh0)
     return rgb_to_sh0((before + offsets).clip(before.clip(None, -0.05), before.clip(1.05)))

@@ -7,7 +7,7 @@ from gsmerge.fit import FitOptions
 from gsmerge.research.baselines import greedy, simple, voxel
 from gsmerge.settings.setting import flat_settings
 
-FULL_FIT_SETTINGS = ("effort", "device", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
+FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 
 UNMERGED = Method("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = Method("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS)
