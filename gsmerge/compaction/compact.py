@@ -10,13 +10,14 @@ from typing import Any
 
 from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
-from gsmerge.compaction.methods import Method, choose_method
+from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
+from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
@@ -70,22 +71,22 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
     for count in search:
-        search.add(build_scored(method, prepared, plan, count))
-    rebuild = partial(build_scored, method, prepared, plan)
+        search.add(build_scored(method.build, prepared, plan, count))
+    rebuild = partial(build_scored, method.build, prepared, plan)
     best = meet_bytes(search.best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
+    levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
     return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 
 @record_part()
-def build_scored(method: Method, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
-    return score(count, build_cleaned(method, prepared, plan, count), prepared, plan)
+    return score(count, build_cleaned(build, prepared, plan, count), prepared, plan)
 
 
-def build_cleaned(method: Method, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
 
     More are built than are asked for, and the faintest of what is too many are left out. UsageError if the crop holds
@@ -93,7 +94,7 @@ def build_cleaned(method: Method, prepared: Prepared, plan: Plan, count: int | N
     """
     options = plan.clean
     if not options.asked:
-        return method.build(prepared, plan, count)
+        return build(prepared, plan, count)
     scene, to_world = prepared.scene, prepared.frame.leave
     input_gaussians = scene.finite_gaussians
     most, asked = len(input_gaussians), count
@@ -106,7 +107,7 @@ def build_cleaned(method: Method, prepared: Prepared, plan: Plan, count: int | N
     best: tuple[Fitted, dict[str, int], Record] | None = None
     for _ in range(MAX_BUILDS):
         with record_part() as record:
-            fitted = method.build(prepared, plan, asked)
+            fitted = build(prepared, plan, asked)
             gaussians, counts = clean(fitted.gaussians, options, scene, to_world)
         add_seconds(record.seconds)
         if best is None or count is None or len(best[0].gaussians) < len(gaussians):

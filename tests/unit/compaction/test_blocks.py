@@ -22,7 +22,7 @@ from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Cameras, PicturedScene, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}
 
@@ -186,7 +186,10 @@ def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatc
     """As they are one after the other, with photos in a file or not."""
     masks = np.random.default_rng(0).random((len(scene), 30, 40)) < 0.9
     chosen = [([6, 1], None), ([3], masks)]
-    bare = [replace(scene, gaussians=scene.gaussians[:0], pixel_ids=None, masks=mask) for _, mask in chosen]
+    bare = [
+        PicturedScene.of(replace(scene, gaussians=scene.gaussians[:0], pixel_ids=None), scene.images, mask)
+        for _, mask in chosen
+    ]
     for size in (1, 1 << 40):
         monkeypatch.setattr(memory, "MAPPED_BYTES", size)
         joined = join_views([(part, ids) for part, (ids, _) in zip(bare, chosen, strict=True)])

@@ -22,6 +22,7 @@ from gsmerge.compaction.search import (
     search_count,
 )
 from gsmerge.facts.prepare import Prepared
+from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 
@@ -186,7 +187,7 @@ def test_search_stays_within_its_limits() -> None:
 @pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
 def test_search_begins_within_its_limits(default: int, first: int) -> None:
     plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
-    assert search_count(cast("Prepared", None), plan).first == first
+    assert search_count(cast("Prepared", None), plan, cast("Build", None)).first == first
 
 
 def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:

@@ -30,9 +30,9 @@ def prepared(bare: Scene) -> Prepared:
 
 
 def test_views_show_the_input_and_nothing_is_fitted_to_them(prepared: Prepared) -> None:
-    assert prepared.alone
-    assert prepared.photo_views == ()
-    scene = prepared.scene
+    scene, reference = prepared.scene, prepared.reference
+    assert (reference.placed, reference.fit_views) == (True, ())
+    assert reference.score_views == tuple(range(len(scene)))
     assert 1 <= len(scene) <= JUDGES
     np.testing.assert_array_equal(scene.images, render(scene.gaussians, scene.cameras).images.clip(0, 1))
     assert scene.images.std() > 0.05
