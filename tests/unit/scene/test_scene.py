@@ -18,9 +18,9 @@ from tiny_scene import (
     write_transforms,
 )
 
+from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.measure.inspect import inspect
 from gsmerge.scene import read
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
