@@ -22,6 +22,8 @@ from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
+SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
+SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
@@ -277,6 +279,11 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
     pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))
     return median(errors), _color_distance(inputs, pairs)
+
+
+def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
+    """Return whether a reading is near enough to be true, and far nearer than shuffled pixels."""
+    return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, SMALLEST_PX)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
