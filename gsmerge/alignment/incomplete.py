@@ -142,7 +142,7 @@ def _solve_scale(
 
 def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
     """Return what measures the distances of some rows' base colours from the photos; None without photos."""
-    if inputs.images is None:
+    if not len(inputs.images):
         return None
     base = sh0_to_rgb(inputs.gaussians.sh0[ids, 0])
     photos = inputs.images.reshape(len(inputs.cameras), -1, 3)

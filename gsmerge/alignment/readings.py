@@ -96,12 +96,11 @@ def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
     """Drop orders that only exchange views of one pose with equal photos, or without any: either is right."""
     cameras, images, (first, *labellings) = inputs.cameras, inputs.images, inputs.labellings
-    facts = np.concatenate([cameras.viewmats[:, :3].reshape(-1, 12), cameras.Ks.reshape(-1, 9)], 1)
+    parts = cameras.viewmats[:, :3], cameras.Ks, images
 
     def same(other: Sequence[int]) -> bool:
         moved = [(a, b) for a, b in zip(first, other, strict=True) if a != b]
-        alike = images is None or all(np.array_equal(images[a], images[b]) for a, b in moved)
-        return alike and all(np.array_equal(facts[a], facts[b]) for a, b in moved)
+        return all(np.array_equal(part[a : a + 1], part[b : b + 1]) for part in parts for a, b in moved)
 
     return replace(inputs, labellings=[first, *(first if same(other) else other for other in labellings)])
 

@@ -210,7 +210,7 @@ class AlignmentInput:
     gaussians: Gaussians  # the file's n rows
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
-    images: np.ndarray | None  # ``[c,h,w,3]``, or None
+    images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     labellings: Sequence[tuple[int, ...]]  # orders that the views may be in: the file's, that of the names
     # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
@@ -292,12 +292,17 @@ def color_error(inputs: AlignmentInput, layout: Layout) -> float:
 
 
 def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
-    if inputs.images is None or not len(pairs.rows):
+    if not len(pairs.rows):
         return math.nan
     base = sh0_to_rgb(gather(inputs.gaussians.sh0, pairs.rows)[:, 0])
     x, y = pairs.pixels.astype(np.int64).T
-    colors = gather(inputs.images, pairs.views, y, x)
+    colors = photo_colors(inputs.images, pairs.views, y, x)
     return float(np.abs(base.clip(0, 1) - colors).mean(1).mean())
+
+
+def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at some pixels; NaN where there are no photos."""
+    return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
 @dataclass(frozen=True)

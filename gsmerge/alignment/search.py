@@ -34,7 +34,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
@@ -51,7 +51,7 @@ class AlignmentResult:
     # A block is a view, or one layer of a view with several Gaussians per pixel
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
-    images: np.ndarray | None  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32
+    images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
     camera_file: CameraFile | None  # as it was read in the end; None where there are no cameras
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
     transform: PhotoTransform | None = None  # what was done to the photos
@@ -76,16 +76,16 @@ class _Source:
 
     ply: GaussianFile
     camera_file: CameraFile
-    photos: Photos | None
+    photos: Photos
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
     seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
 
     @cached_property
-    def images(self) -> np.ndarray | None:
+    def images(self) -> np.ndarray:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
-        return None if self.photos is None else as_floats(self.photos)
+        return as_floats(self.photos)
 
     def may_be(self, grid: GridFit) -> bool:
         """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
@@ -96,8 +96,8 @@ class _Source:
 
     def inputs(self, grid: GridFit, *, photos: bool = True) -> AlignmentInput:
         """Put rows, cameras and photos at the size of a grid together; without photos where only positions matter."""
-        images = None
-        if photos and self.photos is not None:
+        images = NO_IMAGES
+        if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
         return AlignmentInput(
             gaussians=self.ply.gaussians,
@@ -128,7 +128,7 @@ class _Source:
 def align(
     ply: GaussianFile,
     camera_file: CameraFile,
-    photos: Photos | None = None,
+    photos: Photos = (),
     *,
     order: str = "auto",
     scale: float | None = None,
@@ -143,7 +143,7 @@ def align(
     Args:
         ply: The file's rows.
         camera_file: Its cameras.
-        photos: c uint8 photos of one size.
+        photos: c uint8 photos of one size, or none.
         order: The order of the rows where it is known, see :class:`gsmerge.settings.reading.ReadHints`.
         scale: Size of the Gaussians' world in units of the cameras', where it is given.
         depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
@@ -185,13 +185,13 @@ def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequenc
 
 def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
-    for fitted in (grid, *square_grids(grid)):
+    for fitted in (grid, *square_grids(grid)) if len(source.photos) else ():
         inputs = source.inputs(fitted)
         frame = solve_upright(inputs, rotation)
         if frame is not None:
             break
     else:
-        raise upright_error(source.ply.info, source.photos is not None)
+        raise upright_error(source.ply.info, len(source.photos))
     moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
     recovery = accept_reading(moved, read_grid(moved))
     if recovery is not None:
@@ -228,7 +228,7 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
         yield next(other_sizes, [])
     rows = source.ply.gaussians, source.ply.valid
     grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
-    yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, None).ok)
+    yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
     yield from other_sizes
 
 

@@ -16,6 +16,7 @@ from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
+from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.coverage import TRANSPARENT, coverage, extents
 from gsmerge.report import finite, human_bytes
 from gsmerge.runtime.record import record_part, report_progress
@@ -114,7 +115,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
 def _photo_notes(scene: Scene) -> list[str]:
     """Say which photos do not look as their Gaussians, as a run would."""
     with record_part(silent=True) as record:
-        if scene.images is not None and len(scene) and len(scene.gaussians):
+        if len(scene) and len(scene.gaussians):
             compare_photos(canonicalise(scene)[0])
     return record.notes
 
@@ -148,11 +149,10 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
-        stored = scene.stored.reshape(-1) if scene.aligned else np.ones(len(gaussians), bool)
-        sight = check_cameras(gaussians, stored, scene.cameras, scene.images)
-        if scene.images is not None:
-            means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
-            num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
+        stored, images = scene.stored_rows, photo_array(scene.images)
+        sight = check_cameras(gaussians, stored, scene.cameras, images)
+        means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
+        num_sky_views = len(sky_regions(means, scene.cameras, images))
     facts |= {"notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}

@@ -58,7 +58,5 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 def shares_inside(scene: Scene, most: int) -> list[float]:
     """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
     rows = np.arange(0, len(scene.gaussians), max(1, -(-len(scene.gaussians) // most)))
-    if scene.aligned:
-        rows = rows[scene.stored.reshape(-1)[rows]]
-    points = scene.gaussians.means[rows].astype(np.float64)
+    points = scene.gaussians.means[rows[scene.stored_rows[rows]]].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

@@ -14,6 +14,7 @@ from gsmerge.alignment import readings
 from gsmerge.alignment.judge import COLOR_MARGIN, Recovery, accept_reading
 from gsmerge.alignment.readings import read_grid
 from gsmerge.alignment.score import SHUFFLED_MARGIN, AlignmentInput
+from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.scene.read import load_scene
 from gsmerge.types import SH_C0, Cameras
 
@@ -21,7 +22,7 @@ from gsmerge.types import SH_C0, Cameras
 def clues_of(smooth: Smooth, images: np.ndarray | None, labellings: list[list[int]] | None = None) -> AlignmentInput:
     """Three cameras, the Gaussians and any photos."""
     w2c, Ks = smooth.w2c, np.tile(smooth.K, (3, 1, 1))
-    photos = None if images is None else images.astype(np.float32) / 255
+    photos = NO_IMAGES if images is None else images.astype(np.float32) / 255
     valid = np.ones(len(smooth.gaussians), bool)
     cameras = Cameras(w2c, Ks, smooth.width, smooth.height)
     return AlignmentInput(smooth.gaussians, valid, cameras, photos, labellings or [[0, 1, 2]], lambda: None)
