@@ -1,11 +1,10 @@
-"""The default fit seed by seed, enlarged, with compensation, and with aligned colours and poses, for docs/results.md.
+"""The default fit seed by seed, enlarged, and with compensation, for docs/results.md.
 
 python benchmarks/defaults.py                  # the evaluation scenes, five seeds; what is done is not repeated
 python benchmarks/defaults.py --split train --seeds 2
 
 Held-out views, visible pixels, plain exports, and fog and holes from outside. Every seed is scored at the photos'
-size; the first one also at other sizes, with compensation as some viewers have it, and after alignment of every view's
-colours and camera.
+size; the first one also at other sizes, and with compensation as some viewers have it.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from gsmerge.measure.scores import OUTSIDE
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.scene.held_out import read_held_out as read_views
 from gsmerge.scene.read import load_scene
-from gsmerge.settings.evaluate import ALIGNMENTS
 from gsmerge.types import Views
 
 NAME = "defaults.jsonl"
@@ -45,7 +43,7 @@ def measure(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
     views = Views(held_out.cameras, held_out.images, held_out.names)
     results = {"gsmerge": gsmerge.compact(load.scene, seed=seed).gaussians}
     record: dict[str, Any] = {"scene": folder.name, "seed": seed}
-    more = {"zoom": ZOOMS, "align": ALIGNMENTS} if seed == 0 else {}
+    more = {"zoom": ZOOMS} if seed == 0 else {}
     options = EvaluateOptions(lpips=("vgg",), lpips_views=LPIPS_VIEWS, context=False, own=seed == 0, **more)
     for result in evaluate(load.scene, results, views, options).results:
         mean = result.mean("target")[1]
@@ -53,9 +51,6 @@ def measure(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
         record[result.name] = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips_vgg} | fog
         if seed == 0:
             record[result.name]["zooms"] = {z: result.mean("target", zoom=z)[1].psnr for z in ZOOMS}
-            record[result.name]["aligned"] = {
-                name: result.mean("target", align=name)[1].psnr for name in options.alignments
-            }
     if seed == 0:
         other = EvaluateOptions(lpips=(), context=False, antialiased=True, fog=False)
         for result in evaluate(load.scene, results, views, other).results:
@@ -76,7 +71,7 @@ def make_section(records: Sequence[Mapping[str, Any]]) -> str:
     seeds = make_table(("scene", "seeds", *(heading for heading, _ in columns.values())), seed_rows(records))
     outside = "\n[Fog and holes](guide/evaluate.md#fog-and-holes) are seen from outside." if "holes" in columns else ""
     views = make_table(
-        ("scene", "result", *(f"{zoom:g} x" for zoom in ZOOMS), "compensated", "colour", "pose", "both"),
+        ("scene", "result", *(f"{zoom:g} x" for zoom in ZOOMS), "compensated"),
         view_rows(records),
     )
     return f"""## The defaults, seed by seed
@@ -86,11 +81,10 @@ order of the views, the backgrounds and the held-out blocks.{outside}
 
 {seeds}
 
-### As viewers show it, and with aligned targets
+### As viewers show it
 
-PSNR (dB) of the first seed: the photos resized to so many times their size; at their size with the opacity of small
-Gaussians lowered by what the low-pass adds (`--antialiased`); and after an affine map of each render's colours, after a
-refined pose of each held-out camera, and after both (`--align color,pose`).
+PSNR (dB) of the first seed: the photos resized to so many times their size; and at their size with the opacity of
+small Gaussians lowered by what the low-pass adds (`--antialiased`).
 
 {views}"""
 
@@ -124,12 +118,12 @@ def seed_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def view_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Scene, result, and PSNR at each size, with compensation, and after each alignment; last the means."""
+    """Scene, result, and PSNR at each size and with compensation; last the means."""
     table: dict[str, list[tuple[str, list[float]]]] = {}
     for record in sorted(records, key=lambda r: r["scene"]):
         for name in ("input", "gsmerge") if record["seed"] == 0 else ():
             one = record[name]
-            values = [*one["zooms"].values(), one["compensated"], *one["aligned"].values()]
+            values = [*one["zooms"].values(), one["compensated"]]
             table.setdefault(name, []).append((record["scene"], values))
     rows = [(scene, name, *(f"{v:.2f}" for v in values)) for name, some in table.items() for scene, values in some]
     for name, some in table.items():

@@ -25,7 +25,6 @@ import numpy as np
 from shared_scenes import Targets, exporter, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.measure.align import fit_colors
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
@@ -197,6 +196,13 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
 def _order(folder: Path, name: str) -> int:
     frames = json.loads((folder / "transforms.json").read_text())["frames"]
     return [Path(frame["file_path"]).name for frame in frames].index(name)
+
+
+def fit_colors(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Apply the affine colour map (3 x 4) that brings a render closest to its photo, over the pixels of the mask."""
+    colors = np.concatenate([image[mask], np.ones((int(mask.sum()), 1))], 1, dtype=np.float64)
+    affine = np.linalg.lstsq(colors, photo[mask].astype(np.float64), rcond=None)[0]
+    return np.asarray((image @ affine[:3] + affine[3]).clip(0, 1), np.float32)
 
 
 def measure(gaussians: Gaussians, targets: Targets) -> dict[str, float]:

@@ -44,6 +44,5 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
     """Return the most Gaussians that a budget, a file size or a device allows, at most the input's."""
-    device = DEVICES.get(str(options.budget))
-    limit = device.count if device else exact_count(options, num_input, sh_degree)
+    limit = DEVICES.get(str(options.budget), exact_count(options, num_input, sh_degree))
     return num_input if limit is None else min(limit, num_input)

@@ -1,4 +1,4 @@
-"""The plan of a run: the one place that reads "auto", effort, device, budget, recipe and checkpoint names.
+"""The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
 :func:`make_plan` settles every choice once. Each stage is handed its own part of the plan, and no
 stage knows the options of another.
@@ -15,10 +15,9 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import report_views, scored_views
-from gsmerge.fit import FitBackend, photo_scale, start_share
-from gsmerge.fit.gpu import choose_backend
+from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, Device
+from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -56,14 +55,14 @@ class Effort:
     rectangles: float  # Rectangles per superpixel of `rdseg`
     early_sweeps: int  # Sweeps of `rdseg` before rectangles are merged
     merges: bool = True  # Whether Gaussians of different views are merged
-    networks: bool = True  # Whether `checkpoint="auto"` may run networks before a fit, and without one more than heads
+    refines: bool = True  # Whether `checkpoint="auto"` runs more of the networks than the heads
     prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
 
 
 EFFORTS = {
-    "draft": Effort(30, 1.0, 0, merges=False, networks=False, prunes=False, large_photos=False),
-    "fast": Effort(55, 1.0, 0, networks=False, large_photos=False),
+    "draft": Effort(30, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False),
+    "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(320, 2.0, 0),
     "best": Effort(1000, 3.0, 1),
 }
@@ -74,7 +73,6 @@ class Plan:
     """All decisions about a run, made before the first superpixel is cut."""
 
     superpixels: SuperpixelPlan  # How each view is cut, and into how many
-    networks: tuple[NetworkWeights | None, ...]  # Networks, None for the analytic start, or both
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -85,17 +83,25 @@ class Plan:
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     size: FileSize | None  # What the output's file may have at most; None: any
-    device: Device | None  # What the result shall be drawn by fluidly; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    backend: FitBackend  # Where the fit and the scores run
     seed: int  # Everything random depends on it alone
-    checkpoint: Checkpoint | None  # Where the networks come from; None without any
+    checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+
+    @property
+    def networks(self) -> NetworkWeights | None:
+        """Networks that correct the stages' results; None: closed formulas alone."""
+        return None if self.checkpoint is None else self.checkpoint.networks
+
+    @property
+    def network_facts(self) -> dict[str, Any]:
+        """Facts about the networks, for reports, by name; empty without networks."""
+        return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
 
     @property
     def weakens(self) -> bool:
         """Whether groups that other views see through start with less opacity, because a long fit follows."""
-        return self.superpixels.start_share < 1
+        return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
     def limits(self) -> CountLimits:
@@ -142,20 +148,13 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             num_reserved=0 if unseen is None else len(unseen),
         )  # fmt: skip
         limits = whole.limits
-        backend, problem = choose_backend(options.device, input_scene.num_gaussians)
-        if problem is not None:
-            note(problem)
-        fit = _fit_photos(prepared, options, whole.fit, backend)
+        fit = _fit_photos(prepared, options, whole.fit)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
-    networks: tuple[NetworkWeights | None, ...] = (None,)
-    if checkpoint is not None:
-        networks = (checkpoint.networks, None) if options.checkpoint == "auto" else (checkpoint.networks,)
     return Plan(
         superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
-        networks=networks,
         match=replace(options.match, match=whole.match),
         decode=options.decode,
         fit=fit,
@@ -166,12 +165,10 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         size=file_size(options.budget),
-        device=DEVICES.get(str(options.budget.budget)),
         scored_views=_choose_scored_views(prepared, options),
-        backend=backend,
         seed=options.seed,
         checkpoint=checkpoint,
-        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps, "device": backend.device},
+        settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
     )
 
 
@@ -274,16 +271,14 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
 def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    The shipped networks improve scenes with one Gaussian per pixel (``aligned``) if no fit follows, or a short one
-    under an effort that has time for both, and others with photos to choose the start by if no fit follows
-    (docs/laboratory/networks.md). ``photos``: whether there are any to fit to.
+    The shipped networks improve scenes with one Gaussian per pixel (``aligned``), and others that have photos, if no
+    fit follows; a fit takes more from its steps (docs/laboratory/networks.md). ``photos``: whether there are any to fit
+    to.
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    steps = resolve_fit(options).steps * (AUTO_STEPS if options.budget.auto and options.fit.fit_steps is None else 1)
-    short = EFFORTS[options.effort].networks and steps <= SHORT_STEPS
-    bare = not photos or options.fit.fit == "none"
-    return "shipped" if (aligned and (bare or short)) or (photos and options.fit.fit == "none") else "none"
+    unfitted = options.fit.fit == "none"
+    return "shipped" if (aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
 def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Checkpoint | None:
@@ -303,7 +298,7 @@ def load_networks(options: CompactOptions, scene: Scene, *, photos: bool) -> Che
         note(text)
     if checkpoint is None:
         return None
-    if options.checkpoint == "auto" and not EFFORTS[options.effort].networks:
+    if options.checkpoint == "auto" and not EFFORTS[options.effort].refines:
         checkpoint = replace(checkpoint, networks=checkpoint.networks.heads_alone())
     outputs = checkpoint.networks.options.outputs
     if options.recipe == "paper" and outputs != "absolute":
@@ -404,17 +399,16 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions, backend: FitBackend) -> FitOptions:
+def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
     scene = prepared.scene
     if not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
-    auto = EFFORTS[options.effort].large_photos and backend.device == "cpu"
-    scale, problem = photo_scale(scene, fit, auto=auto)
+    scale, problem = photo_scale(scene, fit, auto=EFFORTS[options.effort].large_photos)
     if problem is not None:
         note(problem)
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.input_scene.images is not None  # which only the CPU can do
+    moves = free and fit.fit == "full" and prepared.input_scene.images is not None
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 

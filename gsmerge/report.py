@@ -180,13 +180,6 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     judged = document["choices"].get("fidelity")
     if judged:
         rows += [("PSNR", "", f"{judged['psnr']:.2f} dB", _judged_by(judged))]
-    if drawn := document["choices"].get("overdraw"):
-        (old, _), (new, crowded), limit = _worst(drawn["before"]), _worst(drawn["after"]), drawn["limit"]
-        remark = f"at most {limit['mean']:g}; 95 %: {crowded:.0f}, at most {limit['crowded']:g}"
-        rows += [
-            ("overdraw", f"{old:.1f}", f"{new:.1f}", remark),
-            ("limit", "", f"{limit['num_gaussians']:,}", "Gaussians"),
-        ]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
@@ -196,11 +189,6 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     last = [] if cameras is None else [f"  cameras    {cameras}"]
     last += [] if next_step is None else [f"  next       {next_step}"]
     return [after["path"], *table, *level_lines(document), *curve, *last]
-
-
-def _worst(kinds: Mapping[str, Mapping[str, float]]) -> tuple[float, float]:
-    """Return the largest mean and the largest crowded overdraw of all kinds of pictures."""
-    return max(kind["mean"] for kind in kinds.values()), max(kind["crowded"] for kind in kinds.values())
 
 
 def _judged_by(fidelity: Mapping[str, Any]) -> str:
@@ -254,10 +242,6 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
-    if drawn := document["choices"].get("overdraw"):
-        (mean, crowded), limit = _worst(drawn["after"]), drawn["limit"]
-        quality += f"; at most {limit['num_gaussians']:,} Gaussians"
-        quality += f"; overdraw {mean:.1f} of {limit['mean']:g}, 95 %: {crowded:.0f} of {limit['crowded']:g}"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"

@@ -8,7 +8,6 @@ from string import Formatter
 from typing import Any
 
 from gsmerge.io import OUTPUT_FORMATS
-from gsmerge.io.formats.table import input_format
 from gsmerge.scene.content_hash import digest
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -39,8 +38,6 @@ class BatchOptions(Settings):
     retries: int = setting(1, "How often a scene is tried again whose process died or took too long.", least=0)
     rerun: bool = setting(False, "Compact scenes again that are done.")
     overwrite: bool = setting(False, "Replace files in the output folder that no batch wrote.")
-    sequence: bool = setting(False, "Whether scenes, in the order of their names, are moments of one place, each of "
-        "which starts from the result before it.")  # fmt: skip
     engine: str = setting("local", "Where scenes are compacted, see `Engine`.")
     address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
 
@@ -63,10 +60,6 @@ class BatchOptions(Settings):
         ):
             if not is_possible:
                 raise ValueError(f"output: expected {expected}, got {self.output!r}")
-        if self.sequence and (self.engine != "local" or self.jobs not in (None, 1)):
-            raise ValueError("sequence: expected engine local and one job, as each scene waits for the one before it")
-        if self.sequence and input_format(example.lower()).read is None:
-            raise ValueError(f"sequence: expected an output that is read again, not one in USD, got {self.output!r}")
         if Engine(self.engine, self.address).name == "ray" and self.max_memory is not None:
             raise ValueError("max_memory: expected engine local; Ray knows the memory of its nodes")
 
@@ -74,8 +67,7 @@ class BatchOptions(Settings):
         """Return all settings that a result depends on, apart from the scene's files, as plain values."""
         settings = self.settings.to_dict()
         del settings["threads"]
-        sequence = {"sequence": True} if self.sequence else {}
-        return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints), **sequence}
+        return {"settings": settings, "opacity": self.opacity, "reading": vars(self.hints)}
 
     def name(self) -> str:
         """Return a digest that is equal for runs whose results are the same."""

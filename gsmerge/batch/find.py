@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,6 @@ from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
 from gsmerge.io.formats.table import estimate_counts, may_hold_gaussians
-from gsmerge.io.image_names import natural_key
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import stem_of
 from gsmerge.scene.files import (
@@ -89,10 +88,7 @@ def find_jobs(
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    scenes: Iterable[Path] = find_scenes(arguments, out, unreadable)
-    if options.sequence:
-        scenes = sorted(scenes, key=lambda scene: natural_key(str(scene)))
-    for scene in scenes:
+    for scene in find_scenes(arguments, out, unreadable):
         ply = main_file(scene)
         real = os.path.realpath(ply)
         if real in inputs or real in results:

@@ -15,7 +15,7 @@ from typing import Any
 from gsmerge.batch.batch_options import BatchOptions, with_whole_paths
 from gsmerge.batch.find import Job
 from gsmerge.batch.records import BUSY, RECORDS, STUCK, RecordIndex, check_folder
-from gsmerge.batch.task import BatchContext, Task, clean_up, make_tasks, record_failure, run_lock, run_recorded
+from gsmerge.batch.task import BatchContext, Task, clean_up, record_failure, run_lock, run_recorded
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
@@ -48,7 +48,7 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions, *, processors: int
     threads = options.settings.threads
     if options.engine == "ray":
         return Schedule(options.jobs or 0, threads or 1, max((job.memory for job in jobs), default=0))
-    count = 1 if options.sequence else options.jobs or max(1, processors // (threads or 1))
+    count = options.jobs or max(1, processors // (threads or 1))
     sums = list(accumulate(nlargest(max(1, min(count, len(jobs))), (job.memory for job in jobs)))) or [0]
     limit = free_memory() if options.max_memory is None else options.max_memory
     count, notes = len(sums), []
@@ -121,7 +121,8 @@ def run_batch(
             cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
             pool = RayPool(cluster, schedule.threads, jobs=schedule.jobs, timeout=options.timeout)
         stack.callback(lambda: clean_up(pool.close(), context))
-        yield from dispatch(make_tasks(jobs, index.known, context), pool, context)
+        tasks = (Task(job, index.known.get(job.output)) for job in jobs)
+        yield from dispatch(tasks, pool, context)
 
 
 def dispatch(tasks: Iterator[Task], pool: ProcessPool | RayPool, context: BatchContext) -> Iterator[dict[str, Any]]:
@@ -131,8 +132,7 @@ def dispatch(tasks: Iterator[Task], pool: ProcessPool | RayPool, context: BatchC
     active = 0
 
     def next_task() -> Task | None:
-        waits = bool(busy) and context.options.sequence  # for the result that the next one starts from
-        task = retried.popleft() if retried else None if waits else next(tasks, None)
+        task = retried.popleft() if retried else next(tasks, None)
         if task is None and busy and busy[0][0] <= time.monotonic():
             return busy.popleft()[1]
         return task

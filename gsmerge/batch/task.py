@@ -10,7 +10,7 @@ import os
 import secrets
 import socket
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,7 +53,6 @@ class Task:
     job: Job  # the scene
     known: DoneResult | None  # its result of former runs; None without one
     attempt: int = 1  # from 1
-    earlier: str | None = None  # in a sequence: name of the result before it in the output folder
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def _process(task: Task, context: BatchContext, new_records: RecordIndex, begun:
     """Skip or compact a scene, and return its record."""
     job, options = task.job, context.options
     files = _files_of(job, options)
-    key = _key_of(task, files, context)
+    key = _key_of(job, files, options)
     before, since = task.known, new_records.known.get(job.output)
     for done in (since, None if options.rerun else before):
         if done is not None and done.holds(context.folder, key):
@@ -148,7 +147,6 @@ def _compact(task: Task, context: BatchContext, files: SceneFiles, key: str) -> 
                 opacity=options.opacity,
                 hints=options.hints,
                 hashed=True,
-                earlier=None if task.earlier is None else context.folder / task.earlier,
             )
             written = [out, *(Path(level["path"]) for level in document["levels"])]
         else:
@@ -169,10 +167,8 @@ def _files_of(job: Job, options: BatchOptions) -> SceneFiles:
     return find_scene_files(scene, cameras=filled(options.cameras, scene), images=filled(options.images, scene))
 
 
-def _key_of(task: Task, files: SceneFiles, context: BatchContext) -> str:
-    job, options = task.job, context.options
-    key = scene_key(files, options) if job.work is None else job.work.key(options)
-    return key if task.earlier is None else digest({"key": key, "earlier": file_sha256(context.folder / task.earlier)})
+def _key_of(job: Job, files: SceneFiles, options: BatchOptions) -> str:
+    return scene_key(files, options) if job.work is None else job.work.key(options)
 
 
 def scene_key(files: SceneFiles, options: BatchOptions) -> str:
@@ -188,20 +184,9 @@ def is_done(task: Task, context: BatchContext) -> bool:
     """Return whether a scene's known result is up to date, so that the scene is skipped."""
     try:
         files = _files_of(task.job, context.options)
-        return task.known is not None and task.known.holds(context.folder, _key_of(task, files, context))
+        return task.known is not None and task.known.holds(context.folder, _key_of(task.job, files, context.options))
     except SceneError:
         return False
-
-
-def make_tasks(jobs: Iterable[Job], known: Mapping[str, DoneResult], context: BatchContext) -> Iterator[Task]:
-    """Yield the task of each job; in a sequence with the last result before it when the task is taken."""
-    earlier, new_records = None, RecordIndex(context.folder, context.start)
-    for job in jobs:
-        yield Task(job, known.get(job.output), earlier=earlier)
-        if context.options.sequence and (context.folder / job.output).is_file():
-            new_records.read_on()
-            made = job.output in new_records.known or job.output in known  # files of others are no results
-            earlier = job.output if made else earlier
 
 
 def record_failure(task: Task, context: BatchContext, error: str) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def parse_jobs(text: str) -> int:
                    "it.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
-    "hint k superpixels budget quality effort fit device set",
+    "hint k superpixels budget quality effort fit set",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
@@ -57,9 +57,6 @@ def parse_jobs(text: str) -> int:
         opt.option("max_memory", str, "Memory that all scenes at once may take, such as 8GB.",
                    wording="most of the free memory"),
         opt.option("timeout", float, "Seconds that a scene may take.", min=0.001),
-        opt.option("sequence", bool, "The scenes, in the order of their names, are moments of one place: each starts "
-                   "from the result before it, so that what stands still does not flicker.", "--sequence",
-                   default=False),
         opt.option("retries", int, "How often a scene is tried again whose process died or took too long.", default=1,
                    min=0),
     ),
@@ -92,7 +89,7 @@ def batch(args: opt.Args) -> None:
         options = BatchOptions(
             args.settings(), args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
             _bytes(args.max_memory), args.timeout, args.retries, rerun=not args.resume, overwrite=args.overwrite,
-            sequence=args.sequence, engine=args.engine, address=args.address,
+            engine=args.engine, address=args.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
         from gsmerge.runtime.work import require_ray
@@ -194,15 +191,11 @@ def _first(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
 
 def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:
     """List the jobs without an up-to-date result in the folder; all jobs if results are to be made again."""
-    from gsmerge.batch.task import BatchContext, is_done, make_tasks
+    from gsmerge.batch.task import BatchContext, Task, is_done
 
+    known = {} if options.rerun else index.known
     shared = BatchContext(out, options, 0)
-    tasks = make_tasks(jobs, {} if options.rerun else index.known, shared)
-    pending: dict[str, Job] = {}
-    for task in tasks:
-        if task.earlier in pending or not is_done(task, shared):  # what a result starts from may be another then
-            pending[task.job.output] = task.job
-    return list(pending.values())
+    return [job for job in jobs if not is_done(Task(job, known.get(job.output)), shared)]
 
 
 def print_plan(

@@ -40,12 +40,12 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
 @opt.command(
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined."),
-    f"{opt.READING} masks earlier k superpixels budget quality levels blocks",
-    "effort fit exposure poses device method recipe checkpoint set crop drop up scale rotate translate",
+    f"{opt.READING} masks k superpixels budget quality levels blocks",
+    "effort fit exposure poses method recipe checkpoint set crop drop up scale rotate translate",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
                "A folder named colmap: a COLMAP model.", "SCENE.compact.ply"),
     f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
-    rare="hint masks earlier levels blocks fit exposure poses method recipe checkpoint crop drop up scale rotate"
+    rare="hint masks levels blocks fit exposure poses method recipe checkpoint crop drop up scale rotate"
          " translate strict save_cameras embed_cameras"
          f" engine address json quiet {opt.RUN}",
 )  # fmt: skip
@@ -54,7 +54,6 @@ def compact(args: opt.Args) -> None:
     start = perf_counter()
     hints = args.hints()
     from gsmerge.compaction.files import level_output
-    from gsmerge.io.bounds import check_file
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.placement import PlacementOptions
@@ -71,10 +70,7 @@ def compact(args: opt.Args) -> None:
         raise UsageError(f"{out}: expected a --budget in Gaussians and no --levels for a COLMAP model")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
-    earlier = () if args.earlier is None else (args.earlier,)
-    for path in earlier:
-        check_file(path)
-    inputs = (*input_files(files), *earlier, *checkpoint_files(settings.checkpoint))
+    inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
     named = (out, *model, *levels, args.report, beside, args.save_cameras)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
@@ -101,7 +97,7 @@ def compact(args: opt.Args) -> None:
     with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
             files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
-            hashed=args.json or args.report is not None, earlier=args.earlier, seconds_before=seconds_before,
+            hashed=args.json or args.report is not None, seconds_before=seconds_before,
         )  # fmt: skip
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)

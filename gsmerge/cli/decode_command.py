@@ -18,7 +18,7 @@ from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_
                 "5MB; at least one per group. auto: up to the knee of the superpixels' distortion."),
     opt.changed("fit", help="What is fitted to the photos that a state has kept.",
                 show_default="full where there are photos"),
-    "effort device",
+    "effort",
     opt.changed("set", help="Any other setting of the fit or of the written file, such as normals=false; may be "
                 "repeated."),
     opt.output(opt.COMPACT_SCENE, "ENCODED.compact.ply"),
@@ -35,7 +35,7 @@ def decode(args: opt.Args) -> None:
 
     wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)
-    run = args.given(("effort", "device", "seed", "threads"))
+    run = args.given(("effort", "seed", "threads"))
     with opt.usage_errors():
         settings = replace(CompactOptions(fit=wanted), **run)
     before = {"import": perf_counter() - start}

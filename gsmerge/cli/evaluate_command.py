@@ -32,11 +32,6 @@ def parse_zoom(text: str) -> tuple[float, ...]:
         raise typer.BadParameter(f"expected sizes such as .5,1,2,4, got {text!r}") from None
 
 
-def parse_align(text: str) -> tuple[str, ...]:
-    """Parse ``--align``: names with commas between."""
-    return tuple(part.strip() for part in text.split(","))
-
-
 @opt.command(
     opt.BEFORE,
     opt.AFTER,
@@ -52,8 +47,6 @@ def parse_align(text: str) -> tuple[str, ...]:
         opt.MEASURING,
         opt.option("zoom", str, "Also measure PSNR and SSIM at other sizes: rendered at these multiples of the photos' "
                    "pixels per side.", wording="1", metavar="LIST", parser=parse_zoom),
-        opt.option("align", str, "Also score held-out views after alignment with their photos: of the renders' colours "
-                   "(color), of the cameras (pose), or both (color,pose).", metavar="LIST", parser=parse_align),
     ),
     "lpips lpips_views antialiased",
     *opt.panel(
@@ -74,8 +67,6 @@ def evaluate(args: opt.Args) -> None:
     """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, fog, counts, bytes, render time."""
     if not args.context and args.targets is None:
         raise UsageError("--no-context: expected held-out views to measure instead; name them with --targets")
-    if args.align and args.targets is None:
-        raise UsageError("--align: expected held-out views, whose photos to align with; name them with --targets")
     from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
@@ -95,7 +86,7 @@ def evaluate(args: opt.Args) -> None:
     with opt.usage_errors():
         options = EvaluateOptions(
             nets, args.lpips_views, args.context, threads=args.threads, antialiased=args.antialiased,
-            **args.given(("photo_side", "zoom", "align")),
+            **args.given(("photo_side", "zoom")),
         )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)

@@ -227,7 +227,7 @@ def _change(parameter: Parameter, **changes: Any) -> Parameter:
 
 
 def _escape(help: str) -> str:
-    """Escape brackets, so that rich does not take ``[cuda]`` for markup, and leave out backticks."""
+    """Escape brackets, so that rich does not take ``[ray]`` for markup, and leave out backticks."""
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
@@ -294,8 +294,6 @@ _TABLE = (
         option("images", Path, "Folder of the input photos. Default: beside the .ply."),
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
                "beside the photos, and where these are transparent."),
-        option("earlier", Path, "Result of the same place at another moment: what it shows right is taken over, and "
-               "the fit takes half its steps."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
@@ -315,7 +313,7 @@ _TABLE = (
     ),
     panel(
         METHOD,
-        *map(setting_option, ("effort", "fit", "exposure", "poses", "device", "method", "recipe", "checkpoint")),
+        *map(setting_option, ("effort", "fit", "exposure", "poses", "method", "recipe", "checkpoint")),
         option("set", list[str], f"Any other setting, such as match=aabb; may be repeated. {SETTINGS_PAGE} lists "
                "them.", metavar="NAME=VALUE"),
     ),

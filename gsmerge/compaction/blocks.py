@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes
-from gsmerge.compaction.overdraw import report_overdraw
 from gsmerge.compaction.result import (
     CompactReport,
     CompactResult,
@@ -48,7 +47,7 @@ from gsmerge.runtime.memory import free_pages, make_array, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
 from gsmerge.runtime.threads import in_turn
 from gsmerge.runtime.work import start_work
-from gsmerge.settings.budget import DEVICES, parse_share, share_text
+from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
@@ -115,8 +114,6 @@ def compact_in_blocks(
             result = faintest_dropped(result, most)
         if asked := file_size(options.budget):
             result = drop_to_bytes(result, [], asked.num_bytes, asked.file)
-        shown_by = DEVICES.get(str(options.budget.budget))
-        report_overdraw(frame.enter(result), frame.enter_cameras(scene.cameras), shown_by)
         everything = work.share(result)
         scored = work.run("score", score_part, count, each_part(parts, everything))
         scores = [score for score, _ in adopt_records(scored)]
@@ -199,7 +196,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution
     rows = np.flatnonzero(used)
     decoded = Decoded(joined[rows], round(growth * len(rows)), exact=False)
-    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed, plan.backend)
+    fitted = fit_scene(decoded, scene, part.prepared.photo_views, plan.fit, plan.seed)
     if fitted.report is None:  # nothing was fitted, and what no photo shows is left out
         return fitted.gaussians
     assert fitted.report.origins is not None
@@ -235,7 +232,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
     )  # fmt: skip
     decoded = Decoded(joined[rows], len(rows), exact=True, fixed=~at_seam[rows])
     with record_part(title="seams") as record:
-        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed, plan.backend)
+        fitted = fit_scene(decoded, scene, range(len(scene)), options, seed)
     add_seconds(record.seconds)
     choose(seams={"views": len(scene), "num_gaussians": int(at_seam.sum()), "steps": options.steps})
     columns = {f.name: np.array(getattr(joined, f.name)) for f in fields(Gaussians)}

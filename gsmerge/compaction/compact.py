@@ -11,7 +11,6 @@ from typing import Any
 from gsmerge.compaction.blocks import compact_in_blocks, cut_views
 from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 from gsmerge.compaction.methods import Build, choose_method
-from gsmerge.compaction.overdraw import meet_overdraw
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
 from gsmerge.errors import UsageError
@@ -22,11 +21,10 @@ from gsmerge.plan import Plan, make_plan, note_engine, plan_whole, stands_alone
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
 from gsmerge.stages.segment import measure_size
-from gsmerge.stages.take_over import measure_flicker
-from gsmerge.types import Gaussians, Scene, StrPath
+from gsmerge.types import Scene, StrPath
 
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
 
@@ -36,7 +34,6 @@ def compact(
     options: CompactOptions | None = None,
     *,
     progress: Progress | None = None,
-    earlier: Gaussians | None = None,
     **settings: Any,
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
@@ -45,8 +42,6 @@ def compact(
         scene: What :func:`gsmerge.read_scene` returns, or the path that it reads. Tensors give tensors.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
-        earlier: Gaussians of a result of the same place at another moment, in the scene's world: what they show right
-            is taken over, so that it does not flicker, and the fit takes half its steps.
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises SceneError for a path that cannot be read, ValueError for a setting that is unknown or out of range.
@@ -65,41 +60,25 @@ def compact(
         if whole.blocks > 1:
             blocks, covisibility = cut_views(scene, options, whole.blocks)
             if len(blocks) > 1:
-                if earlier is not None:
-                    note("the earlier result is not used: the scene is compacted in blocks")
                 return compact_in_blocks(scene, options, whole, blocks, covisibility)
-        return compact_piece(scene, options, earlier)
+        return compact_piece(scene, options)
 
 
-def compact_piece(scene: Scene, options: CompactOptions, earlier: Gaussians | None = None) -> CompactResult:
-    """Compact a scene in one piece, from an ``earlier`` result of another moment if there is one."""
+def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
+    """Compact a scene in one piece."""
     method = choose_method(options, scene, build)  # ours, or a baseline
     alone = stands_alone(scene, options)  # facts: frame, photos, poses, unseen
     prepared = prepare_alone(scene.numpy()) if alone else prepare(scene.numpy(), options.prepare)
-    earlier = enter_earlier(earlier, prepared, options)
-    method = method if earlier is None else partial(build, earlier=earlier)
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan)  # one count, or counts until a quality is met
     for count in search:
         search.add(build_scored(method, prepared, plan, count))
     rebuild = partial(build_scored, method, prepared, plan)
-    best = meet_overdraw(meet_bytes(search.best, rebuild, prepared, plan), rebuild, prepared, plan)
+    best = meet_bytes(search.best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
-    if earlier is not None:
-        choose(flicker=measure_flicker(earlier, best.fitted.gaussians, prepared.scene, prepared.photo_views))
     return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
-
-
-def enter_earlier(earlier: Gaussians | None, prepared: Prepared, options: CompactOptions) -> Gaussians | None:
-    """Return the canonical Gaussians of an earlier result; None, with a note, where no fit to photos can go on."""
-    if earlier is None:
-        return None
-    if prepared.scene.images is None or not prepared.photo_views or options.fit.fit == "none" or options.method != OURS:
-        note("the earlier result is not used: there is no fit to photos that could go on from it")
-        return None
-    return prepared.frame.enter(earlier.numpy())
 
 
 @record_part()

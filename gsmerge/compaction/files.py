@@ -25,8 +25,7 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import missing_notes
-from gsmerge.fit.gpu import choose_backend
-from gsmerge.io import atomic_outputs, output_format, read_gaussians, write_gaussians
+from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
@@ -47,7 +46,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.segment import measure_size
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Scene
 
 
 @dataclass(frozen=True)
@@ -75,13 +74,11 @@ def compact_files(
     hints: ReadHints = AUTO,
     progress: Progress | None = None,
     hashed: bool = False,
-    earlier: Path | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
 
-    ``hashed``: hash the input for the report. ``earlier``: a result of another moment to start from.
-    ``seconds_before``: wall time by name of the caller's earlier steps.
+    ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
 
     Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
@@ -91,7 +88,6 @@ def compact_files(
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
-        start_from = None if earlier is None else read_earlier(earlier, outputs)
         load = read_input(files, opacity=opacity, hints=hints)
         check_saved_cameras(load.scene, outputs)
         views = _views_once(load.scene)
@@ -102,7 +98,7 @@ def compact_files(
             raise _other_cameras(cameras_path)
         cameras_path = cameras_path if len(load.scene) else None
         read = perf_counter()
-        result = compact(load.scene, settings, earlier=start_from, progress=progress)
+        result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
@@ -144,9 +140,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
     scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs)
     _, unused = check_method(settings, scene)
-    backend, problem = choose_backend(settings.device, scene.num_gaussians)
-    settings = replace(settings, device=backend.device)
-    notes = [*load.notes, *unused, *missing_notes(scene), *([] if problem is None else [problem])]
+    notes = [*load.notes, *unused, *missing_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
@@ -251,14 +245,6 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     loaded = load_files(files, opacity=opacity, hints=hints).without_photos()
     release_memory()
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
-
-
-def read_earlier(path: Path, outputs: Outputs) -> Gaussians:
-    """Read a result of another moment; UsageError where this one is to be written in another frame than the scene's."""
-    if outputs.placement.moves:
-        raise UsageError(f"{path}: expected no change of the frame (--up, --scale, --rotate, --translate) with it")
-    file = read_gaussians(path)
-    return file.gaussians[file.valid]
 
 
 def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:

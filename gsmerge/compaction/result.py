@@ -11,13 +11,13 @@ import numpy as np
 
 from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS
-from gsmerge.fit import FitBackend, Fitted, run_on
+from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.measure.preview import picture_html, to_picture
 from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss
-from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos
+from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.report import html_table
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
@@ -193,11 +193,7 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> flo
 @stage("score")
 def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
     """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
-
-    def score_on(backend: FitBackend) -> PhotoScore:
-        return backend.score_photos(gaussians, scene_photos(judges), plan.scored_views)
-
-    return run_on(plan.backend, "scores", score_on).psnr
+    return score_photos(gaussians, scene_photos(judges), plan.scored_views).psnr
 
 
 def move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
@@ -241,13 +237,9 @@ def measure_score(
     if views.images is None or not prepared.photo_views:
         return None
     with stage(name):
-        photos, near, quarter = scene_photos(views), NEAR * prepared.frame.unit, plan.target_psnr is None
-
-        def score_on(backend: FitBackend) -> PhotoScore:
-            settings = {"quarter": quarter, "near": near, "covered": covered}
-            return backend.score_photos(gaussians, photos, plan.scored_views, **settings)
-
-        return run_on(plan.backend, "scores", score_on)
+        near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None
+        photos = scene_photos(views)
+        return score_photos(gaussians, photos, plan.scored_views, quarter=quarter, near=near, covered=covered)
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:

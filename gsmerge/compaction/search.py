@@ -141,7 +141,7 @@ def measure_curve(prepared: Prepared, plan: Plan, steps: int, counts: Sequence[i
     full size, or of the whole pictures that judge a scene without views; LPIPS needs whole pictures.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
-    quick = replace(plan.with_fit(short), networks=(None,), checkpoint=None, clean=CleanOptions())  # nothing grows
+    quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
     photos = scene_photos(prepared.scene)
     if prepared.alone:  # nothing is fitted to them
         weights = [np.zeros((photos.height, photos.width), np.float32)] * len(photos)

@@ -93,12 +93,11 @@ def _without_fit(options: CompactOptions, settings: dict[str, Any]) -> CompactOp
 
 def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int | None) -> Encoded:
     """Collect everything that decoding needs of the merged Feature Gaussians."""
-    features, networks, exact = merged.features, merged.networks, merged.segmentation.exact
+    features, exact = merged.features, merged.segmentation.exact
     options, scene = plan.decode, prepared.scene
     count = merged_count(merged, options, grows=plan.fit.grows)
     max_k = max_k or (DEFAULT_MAX_K if count is None and options.max_k <= DEFAULT_MAX_K else MAX_CHILDREN)
-    if networks is not None:
-        max_k = min(max_k, networks.options.max_children)
+    max_k = min(max_k, merged.networks.max_children)
     settings = StoredSettings(
         num_input=prepared.input_scene.num_gaussians,
         k=AUTO if plan.auto_count else options.k,
@@ -110,9 +109,11 @@ def _to_encoded(prepared: Prepared, plan: Plan, merged: MergedViews, max_k: int 
         knee_count=knee_count(scene, plan.superpixels),
     )
     heads = None
-    if networks is not None and plan.checkpoint is not None:
-        group_features = networks.describe(features)
-        heads = StoredHeads(plan.checkpoint.networks, group_features.views, group_features.group)
+    if plan.networks is not None:
+        from gsmerge.networks.tokens import compute_group_features
+
+        group_features = compute_group_features(features, merged.members, scene.cameras)
+        heads = StoredHeads(plan.networks, group_features.views, group_features.group)
     return Encoded(
         features=without_members(features),
         division=divide_all(features, merged.members, max_k),

@@ -8,7 +8,6 @@ conjugate-gradient steps do.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from gsmerge.raster.photos import Photos
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Array, Gaussians, as_array
+from gsmerge.types import Gaussians
 
 MAX_RETRIES = 2
 HOLDOUT = 4  # times the share: the last steps see everything, and a small sample misjudges a scene of few views
@@ -62,8 +61,12 @@ def fit_colors(
     """
     train = color_weights(photos, options, seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
-    system = _System(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
-    return fit_offsets(gaussians, system, np.zeros((len(gaussians), 3)), options)
+    system = ColorSystem(drawn, photos, options, train, train, np.ones((len(photos), 3)), precision)
+    offsets, report = solve_colors(system, np.zeros((len(gaussians), 3)), options)
+    if not report.accepted:
+        return gaussians, report
+    sh0 = add_offsets(gaussians.sh0.astype(np.float64), offsets[:, None])
+    return replace(gaussians, sh0=sh0.astype(np.float32)), report
 
 
 def color_weights(photos: Photos, options: FitOptions, seed: int) -> list[np.ndarray]:
@@ -71,36 +74,74 @@ def color_weights(photos: Photos, options: FitOptions, seed: int) -> list[np.nda
     return training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
 
 
-def fit_offsets(gaussians: Gaussians, system: ColorSystem, start: Array, options: FitOptions) -> FitResult:
-    """Solve for colour offsets, starting from ``start [n,3]``, and add them if held-out blocks get better."""
-    offsets, report = solve_colors(system, start, options)
-    if not report.accepted:
-        return gaussians, report
-    sh0 = add_offsets(gaussians.sh0.astype(np.float64), as_array(offsets)[:, None])
-    return replace(gaussians, sh0=sh0.astype(np.float32)), report
+@dataclass(frozen=True, eq=False)
+class ColorSystem:
+    """Least-squares system in the colours of n Gaussians; ``x [n,3]`` are offsets, float64."""
 
+    drawn: Drawn  # The Gaussians against the photos
+    photos: Photos  # V photos
+    options: FitOptions  # The solver's settings
+    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
+    weights: list[np.ndarray]  # [h,w] of the pixels of every view
+    gains: np.ndarray  # [v,3] exposures
+    precision: np.ndarray | float  # [n,1] prior added to the diagonal, by which earlier photos pull offsets to 0; or 0
 
-class ColorSystem(Protocol):
-    """Least-squares system in the colours of n Gaussians, of arrays or tensors; ``x [n,3]`` are offsets, float64."""
+    def _image(self, view: int, x: np.ndarray) -> np.ndarray:
+        return self.drawn.images[view] + apply(self.drawn.views[view], x)
 
-    @property
-    def precision(self) -> Array:
-        """Prior added to the diagonal, ``[n,1]`` or a number; it pulls offsets to 0."""
+    def _images(self, x: np.ndarray) -> list[np.ndarray]:
+        return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
 
-    def score(self, x: Array = None) -> float:
+    def score(self, x: np.ndarray | None = None) -> float:
         """Return the PSNR (dB) of the held-out blocks; None: with the colours before the fit."""
+        images = self.drawn.images if x is None else self._images(x)
+        return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
 
-    def residual(self, x: Array) -> tuple[Array, Array]:
+    def residual(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the diagonal scale ``[n,3]`` and the negative gradient ``[n,3]`` of the data term."""
 
-    def normal(self, x: Array) -> Array:
+        def one_view(view: int) -> np.ndarray:
+            weight, gain = self.weights[view][..., None], self.gains[view].astype(np.float32)
+            residual = weight * (self.photos.images[view] - gain * self._image(view, x))
+            return apply_transposed(self.drawn.views[view], np.concatenate([residual, weight], -1))
+
+        mass, gradient = np.zeros_like(x), np.zeros_like(x)
+        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
+            ids, gain = self.drawn.views[view].ids, self.gains[view]
+            mass[ids] += sums[:, 3:] * gain**2
+            gradient[ids] += sums[:, :3] * gain
+        return mass, gradient
+
+    def normal(self, x: np.ndarray) -> np.ndarray:
         """Return the normal matrix of the data term times ``x``, ``[n,3]``."""
 
-    def reweigh(self, x: Array, *, everywhere: bool = False) -> ColorSystem:
+        def one_view(view: int) -> np.ndarray:
+            matrix = self.drawn.views[view]
+            return apply_transposed(matrix, apply(matrix, x) * self.weights[view][..., None])
+
+        # views are added in their order, so that the threads cannot change the sum
+        total = np.zeros_like(x)
+        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
+            total[self.drawn.views[view].ids] += sums * self.gains[view] ** 2
+        return total
+
+    def reweigh(self, x: np.ndarray, *, everywhere: bool = False) -> ColorSystem:
         """Return the system with Huber weights and exposure gains at ``x``, on training pixels or ``everywhere``."""
+        images, options = self._images(x), self.options
+
+        def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
+            train = self.train[view]
+            base = np.where(train == 0, np.float32(1), train) if everywhere else train
+            error = np.sqrt(((self.photos.images[view] - images[view]) ** 2).mean(-1))
+            robust = base * np.minimum(1, options.tuning.huber / np.maximum(error, 1e-6)).astype(np.float32)
+            return robust, base * (error < 2 * options.tuning.huber)
+
+        weights, calm = zip(*parallel_map(one_view, range(len(self.photos))), strict=True)
+        gains = exposure_gains(images, self.photos.images, calm, options.tuning.min_gain, options.tuning.max_gain)
+        return replace(self, weights=list(weights), gains=gains)
 
 
-def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tuple[Array, FitReport]:
+def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) -> tuple[np.ndarray, FitReport]:
     """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out blocks get worse.
 
     A third of the steps with plain weights; then pixels that still fit badly count less, exposure
@@ -122,7 +163,7 @@ def solve_colors(system: ColorSystem, start: Array, options: FitOptions) -> tupl
     return start, FitReport("none", False, steps, before, after, stopped)
 
 
-def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_weight: float) -> Array:
+def conjugate_gradients(system: ColorSystem, x: np.ndarray, iterations: int, prior_weight: float) -> np.ndarray:
     """Run Jacobi-preconditioned conjugate gradients (Hestenes and Stiefel 1952) from ``x [n,3]`` on.
 
     They minimise sum |gain (prior + W x) - photo|^2 + (prior_weight mass + precision) |x|^2.
@@ -143,68 +184,7 @@ def conjugate_gradients(system: ColorSystem, x: Array, iterations: int, prior_we
     return x
 
 
-def add_offsets(sh0: Array, offsets: Array) -> Array:
+def add_offsets(sh0: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Add offsets to base colours; keep them in [-0.05, 1.05], or no farther outside than before."""
     before = sh0_to_rgb(sh0)
     return rgb_to_sh0((before + offsets).clip(before.clip(None, -0.05), before.clip(1.05)))
-
-
-@dataclass(frozen=True, eq=False)
-class _System:
-    """Colour system of arrays, see :class:`ColorSystem`."""
-
-    drawn: Drawn  # The Gaussians against the photos
-    photos: Photos  # V photos
-    options: FitOptions  # The solver's settings
-    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
-    weights: list[np.ndarray]  # [h,w] of the pixels of every view
-    gains: np.ndarray  # [v,3] exposures
-    precision: np.ndarray | float  # [n,1] diagonal of earlier photos' normal equations; or 0
-
-    def _image(self, view: int, x: np.ndarray) -> np.ndarray:
-        return self.drawn.images[view] + apply(self.drawn.views[view], x)
-
-    def _images(self, x: np.ndarray) -> list[np.ndarray]:
-        return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
-
-    def score(self, x: np.ndarray | None = None) -> float:
-        images = self.drawn.images if x is None else self._images(x)
-        return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
-
-    def residual(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        def one_view(view: int) -> np.ndarray:
-            weight, gain = self.weights[view][..., None], self.gains[view].astype(np.float32)
-            residual = weight * (self.photos.images[view] - gain * self._image(view, x))
-            return apply_transposed(self.drawn.views[view], np.concatenate([residual, weight], -1))
-
-        mass, gradient = np.zeros_like(x), np.zeros_like(x)
-        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
-            ids, gain = self.drawn.views[view].ids, self.gains[view]
-            mass[ids] += sums[:, 3:] * gain**2
-            gradient[ids] += sums[:, :3] * gain
-        return mass, gradient
-
-    def normal(self, x: np.ndarray) -> np.ndarray:
-        def one_view(view: int) -> np.ndarray:
-            matrix = self.drawn.views[view]
-            return apply_transposed(matrix, apply(matrix, x) * self.weights[view][..., None])
-
-        # views are added in their order, so that the threads cannot change the sum
-        total = np.zeros_like(x)
-        for view, sums in enumerate(in_turn(one_view, range(len(self.photos)))):
-            total[self.drawn.views[view].ids] += sums * self.gains[view] ** 2
-        return total
-
-    def reweigh(self, x: np.ndarray, *, everywhere: bool = False) -> _System:
-        images, options = self._images(x), self.options
-
-        def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-            train = self.train[view]
-            base = np.where(train == 0, np.float32(1), train) if everywhere else train
-            error = np.sqrt(((self.photos.images[view] - images[view]) ** 2).mean(-1))
-            robust = base * np.minimum(1, options.tuning.huber / np.maximum(error, 1e-6)).astype(np.float32)
-            return robust, base * (error < 2 * options.tuning.huber)
-
-        weights, calm = zip(*parallel_map(one_view, range(len(self.photos))), strict=True)
-        gains = exposure_gains(images, self.photos.images, calm, options.tuning.min_gain, options.tuning.max_gain)
-        return replace(self, weights=list(weights), gains=gains)

@@ -12,72 +12,70 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.fit.engine import Engine
-from gsmerge.fit.fit_state import gaussians_of, grow_to, start_state
+from gsmerge.fit.fit_state import State, gaussians_of, start_state
+from gsmerge.fit.growth import grow_to
 from gsmerge.fit.report import FitReport, FitResult
-from gsmerge.fit.schedule import GROWTH, PROBE, Schedule, affordable_steps
-from gsmerge.fit.survey import Survey
+from gsmerge.fit.schedule import GROWTH, PROBE, FitPlan, Schedule, affordable_steps
+from gsmerge.fit.scores import score_state
+from gsmerge.fit.steps import make_optimiser
+from gsmerge.fit.survey import Survey, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
+from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
-from gsmerge.types import Array, Gaussians, as_array
+from gsmerge.types import Gaussians
 
 
 def fit_full(
-    gaussians: Gaussians, engine: Engine, survey: Survey | None = None, fixed: np.ndarray | None = None
+    gaussians: Gaussians, plan: FitPlan, survey: Survey | None = None, fixed: np.ndarray | None = None
 ) -> FitResult:
-    """Fit all parameters of Gaussians to the photos of an engine, following the engine's plan.
+    """Fit all parameters of Gaussians to the photos of a plan, following it.
 
     The result is the fitted Gaussians if they beat the start on held-out blocks after the half-size steps, otherwise it
     is the start. The full-size steps then use every block. ``survey``: of the Gaussians, if made already; ``fixed``:
     mask ``[n]`` of Gaussians that stay as they are.
     """
-    plan, start = engine.plan, start_state(gaussians)
     job, options, schedule, tail = plan.job, plan.job.options, Schedule(plan), TailMean()
+    state, optimiser = start_state(gaussians), make_optimiser(plan)
     if fixed is not None:
-        start.fixed[:] = fixed
-    survey = engine.survey(gaussians) if survey is None else survey
-    start.box_shares[:], start.min_sizes[:] = limit_moves(survey, options.tuning)
-    moving = engine.at_poses(job.photos[0].viewmats) if options.move_cameras else engine
-    state, start_score, judged = moving.start(start), survey.score, not options.judged
+        state.fixed[:] = fixed
+    survey = survey_photos(gaussians, plan) if survey is None else survey
+    state.box_shares[:], state.min_sizes[:] = limit_moves(survey, options.tuning)
+    half, start_score, judged = optimiser.photos[1], survey.score, not options.judged
     before = after = start_score
     step, steps, error, grows = 0, options.steps, 0.0, options.grows
-    if options.time_budget is not None:
-        moving.warm_up(state)
     started = time.perf_counter()
     while step < steps:
         part = step / steps
         if part >= plan.half_part and not judged:  # before growth: halves that were never fitted show less
-            (before, after), judged = judge(state, start_score, engine, moving), True
+            (before, after), judged = judge(state, start_score, plan, half), True
             if after <= before:
                 break
         if grows and part >= GROWTH and len(state.x) < job.count:
-            state = grow_state(state, moving)
+            state = grow_to(state, half, job.count)
         drawn = schedule.draw(step + 1, part, len(state.x))
-        error += (moving.step(state, drawn) - error) / min(step + 1, 10)
+        error += (optimiser.step(state, drawn) - error) / min(step + 1, 10)
         step += 1
         outside_view = plan.outside_view(step, part)
         if outside_view is not None:
-            moving.clear_fog(state, drawn, outside_view)
+            optimiser.clear_fog(state, drawn, outside_view)
         if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:
-            float(error)  # waits for a GPU
             steps = affordable_steps(time.perf_counter() - started, plan)
-        if job.progress and (step % moving.read_every == 0 or step == steps):
-            job.progress(step, steps, decibels(float(error)))
+        if job.progress:
+            job.progress(step, steps, decibels(error))
     if not judged:
-        before, after = judge(state, start_score, engine, moving)
+        before, after = judge(state, start_score, plan, half)
     if options.judged and after <= before:
         why = f"held-out parts of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
     if grows and len(state.x) < job.count:  # a time budget may end before the growth
-        state = grow_state(state, moving)
+        state = grow_to(state, half, job.count)
     why = "time budget spent" if options.time_budget is not None else "all steps done"
-    end = moving.read(state)
-    fitted = gaussians_of(as_array(tail.of(state.x)), end.splats.shN)
-    return fitted, FitReport("full", True, step, before, after, why, moving.viewmats, origins=end.origins)
+    fitted = gaussians_of(tail.of(state.x), state.splats.shN)
+    return fitted, FitReport("full", True, step, before, after, why, optimiser.viewmats, origins=state.origins)
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
@@ -94,40 +92,35 @@ def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
     return box_shares, log(rates.min_scale * pixels).astype(np.float32)
 
 
-def judge(state: Array, start_score: float, engine: Engine, moving: Engine) -> tuple[float, float]:
+def judge(state: State, start_score: float, plan: FitPlan, half: Photos) -> tuple[float, float]:
     """Return the PSNR (dB) on held-out blocks that the fit has to beat, and the one that it reached.
 
     The fit has to beat ``start_score``, the score of its start, or a baseline that scores worse: networks learn from
     whole photos, so a fit to the other blocks makes held-out blocks worse even where it makes new views better. The
-    baseline is scored only if the fit does not beat its start, with the cameras of ``engine``, not those that
-    ``moving`` moved.
+    baseline is scored only if the fit does not beat its start, with the cameras of the plan, not those of ``half``,
+    the half-size photos at the poses that the fit moved.
     """
-    after, baseline_start = moving.score(state), engine.plan.job.baseline_start
+    after, baseline_start = score_state(state, plan, half), plan.job.baseline_start
     if baseline_start is None or after > start_score:
         return start_score, after
-    return min(start_score, engine.score(engine.start(start_state(baseline_start)))), after
-
-
-def grow_state(state: Array, engine: Engine) -> Array:
-    """Grow an engine's state to the number of Gaussians that the job asks for."""
-    return engine.start(grow_to(engine.read(state), engine.error_masses, engine.plan.job.count))
+    return min(start_score, score_state(start_state(baseline_start), plan, plan.job.photos[1])), after
 
 
 @dataclass
 class TailMean:
     """Mean of the parameters ``[n,14]`` over the last steps, which are noisy."""
 
-    total: Array = None
+    total: np.ndarray | None = None
     count: int = 0
 
-    def add(self, x: Array) -> None:
+    def add(self, x: np.ndarray) -> None:
         """Add the parameters after a step; start anew if the number of Gaussians has changed."""
         if self.total is None or len(self.total) != len(x):
             self.total, self.count = 0 * x, 0
         self.count += 1
         self.total += x
 
-    def of(self, x: Array) -> Array:
+    def of(self, x: np.ndarray) -> np.ndarray:
         """Return the mean with normalised quaternions; ``x`` itself if no steps with as many Gaussians were added."""
         if self.total is None or len(self.total) != len(x):
             return x

@@ -1,6 +1,6 @@
-"""Steps of the fit on the CPU as few calls: buffers stay, and arguments are checked once.
+"""Steps of the fit as few calls: buffers stay, and arguments are checked once.
 
-The same bits as :meth:`gsmerge.fit.cpu._CpuEngine.step` takes by single calls, which stay for what is not prepared
+The same bits as :meth:`gsmerge.fit.steps.Optimiser.step` takes by single calls, which stay for what is not prepared
 here: cameras that move, Gaussians that are fixed, harmonics, and views in which most Gaussians are hidden.
 """
 

@@ -26,7 +26,6 @@ class FitReport:
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
     # Mean opacity of the result, in [0, 1], seen from outside where the start shows nothing; None: it fills every view
     fog: float | None = None
-    device: str = "cpu"  # Where it ran: `"cpu"` or `"cuda"`
     # [n] row of the start that each Gaussian comes from; None: not known
     origins: np.ndarray | None = field(default=None, compare=False)
 

@@ -1,7 +1,4 @@
-"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes.
-
-An engine does the steps (:class:`gsmerge.fit.engine.Engine`); here is what engines have in common.
-"""
+"""The steps of a full fit: how each draws, which view, background and Gaussians it takes, how far it goes."""
 
 from __future__ import annotations
 
@@ -48,7 +45,7 @@ class FitJob:
     options: FitOptions
     count: int = 0  # Gaussians to grow to, where the run is long enough
     seed: int = 0
-    progress: Progress | None = None  # Called after steps, on a GPU after some of them
+    progress: Progress | None = None  # Called after each step
     baseline_start: Gaussians | None = None  # Another start to beat instead, see gsmerge.fit.full.judge
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
     outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
@@ -142,9 +139,8 @@ class Step:
 class Schedule:
     """Draws the order of views, the backgrounds and the dropped Gaussians of all steps from one seed.
 
-    All engines follow it, so they take the same steps. One generator draws everything, a step's
-    dropout after its background: a generator of its own for dropout would change all results of
-    few views and of long runs.
+    One generator draws everything, a step's dropout after its background: a generator of its own
+    for dropout would change all results of few views and of long runs.
     """
 
     def __init__(self, plan: FitPlan):

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.schedule import FitPlan
+from gsmerge.fit.scores import score_images
 from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
-from gsmerge.types import Array, Gaussians
+from gsmerge.types import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,36 +21,34 @@ class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
     score: float  # PSNR (dB) of the held-out blocks of these pictures
-    inside: Array  # [n] bool, whether some photo's frustum may hold it
-    peaks: Array  # [n] float32 largest blending weight
-    sums: Array  # [n] float64 blending weights summed over all photos, pixels
-    squares: Array  # [n] float64 squares of each photo's sum, summed
-    pixels: Array  # [n] float32 size of the finest pixel that shows it, world units; inf if none does
+    inside: np.ndarray  # [n] bool, whether some photo's frustum may hold it
+    peaks: np.ndarray  # [n] float32 largest blending weight
+    sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
+    squares: np.ndarray  # [n] float64 squares of each photo's sum, summed
+    pixels: np.ndarray  # [n] float32 size of the finest pixel that shows it, world units; inf if none does
 
-    def visible(self, min_weight: float) -> Array:
+    def visible(self, min_weight: float) -> np.ndarray:
         """Return a mask ``[n]`` of Gaussians with a weight of ``min_weight`` in some photo, or outside all frustums."""
         return ~self.inside | (self.peaks >= min_weight)
 
-    def __getitem__(self, rows: Array) -> Survey:
+    def __getitem__(self, rows: np.ndarray) -> Survey:
         columns = {field.name: getattr(self, field.name)[rows] for field in fields(self) if field.name != "score"}
         return Survey(self.score, **columns)
 
 
-def survey_photos(
-    gaussians: Gaussians, photos: Sequence[Photos], score: Callable[[Sequence[np.ndarray]], float]
-) -> Survey:
-    """Draw Gaussians into the half-size photos, ``photos[1]``, and collect what they show of each.
+def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
+    """Draw Gaussians into the half-size photos of a planned fit, and collect what they show of each.
 
-    The other sizes, full size first, tell the size of the finest pixel. ``score``: computes the score of the drawn
-    half-size pictures over black.
+    The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
     """
+    photos = plan.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
-    def one_view(view: int) -> tuple[Array, ...]:
-        plan = plan_view(state.splats, **half.camera(view))
+    def one_view(view: int) -> tuple[np.ndarray, ...]:
+        drawn = plan_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
-        return plan.ids, plan.depths / focal, *survey(plan, colors)
+        return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
     images, inside, peaks = [], np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
@@ -60,7 +59,7 @@ def survey_photos(
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(score(images), inside, peaks, sums, squares, pixels)
+    return Survey(score_images(images, plan, half), inside, peaks, sums, squares, pixels)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:

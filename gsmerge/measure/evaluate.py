@@ -15,11 +15,10 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame, with_row_colors
 from gsmerge.facts.row_colors import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
-from gsmerge.measure.align import PoseChange, fit_colors, refine_pose
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.raster import prepare, render
+from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
 from gsmerge.raster.photos import COVERED, NEAR, WHOLE
 from gsmerge.report import html_table
@@ -67,10 +66,6 @@ class ViewScore:
     # By pixels per side in units of the photo's, where other sizes than 1 were asked for: scores without LPIPS over all
     # pixels, and over those of which the input views have seen every part.
     zooms: Mapping[float, Pair] = field(default_factory=dict)
-    # Of a held-out view, by "color", "pose" or "both" (the camera first): scores after the alignment with the photo,
-    # over all pixels and over those that the input views have seen, which are aligned.
-    aligned: Mapping[str, Pair] = field(default_factory=dict)
-    pose_change: PoseChange | None = None  # how far the camera was moved, where poses were aligned
 
 
 @dataclass(frozen=True)
@@ -84,8 +79,8 @@ class ResultScores:
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
 
-    def mean(self, split: str, *, zoom: float | None = None, align: str | None = None) -> Pair:
-        """Average the scores of a split's views: as they are, at one ``zoom``, or after one alignment ``align``.
+    def mean(self, split: str, *, zoom: float | None = None) -> Pair:
+        """Average the scores of a split's views: as they are, or at one ``zoom``.
 
         Returns the mean over all pixels and the mean over visible pixels.
         """
@@ -93,8 +88,6 @@ class ResultScores:
         pairs = [(score.full, score.masked) for score in views]
         if zoom is not None:
             pairs = [score.zooms[zoom] for score in views if zoom in score.zooms]
-        if align is not None:
-            pairs = [score.aligned[align] for score in views if align in score.aligned]
         return _mean([full for full, _ in pairs]), _mean([masked for _, masked in pairs])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
@@ -102,11 +95,6 @@ class ResultScores:
         views = [score for score in self.scores if score.split == split]
         shares = [score.covered_share for score in views if score.covered_share is not None]
         return float(np.mean(shares)) if shares else None, _mean([score.covered for score in views])
-
-    def mean_pose_change(self, split: str) -> PoseChange | None:
-        """Average the cameras' moves over the views of a split; None if no camera was aligned."""
-        moves = [score.pose_change for score in self.scores if score.split == split and score.pose_change]
-        return PoseChange(*np.mean([(m.degrees, m.shift) for m in moves], axis=0).tolist()) if moves else None
 
 
 @dataclass(frozen=True)
@@ -177,7 +165,6 @@ class _Renderer:
     """Settings that pictures are drawn with."""
 
     near: float  # near plane, world units
-    centre: np.ndarray  # [3] the scene's middle in the world
     options: EvaluateOptions
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -212,7 +199,7 @@ def evaluate(
     ``on_image`` with (result, split, number of the view in it, render ``[h,w,3]`` in [0, 1]) for each picture.
 
     Raises:
-        UsageError: If the scene has no views, a result is called "input", or alignment is asked for without targets.
+        UsageError: If the scene has no views, or a result is called "input".
         GsmergeError: If LPIPS is asked for and its weights are not installed.
 
     Example:
@@ -228,8 +215,6 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
-    if options.align and targets is None:
-        raise UsageError("align: expected held-out views, got none")
     photos, scene = scene, with_row_colors(scene)
     inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
@@ -237,8 +222,7 @@ def evaluate(
         targets = shrink_views(targets, options.photo_side)
     cameras = {name: shrink_cameras(moved.numpy(), options.photo_side) for name, moved in cameras.items()}
     with use_threads(options.threads):
-        frame = scene_frame(scene)
-        renderer = _Renderer(NEAR * frame.unit, frame.origin, options)
+        renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
         reference = PHOTOS if scene is photos else ROW_COLORS
         splits, scores = _splits(scene, reference, inputs, targets, renderer), []
@@ -354,8 +338,6 @@ def _score_result(
             if split.covered is not None or name == INPUT:
                 share, covered = _covered(image, views.images[i], solid if split.covered is None else split.covered[i])
                 score = replace(score, covered_share=share, covered=covered or full)
-            if options.align and kind == "target":
-                score = _align_score(score, gaussians, image, split, i, nets, renderer)
             scores.append(score)
     ratio = len(gaussians) / max(num_input, 1)
     result = ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
@@ -375,32 +357,6 @@ def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, ren
     photo = resize_photo(photo, *size) if drawn is None else renderer.image(drawn, cameras, view)
     image, seen = renderer.image(gaussians, cameras, view), resize_mask(split.visible[view], *size)
     return _both(image, photo, seen, ())
-
-
-def _align_score(
-    score: ViewScore,
-    gaussians: Gaussians,
-    image: np.ndarray,
-    split: _Split,
-    view: int,
-    nets: Sequence[str],
-    renderer: _Renderer,
-) -> ViewScore:
-    """Add to a score those of the render ``image [h,w,3]`` after alignment."""
-    options, cameras = renderer.options, split.views.cameras[[view]]
-    photo, seen = split.views.images[view], split.visible[view]
-    pictures, change = {"plain": image}, None
-    if "pose" in options.align:
-        cameras, change = refine_pose(
-            prepare(gaussians), cameras, photo, seen,
-            centre=renderer.centre, near=renderer.near, antialiased=options.antialiased,
-        )  # fmt: skip
-        pictures["pose"] = renderer.image(gaussians, cameras, 0)
-    if "color" in options.align:
-        after = {"plain": "color", "pose": "both"}
-        pictures |= {after[name]: fit_colors(picture, photo, seen) for name, picture in pictures.items()}
-    aligned = {name: _both(pictures[name], photo, seen, nets) for name in options.alignments}
-    return replace(score, aligned=aligned, pose_change=change)
 
 
 def _both(image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:

@@ -8,7 +8,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from gsmerge.measure.align import PoseChange
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
@@ -36,9 +35,8 @@ def evaluation_document(
 
     ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
     null of the input, means by split, a score for each view), notes. Means and scores have ``zooms`` where other sizes
-    than the photos' own were asked for, those of held-out views ``aligned`` and ``pose_change`` where that was;
-    ``photo_side`` is there where it is not 0, ``antialiased`` where it is true. Keys are only ever added within one
-    schema version.
+    than the photos' own were asked for; ``photo_side`` is there where it is not 0, ``antialiased`` where it is true.
+    Keys are only ever added within one schema version.
     """
     return {
         **document_head(),
@@ -69,7 +67,6 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
                 **_flat((s.full, s.masked)),
                 **_covered(s.covered_share, s.covered),
                 **_zooms(s.zooms),
-                **_aligned(s.aligned, s.pose_change),
             }
             for s in result.scores
         ],
@@ -79,19 +76,11 @@ def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, An
 def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str, Any]:
     options = evaluation.options
     sizes = () if options.zoom == (1,) else options.zoom
-    ways = options.alignments if split == "target" else ()
     return {
         **_flat(result.mean(split)),
         **_covered(*result.mean_covered(split)),
         **_zooms({zoom: result.mean(split, zoom=zoom) for zoom in sizes}),
-        **_aligned({way: result.mean(split, align=way) for way in ways}, result.mean_pose_change(split)),
     }
-
-
-def _aligned(scores: Mapping[str, Pair], change: PoseChange | None) -> dict[str, Any]:
-    """Make ``aligned`` by way, and ``pose_change``, where there are any."""
-    ways = {"aligned": {way: _flat(pair) for way, pair in scores.items()}} if scores else {}
-    return ways | ({"pose_change": asdict(change)} if change else {})
 
 
 def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
@@ -113,8 +102,7 @@ def _flat(pair: Pair) -> dict[str, float | None]:
 def evaluation_csv(document: Mapping[str, Any]) -> str:
     """Write an evaluation as CSV with one row per result and view; cells without a measurement are empty.
 
-    Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured, and such as
-    ``psnr_align_pose``, ``pose_degrees`` and ``pose_shift`` where held-out views were aligned.
+    Columns such as ``psnr_zoom_0.5`` and ``psnr_visible_zoom_0.5`` follow where other sizes were measured.
     """
     rows = []
     for result in document["results"]:
@@ -126,13 +114,11 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten the score of a view: a column for each figure at another size or after alignment."""
-    row = {key: value for key, value in view.items() if key not in ("zooms", "aligned", "pose_change")}
+    """Flatten the score of a view: a column for each figure at another size."""
+    row = {key: value for key, value in view.items() if key != "zooms"}
     for score in view.get("zooms", ()):
         row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
-    for way, score in view.get("aligned", {}).items():
-        row |= {f"{key}_align_{way}": value for key, value in score.items()}
-    return row | {f"pose_{key}": value for key, value in view.get("pose_change", {}).items()}
+    return row
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
@@ -166,17 +152,8 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
         for name, split, mean in means if sizes
     ]  # fmt: skip
     yield (
-        "Held-out views, aligned with their photos",
-        ("", "aligned", *COLUMNS.values(), "cameras moved by (mean)"),
-        [
-            (name, way, *_cells(scores), _move(mean) if way == "pose" else "")
-            for name, _, mean in means
-            for way, scores in mean.get("aligned", {}).items()
-        ],
-    )
-    yield (
         "Render time",
-        ("", "device", "pixels", "ms/frame", "faster by", "earned back after"),
+        ("", "threads", "pixels", "ms/frame", "faster by", "earned back after"),
         [_speed_row(result, speed) for result in results for speed in result.get("speeds", ())],
     )
 
@@ -197,12 +174,11 @@ def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
 
 
 def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
-    threads = f", {speed['threads']} threads" if speed["threads"] else ""
     faster = f"{speed['speedup']:.1f} x" if "speedup" in speed else ""
     frames, merge = speed.get("break_even_frames"), result.get("merge_seconds")
     earned = "" if merge is None else "never" if frames is None else f"{frames:,.0f} frames ({merge:.1f} s of merging)"
     size = f"{speed['width']} x {speed['height']}"
-    return result["name"], speed["device"] + threads, size, f"{1000 * speed['seconds']:.1f}", faster, earned
+    return result["name"], str(speed["threads"]), size, f"{1000 * speed['seconds']:.1f}", faster, earned
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
@@ -213,11 +189,6 @@ def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str
 
 def _number(value: float | None, digits: int = 3) -> str:
     return "" if value is None else f"{value:.{digits}f}"
-
-
-def _move(mean: Mapping[str, Any]) -> str:
-    change = mean["pose_change"]
-    return f"{change['degrees']:.2f} degrees, {100 * change['shift']:.2f} % of the depth"
 
 
 def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:

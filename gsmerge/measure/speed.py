@@ -28,30 +28,24 @@ def measure_costs(
     merge_seconds: Mapping[str, float] | None = None,
     threads: int | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Measure the costs of drawing each scene, also with CUDA where it can be used.
+    """Measure the costs of drawing each scene.
 
     The scenes take turns, so that a machine that slows down slows all of them; the others are compared with the first.
     A few of the ``cameras`` are drawn, at ``zooms`` times their own size. ``near`` is in world units;
     ``merge_seconds`` is the time that making a scene took, where it is known; ``threads`` None: all. Returned are
-    plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by device and zoom: seconds per
+    plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by zoom: seconds per
     view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
     """
-    from gsmerge.fit.gpu import cuda_problem
-
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {
         name: {"overdraw": round(overdraw(gaussians, few, near), 3), "speeds": []} for name, gaussians in scenes.items()
     }
     with use_threads(threads) as used:
-        for device in ("cpu",) if cuda_problem() else ("cpu", "cuda"):
-            on_cpu = device == "cpu"
-            placed = scenes if on_cpu else {name: gaussians.to(device) for name, gaussians in scenes.items()}
-            for zoom in zooms:
-                views = zoom_cameras(few, zoom)
-                head = {"device": device, "width": views.width, "height": views.height}
-                head["threads"] = used if on_cpu else 0
-                for name, seconds in _time_in_turns(placed, views if on_cpu else views.to(device), near).items():
-                    costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
+        for zoom in zooms:
+            views = zoom_cameras(few, zoom)
+            head = {"width": views.width, "height": views.height, "threads": used}
+            for name, seconds in _time_in_turns(scenes, views, near).items():
+                costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
     first, *others = scenes
     for name in others:
         costs[name]["merge_seconds"] = merge = (merge_seconds or {}).get(name)
@@ -79,11 +73,7 @@ def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float)
 def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
     """Measure the seconds that rendering a view takes."""
     start = time.perf_counter()
-    image = render(gaussians, view, near=near).images
-    if not isinstance(image, np.ndarray) and image.is_cuda:
-        import torch
-
-        torch.cuda.synchronize()
+    render(gaussians, view, near=near)
     return time.perf_counter() - start
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
+from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
 from gsmerge.networks.tokens import (
@@ -28,6 +29,7 @@ from gsmerge.networks.tokens import (
     split_tables,
 )
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, concat_columns, concat_rows, like
 
@@ -40,7 +42,7 @@ RunTable = Callable[[np.ndarray, int], Array]  # rows and width of a table -> [r
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkContext:
+class NetworkContext(Corrector):
     """Networks, with the inputs that they read besides Feature Gaussians."""
 
     networks: NetworkWeights | Networks  # encoder, merger, refiner and decoder heads; the modules of training
@@ -52,6 +54,34 @@ class NetworkContext:
     def options(self) -> NetworkOptions:
         """Options of the networks."""
         return self.networks.options
+
+    @property
+    def max_children(self) -> int:
+        """Most Gaussians of a Feature Gaussian that the heads make."""
+        return self.options.max_children
+
+    def encode(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Run the encoder, see :func:`encode_features`."""
+        return encode_features(features, self)
+
+    def decode_for_matching(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Run the head for K = 1, see :func:`match_geometry`."""
+        return match_geometry(features, self)
+
+    def merge(
+        self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
+    ) -> FeatureGaussians:
+        """Run the merger, see :func:`merge_features`."""
+        return merge_features(pooled, parts, order, cuts, self)
+
+    @stage("refine")
+    def refine(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Run the refiner, see :func:`refine_features`."""
+        return refine_features(features, self)
+
+    def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
+        """Run the heads, see :func:`decode_gaussians`."""
+        return decode_gaussians(children, parents, features, self)
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
         """Decode every Feature Gaussian into one Gaussian."""

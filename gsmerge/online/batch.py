@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.networks.corrector import Corrector
 from gsmerge.online.options import OnlineOptions
 from gsmerge.online.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
 from gsmerge.plan import Plan
@@ -24,9 +24,6 @@ from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
-
-if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
 MARGIN = 2.0  # pixels that the rasterizer's low-pass adds to that
@@ -94,7 +91,7 @@ class BatchFeatures:
 
     features: FeatureGaussians
     members: Members  # The batch's Gaussians, which `features.members` are rows of
-    context: NetworkContext | None  # Networks that correct; None without
+    context: Corrector  # What corrects their Gaussians
     networks: StateNetworks | None = None  # What the state keeps of them: None where groups are decoded as they enter
 
 

@@ -17,7 +17,6 @@ from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import Frame
 from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_share
-from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
 from gsmerge.io.formats.table import PLY, count_for_bytes
@@ -66,7 +65,6 @@ def decode_stored(
     options: FitOptions | None = None,
     seed: int = 0,
     threads: int | None = None,
-    device: str = "cpu",
     progress: Progress | None = None,
 ) -> DecodeResult:
     """Decode an encoded scene, or a state, into Gaussians in the world frame; fit them to stored photos, if any.
@@ -94,12 +92,10 @@ def decode_stored(
         images = stored.replay.images.astype(np.float32) / np.float32(255)
         replay = BatchPhotos(images, stored.cameras[stored.replay.views])
         photos = replay.photos(), replay.photos(2)
-        num_pixels = len(photos[0]) * photos[0].height * photos[0].width
-        backend, problem = choose_backend(device, num_pixels)
         with stage("fit"):
             job = FitJob(photos, options, max_count, seed, report_steps)
-            gaussians, report = fit(gaussians, job, backend)
-    notes = *notes, *([] if problem is None else [problem]), *record.notes
+            gaussians, report = fit(gaussians, job)
+    notes = *notes, *record.notes
     if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
         note = "the fit was not accepted: held-out parts of the photos did not get better"
         gaussians = decode_scene(to_encoded(stored), k=k, budget=budget, threads=threads)
@@ -153,7 +149,7 @@ def decode_file(
     with atomic_output(out, overwrite=overwrite) as temporary:
         decoded = decode_stored(
             stored, k=k, budget=count, options=fit_options, seed=settings.seed, threads=settings.threads,
-            device=settings.device, progress=progress,
+            progress=progress,
         )  # fmt: skip
         gaussians, done = decoded.gaussians, perf_counter()
         if size is not None and size.file is not PLY:

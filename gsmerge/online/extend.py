@@ -118,8 +118,8 @@ def _add_batch(
                 new = replace(new, features=take(new.features, novel))
         groups, joined = kind.join(state.groups, rows, new, batch)
         counts |= joined
-    if new.networks is not None and batch.plan.checkpoint is not None:
-        choose(groups=counts["num_new"], clusters=len(groups), networks=batch.plan.checkpoint.facts())
+    if new.networks is not None:
+        choose(groups=counts["num_new"], clusters=len(groups), **batch.plan.network_facts)
     state = replace(_with_views(state, groups, batch), networks=new.networks)
     if batch.prepared.input_scene.images is None:
         return state, counts

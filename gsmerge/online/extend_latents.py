@@ -80,8 +80,7 @@ class StateContext(NetworkContext):
 
 def keeps_latents(plan: Plan) -> bool:
     """Return whether the state keeps latents, which later batches need: where an encoder makes them."""
-    networks = plan.networks[0]
-    return len(plan.networks) == 1 and networks is not None and networks.options.encoder
+    return plan.networks is not None and plan.networks.options.encoder
 
 
 def own_checkpoint(state: OnlineState, options: CompactOptions) -> Checkpoint | None:
@@ -120,7 +119,7 @@ def _same(networks: NetworkWeights, other: NetworkWeights) -> bool:
 def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> BatchFeatures:
     """Encode a batch's superpixels, which stay of one view each."""
     plan, cameras = batch.plan, batch.scene.cameras
-    weights = plan.networks[0]
+    weights = plan.networks
     assert weights is not None
     superpixels = segment_scene(batch.scene, plan.superpixels, count).groups
     members = assign(batch.scene, superpixels, draws=False)
@@ -152,7 +151,7 @@ def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> Batch
 def _first(new: BatchFeatures, batch: Batch) -> GroupSet:
     """Match, merge and refine the Feature Gaussians of a first batch, as for a scene of its views."""
     context = new.context
-    assert context is not None
+    assert isinstance(context, NetworkContext)
     merged = merge(new.features, match(new.features, batch.plan.match, context), context)
     refined = refine(merged, context)
     views = choose_views(refined, context.members, context.cameras)

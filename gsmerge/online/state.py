@@ -14,12 +14,12 @@ from gsmerge.facts.views import resize_cameras
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
+from gsmerge.networks.corrector import Corrector
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
     from gsmerge.networks.tokens import GroupFeatures
     from gsmerge.networks.weights import NetworkWeights
 
@@ -168,17 +168,14 @@ class OnlineState(StoredScene):
         return self.groups.children.sh_degree
 
 
-def bake(features: FeatureGaussians, members: Members, networks: NetworkContext | None, max_k: int) -> GroupSet:
+def bake(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> GroupSet:
     """Decode groups into moments and children, so that gains, latents and decoder heads are no longer needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
         children, parents = divide(features, members, np.full(len(features), max_k))
-    if networks is not None:
-        from gsmerge.networks.apply import decode_gaussians
-
-        ones = decode_gaussians(ones, np.arange(len(features)), features, networks)
-        children = decode_gaussians(children, parents, features, networks)
+    ones = networks.decode(ones, np.arange(len(features)), features)
+    children = networks.decode(children, parents, features)
     return make_groups(decoding_to(ones, features), children, parents)
 
 
@@ -206,8 +203,7 @@ def from_encoded(encoded: Encoded) -> OnlineState:
     cameras = encoded.cameras
     settings = replace(encoded.settings, target_count=None, num_slots=None)
     options = dict(encoded.about.get("options", {}))
-    for name in ("fit", "device"):  # there are no photos to fit to, and this may be another machine
-        options.pop(name, None)
+    options.pop("fit", None)  # there are no photos to fit to
     batch = {"num_views": len(cameras), "num_input": settings.num_input, "num_new": len(encoded)}
     batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": len(encoded)}
     about = {"gsmerge": __version__, "options": options, "batches": [batch]}

@@ -10,15 +10,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from gsmerge.geometry import camera_centres
-from gsmerge.kernels.raster import sh
 from gsmerge.kernels.raster.project import add_rows
-from gsmerge.raster.composite import Rendering, composite, draw_views, prepare_views, view_colors
-from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, plan_gradients, pose_gradient
-from gsmerge.raster.view_plan import Array, Splats, ViewPlan, plan_view
+from gsmerge.raster.composite import Rendering, draw_views, prepare_views, view_colors
+from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, pose_gradient
+from gsmerge.raster.view_plan import Array, ViewPlan, plan_view
 from gsmerge.types import Cameras, Gaussians
-
-Shape = tuple[Tensor, Tensor, Tensor, Tensor]  # means, quaternions, scales, opacities
 
 
 class _Render(torch.autograd.Function):
@@ -69,7 +65,7 @@ class _Render(torch.autograd.Function):
             if moves:
                 poses[view] = pose_gradient(plan, shape, shade)
         gradients = [
-            torch.from_numpy(total).to(tensor.device, tensor.dtype) if needed else None
+            torch.from_numpy(total).to(tensor.dtype) if needed else None
             for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)
         ]
         return None, None, None, None, *gradients
@@ -83,53 +79,3 @@ def render_tensors(
     cameras = replace(cameras, viewmats=cameras.viewmats.detach())
     drawn = _Render.apply(cameras, background, options, with_depths, *tensors)
     return Rendering(drawn[0], drawn[1], drawn[2] if with_depths else None)
-
-
-class _Draw(torch.autograd.Function):
-    """Image of tensors on the CPU, by the kernels."""
-
-    @staticmethod
-    def forward(ctx: Any, camera: dict[str, Any], background: np.ndarray, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        means, quats, scales, opacities, colors = (tensor.detach().contiguous().numpy() for tensor in tensors)
-        unused = np.zeros((len(colors), 0, 3), np.float32)
-        splats = Splats(means, quats, scales, opacities, sh0=unused, shN=unused, origin=np.zeros(3))
-        plan = plan_view(splats, **camera)
-        image, transmittance = composite(plan, colors, background)
-        ctx.plan, ctx.drawn = plan, {"image": image, "transmittance": transmittance, "colors": colors}
-        reached = torch.zeros(len(means), dtype=torch.bool)
-        reached[torch.from_numpy(plan.ids).long()] = True
-        ctx.mark_non_differentiable(reached)
-        return torch.from_numpy(image), reached
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_image: Tensor, _: Any) -> tuple[Any, ...]:
-        gradients = plan_gradients(ctx.plan, grad_image.numpy(), **ctx.drawn)
-
-        def spread(rows: np.ndarray) -> Tensor:
-            every = np.zeros((len(ctx.plan.splats), *rows.shape[1:]), np.float32)
-            every[gradients.ids] = rows
-            return torch.from_numpy(every)
-
-        g = gradients
-        rows = g.means, g.quats, g.scales, g.opacities, g.colors
-        return None, None, *(spread(values) for values in rows)
-
-
-def draw_colored(shape: Shape, colors: Tensor, camera: dict[str, Any], background: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Draw one view from colours, differentiable, on the CPU; on a GPU: :func:`gsmerge.raster.cuda.rasterize`.
-
-    ``shape`` are means ``[n,3]``, quaternions ``[n,4]``, scales ``[n,3]`` and opacities ``[n]``,
-    ``colors [n,3]`` of any sign, all float32. Returns the image ``[h,w,3]``, differentiable in all
-    of them, and a mask ``[n]`` of the Gaussians with a footprint in the view.
-    """
-    return _Draw.apply(camera, background, *shape, colors)
-
-
-def seen_colors(means: Tensor, sh0: Tensor, shN: Tensor, viewmat: np.ndarray) -> Tensor:
-    """Evaluate the colours ``[n,3]`` of spherical harmonics in a view, clipped at 0, without gradient."""
-    eye = camera_centres(viewmat).astype(np.float32)
-    count, arrays = len(means), [tensor.detach().contiguous().numpy() for tensor in (means, sh0, shN)]
-    colors = np.empty((count, 3), np.float32)
-    sh.view_colors(*arrays, np.arange(count, dtype=np.int32), eye, 0, count, colors)
-    return torch.from_numpy(colors)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
-from gsmerge.kernels.raster.project import LN_CUT
 from gsmerge.raster.view_plan import Array, Splats, ViewPlan, pieces, prepare, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
@@ -53,10 +51,10 @@ def blend(plan: ViewPlan, colors: Array, background: Array) -> tuple[Array, Arra
     return image, transmittance
 
 
-def mean_depths(plan: ViewPlan, alphas: Array, least_alpha: float = 0.0) -> Array:
-    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are at most ``least_alpha``."""
+def mean_depths(plan: ViewPlan, alphas: Array) -> Array:
+    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are 0."""
     weighted = blend(plan, np.repeat(plan.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
-    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > least_alpha)
+    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > 0)
 
 
 def composite(plan: ViewPlan, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
@@ -101,21 +99,6 @@ def survey(plan: ViewPlan, colors: Array | None = None) -> tuple[Array, Array, A
     image, totals = np.empty((plan.height, plan.width, 3), np.float32), np.zeros((len(plan.ids), 2), np.float32)
     kernels.survey(*plan.lists, drawn, image, totals)
     return image, totals[:, 0], totals[:, 1]
-
-
-def count_layers(plan: ViewPlan) -> Array:
-    """Count the Gaussians that show in each pixel ``[h,w]`` int32, whatever is in front of them."""
-    layers = np.empty((plan.height, plan.width), np.int32)
-    kernels.count_layers(*plan.lists, layers)
-    return layers
-
-
-def covered_pixels(plan: ViewPlan) -> Array:
-    """Return the area ``[n]`` (pixels) in which each Gaussian shows, inside the image or not; 0 where it does not."""
-    conics, area = plan.conics.astype(np.float64), np.zeros(len(plan.splats))
-    above = np.maximum(conics[:, 5] - LN_CUT, 0)
-    area[plan.ids] = math.pi * above / (conics[:, 2] * np.sqrt(conics[:, 4]))
-    return area
 
 
 def contributions(plan: ViewPlan) -> tuple[Array, Array]:

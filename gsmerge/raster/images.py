@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,24 +21,11 @@ from gsmerge.raster.composite import (
 from gsmerge.raster.photos import NEAR
 from gsmerge.raster.view_plan import ViewPlan, plan_view, prepare
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Array, Cameras, Gaussians, Scene, as_tensor
-
-if TYPE_CHECKING:
-    import torch
+from gsmerge.types import Array, Cameras, Gaussians, Scene, like
 
 ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
 BAND_PIXELS = 1 << 22  # of a picture that are in memory as floating-point numbers; larger ones are drawn in bands
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
-
-
-def one_device(gaussians: Gaussians, cameras: Cameras) -> torch.device | None:
-    """Return the device of all tensors, None for arrays; raise ValueError for several devices."""
-    values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
-    devices = {value.device for value in values if not isinstance(value, np.ndarray)}
-    if len(devices) > 1:
-        named = " and ".join(sorted(map(str, devices)))
-        raise ValueError(f"expected Gaussians and cameras on one device, got {named}; move them with .to(device)")
-    return devices.pop() if devices else None
 
 
 def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
@@ -59,9 +46,8 @@ def render(
 ) -> Rendering:
     """Render Gaussians into every camera.
 
-    Arrays give arrays, tensors give tensors. CUDA tensors are rendered by gsplat (``pip install
-    ".[cuda]"``), and the results are on their device; all others on the CPU. How the two differ:
-    :mod:`gsmerge.raster.cuda`.
+    Arrays give arrays, tensors give tensors. The CPU renders: tensors on a GPU are copied to it, and
+    the results, and gradients, back to where the Gaussians are.
 
     Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians
     and the view matrices, where autograd is on and one of them asks for it; depths and intrinsics
@@ -80,8 +66,7 @@ def render(
         Images, alphas and, if asked for, depths.
 
     Raises:
-        ValueError: If the background or the depth range makes no sense, or the tensors are on several devices.
-        GsmergeError: If CUDA tensors are given and gsplat is not installed.
+        ValueError: If the background or the depth range makes no sense.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -90,22 +75,20 @@ def render(
     """
     under = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
-    device = one_device(gaussians, cameras)
-    if device is not None:  # torch is imported only for those who have tensors
-        gaussians, cameras = gaussians.to(device), cameras.to(device)
-        if device.type == "cuda":
-            from gsmerge.raster.cuda import render_cuda
+    values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
+    tensors = [value for value in values if not isinstance(value, np.ndarray)]
+    if tensors:  # torch is imported only for those who have tensors
+        gaussians, cameras = gaussians.to("cpu"), cameras.to("cpu")
+    if tensors and _needs_gradient(gaussians, cameras):
+        from gsmerge.raster.autograd import render_tensors  # only for those who train
 
-            return render_cuda(gaussians, cameras, under, with_depths=with_depths, **options)
-        if _needs_gradient(gaussians, cameras):
-            from gsmerge.raster.autograd import render_tensors  # only for those who train
-
-            return render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
-    plan_one = _planner(gaussians, cameras, options)
-    drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
-    if device is None:
+        drawn = render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
+    else:
+        plan_one = _planner(gaussians, cameras, options)
+        drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+    if not tensors:
         return drawn
-    return Rendering(*(None if part is None else as_tensor(part) for part in vars(drawn).values()))
+    return Rendering(*(None if part is None else like(part, tensors[0]) for part in vars(drawn).values()))
 
 
 def render_in_turn(

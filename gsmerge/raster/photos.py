@@ -200,12 +200,12 @@ def score_photos(
         return scored_tiles(view, photos.width, photos.height) if quarter else None
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> ViewScore:
-        return score_view(image, masks.get(view, transmittance < COVERED), photos, view, quarter=quarter)
+        return _score_view(image, masks.get(view, transmittance < COVERED), photos, view, quarter=quarter)
 
-    return mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
+    return _mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
 
 
-def mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
+def _mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
     """Average the scores of views."""
     inside = [score.covered_psnr for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
@@ -213,7 +213,7 @@ def mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
     return PhotoScore(mean, float(np.mean(inside)) if inside else math.nan, share, tuple(s.covered for s in scores))
 
 
-def score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> ViewScore:
+def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> ViewScore:
     """Score a render ``[h,w,3]``, clipped in place, also over ``covered [h,w]``; see :func:`score_photos`."""
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]

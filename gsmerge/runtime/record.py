@@ -17,10 +17,10 @@ from gsmerge.runtime.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
 # stages that leave much behind that was freed in other threads
-RELEASED = ("prepare", "segment", "encode", "match", "refine", "choose", "fit")
+RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "choose", "earlier", "join", "fit", "score", "overdraw", "input",
+    "cover", "decode", "join", "fit", "score", "input",
 )  # fmt: skip
 
 

@@ -14,23 +14,8 @@ from gsmerge.settings.setting import Settings, setting
 
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
 AUTO = "auto"
-
-
-@dataclass(frozen=True)
-class Device:
-    """What a device draws fluidly; docs/guide/how-many.md says where the numbers come from."""
-
-    count: int  # most Gaussians
-    overdraw: float = math.inf  # of a pixel, mean: Gaussians that show there, hidden ones as well
-    crowded: float = math.inf  # of the pixel that 95 % of all do not exceed
-    side: int = 1760  # pixels of the longer side of a picture
-
-
-DEVICES = {
-    "quest3": Device(400_000, 40, 80, 1760),
-    "mobile": Device(1_000_000, 60, 120, 2400),
-    "desktop": Device(3_000_000),
-}
+# Gaussians that a device draws fluidly; docs/guide/how-many.md says where the numbers come from
+DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 
 
 @dataclass(frozen=True)
@@ -40,8 +25,7 @@ class BudgetOptions(Settings):
     budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
         "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
         "scene needs.",
-        "In one piece quest3 and mobile limit overdraw as well. A size is that of the output's file, a `.ply` in "
-        "Python, and never exceeded.",
+        "A size is that of the output's file, a `.ply` in Python, and never exceeded.",
         metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
         "lose at most so much against the best, such as -0.2dB.",

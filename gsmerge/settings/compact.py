@@ -65,22 +65,17 @@ class CompactOptions(Settings):
         "of Gaussians has to be settled beforehand.", choices=method_names, metavar="NAME")  # fmt: skip
     effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
-    device: str = setting("cpu", "Where the fit and the scores run; cuda needs gsmerge[cuda]. auto: a GPU where there "
-        "is one and the scene is large enough.",
-        "`cuda` draws with gsplat, whose sums have no fixed order, so that runs differ in the last bits.",
-        choices=("cpu", "cuda", "auto"))  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped ones where they improve the result.",
         "`shipped`: those that come with the package; `paper`: those with absolute outputs; `none`: the analytic "
-        "stages alone. `auto`: the shipped ones where no fit follows or a short one, unless the analytic start shows "
-        "the views better; of these, a draft or a fast run without a fit takes the decoder heads alone, one with a fit "
-        "none.", metavar="FILE|NAME")  # fmt: skip
+        "stages alone. `auto`: the shipped ones where no fit follows, of which a draft or a fast run takes the decoder "
+        "heads alone.", metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
         "analytic stages.")  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
-        "Everything random depends on it alone; on the CPU, runs with one seed are bit-identical.",
+        "Everything random depends on it alone; runs with one seed are bit-identical.",
         least=0)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
         shown="all processors")  # fmt: skip

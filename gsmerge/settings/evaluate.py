@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 NETS = ("vgg", "alex")
-ALIGNMENTS = ("color", "pose")
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
 
 
@@ -36,16 +35,5 @@ class EvaluateOptions(Settings):
     antialiased: bool = setting(False, "Lower the opacity of small Gaussians by what the low-pass adds to them, as "
         "some viewers do (Mip-Splatting).",
         "See `antialiased` of `gsmerge.render`.")  # fmt: skip
-    align: tuple[str, ...] = setting((), "Also score held-out views after alignment with their photos: of the renders' "
-        "colours (color), of the cameras (pose), or both (color,pose).",
-        "`color`: the affine map of the render's colours that brings it closest to the photo; `pose`: the camera moved "
-        "to where the render is closest; with both also after one and then the other.", choices=ALIGNMENTS, unique=True,
-        metavar="LIST")  # fmt: skip
     fog: bool = setting(True, "Also measure fog and holes of the results, which the scene's Gaussians are drawn twelve "
         "more times for.")  # fmt: skip
-
-    @property
-    def alignments(self) -> tuple[str, ...]:
-        """Names of the aligned scores to compute: of "color", "pose", and "both" if both are asked for."""
-        chosen = tuple(name for name in ALIGNMENTS if name in self.align)
-        return (*chosen, "both") if chosen == ALIGNMENTS else chosen

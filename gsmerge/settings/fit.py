@@ -13,7 +13,6 @@ STEPS = 320  # of the full fit
 LONG_STEPS = 600  # from here on a little dropout pays
 USUAL_SHARE = 0.044  # of Gaussians in the pixels, which half-size photos show well
 HASTY_STEPS = 20  # shorter runs have no time for full-size photos
-CONTINUED_STEPS, CONTINUED_HALF, CONTINUED_RATE = 0.5, 0.15, 0.7  # of runs from a fitted start, see FitOptions
 GROW_STEPS = 150  # shorter runs do better when they begin with all that they may have
 
 
@@ -102,11 +101,6 @@ class FitOptions(Settings):
     def steps(self) -> int:
         """Number of steps of the full fit."""
         return STEPS if self.fit_steps is None else self.fit_steps
-
-    def continued(self) -> FitOptions:
-        """Return the options of a run that starts from an earlier result: half the steps, which are smaller."""
-        steps, tuning = max(1, round(CONTINUED_STEPS * self.steps)), self.tuning.scaled(CONTINUED_RATE)
-        return replace(self, fit_steps=steps, half_res_share=CONTINUED_HALF, judged=False, tuning=tuning)
 
     @property
     def half_res_part(self) -> float:

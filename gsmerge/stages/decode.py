@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
+from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import MAX_CHILDREN, MIXED, MIXED_COUNTS, DecodeOptions
+from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Scene, as_array
-
-if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
 
 GROUPS_PER_TASK = 8192
 REFILLS = 3  # times that Gaussians too faint to be seen are replaced by others, of which a few are faint again
@@ -31,7 +28,7 @@ def decode(
     members: Members,
     options: DecodeOptions,
     counts: np.ndarray | None = None,
-    networks: NetworkContext | None = None,
+    networks: Corrector = ANALYTIC,
 ) -> Gaussians:
     """Decode each Feature Gaussian into K Gaussians, fewer where its members are alike.
 
@@ -45,10 +42,7 @@ def decode(
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
     gaussians, parents = divide(features, members, counts)
-    if networks is not None:
-        from gsmerge.networks.apply import decode_gaussians
-
-        gaussians = decode_gaussians(gaussians, parents, features, networks)
+    gaussians = networks.decode(gaussians, parents, features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
@@ -69,19 +63,15 @@ def decode_merged(merged: MergedViews, scene: Scene, options: DecodeOptions, *, 
         gaussians = _decode_count(merged, scene, merged_count(merged, options, grows=grows), options)
         if asked.exact and len(gaussians) > asked.count:  # K each would be more than the fit may grow to
             gaussians = _decode_count(merged, scene, asked.count, options)
-    start = None if merged.unlearned is None else feature_to_gaussians(merged.unlearned)
-    return Decoded(gaussians, asked.count, asked.exact, start)
+    return Decoded(gaussians, asked.count, asked.exact)
 
 
 def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` Gaussians where they lower distortion most; None: K of each Feature Gaussian."""
-    if count is None and options.max_k == 1 and merged.k1_gaussians is not None:
-        return merged.k1_gaussians
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
-        most = MAX_CHILDREN if networks is None else networks.options.max_children
-        children = split_counts(features, members, max(0, count - len(features)), most)
+        children = split_counts(features, members, max(0, count - len(features)), networks.max_children)
     elif options.k == MIXED:
         children = mixed_counts(features, members, scene_saliency(scene_pictures(scene)), options)
     return decode(features, members, options, children, networks=networks)
@@ -90,10 +80,9 @@ def _decode_count(merged: MergedViews, scene: Scene, count: int | None, options:
 def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
     """Decode ``count`` visible Gaussians where they lower distortion most."""
     features, members, networks = merged.features, merged.members, merged.networks
-    most = MAX_CHILDREN if networks is None else networks.options.max_children
     every = replace(options, min_opacity=0.0)
     return deal_visible(
-        deal_order(features, members, most),
+        deal_order(features, members, networks.max_children),
         len(features),
         count,
         options.min_opacity,

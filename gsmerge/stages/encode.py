@@ -12,14 +12,15 @@ import numpy as np
 
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.moments import Members, Moments, Rule, pool_members, scene_members
+from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.runtime.record import choose, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
 if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
     from gsmerge.networks.weights import NetworkWeights
+    from gsmerge.research.training.modules import Networks
 
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
 # surface, and those of which fewer views have it there than see through it
@@ -30,12 +31,12 @@ SAMPLES = 65536  # pixels whose depths are compared
 MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.18, 0.38
 
 
-def make_context(
-    networks: NetworkWeights | None, members: Members, cameras: Cameras, seed: int
-) -> NetworkContext | None:
-    """Bundle networks with the facts about a scene that they read; None without networks."""
+def make_corrector(
+    networks: NetworkWeights | Networks | None, members: Members, cameras: Cameras, seed: int
+) -> Corrector:
+    """Bundle networks with the facts about a scene that they read; without networks nothing is corrected."""
     if networks is None:
-        return None
+        return ANALYTIC
     from gsmerge.networks.apply import NetworkContext
 
     return NetworkContext(networks, members, cameras, seed)
@@ -54,18 +55,14 @@ def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth")
 
 @stage("encode")
 def correct(
-    features: FeatureGaussians, members: Members, cameras: Cameras, networks: NetworkContext | None, *, weaken: bool
+    features: FeatureGaussians, members: Members, cameras: Cameras, networks: Corrector, *, weaken: bool
 ) -> FeatureGaussians:
-    """Correct pooled Feature Gaussians with the encoder network, which also adds latents.
+    """Correct pooled Feature Gaussians with the encoder network, if any, which also adds latents.
 
-    ``weaken``: without networks, lower the optical depth of groups that other views see through. A long fit closes the
-    holes that this leaves.
+    ``weaken``: lower the optical depth of groups that other views see through. A long fit closes the holes that this
+    leaves.
     """
-    if networks is None:
-        return weaken_contradicted(features, members, cameras) if weaken else features
-    from gsmerge.networks.apply import encode_features
-
-    return encode_features(features, networks)
+    return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
 
 
 def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
+from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 
-if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
-
 
 @stage("match")
-def match(features: FeatureGaussians, options: MatchOptions, networks: NetworkContext | None = None) -> Matches:
+def match(features: FeatureGaussians, options: MatchOptions, networks: Corrector = ANALYTIC) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
     The result does not depend on the order of the Feature Gaussians: leaders are taken by weight,
     ties by position. Fully transparent Feature Gaussians stay alone.
     """
-    if networks is not None and options.geometry == "decoded" and options.match != "none":
-        from gsmerge.networks.apply import match_geometry
-
-        features = match_geometry(features, networks)
+    if options.geometry == "decoded" and options.match != "none":
+        features = networks.decode_for_matching(features)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0

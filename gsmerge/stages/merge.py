@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.moments import Members
+from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.runtime.record import stage
-from gsmerge.types import Array, FeatureGaussians, Gaussians, Matches, Segmentation, as_tensor, to_float32
-
-if TYPE_CHECKING:
-    from gsmerge.networks.apply import NetworkContext
+from gsmerge.types import Array, FeatureGaussians, Matches, Segmentation, as_tensor, to_float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,13 +20,11 @@ class MergedViews:
     members: Members  # The scene's Gaussians, indexed by `features.members`
     segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
     num_groups: int  # Superpixels with Gaussians, before merging
-    networks: NetworkContext | None = None  # Networks that correct; None without
-    unlearned: FeatureGaussians | None = None  # The same without networks, for comparison
-    k1_gaussians: Gaussians | None = None  # Their Gaussians at K = 1, if known already
+    networks: Corrector = ANALYTIC  # What corrects the Gaussians that they are decoded into
 
 
 @stage("match")
-def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext | None = None) -> FeatureGaussians:
+def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = ANALYTIC) -> FeatureGaussians:
     """Pool each cluster into one Feature Gaussian; members that are alone in their cluster come first, unchanged.
 
     Members are weighted with their opacities times what the photos say of them (gains); masses and
@@ -40,22 +35,13 @@ def merge(features: FeatureGaussians, matches: Matches, networks: NetworkContext
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return features
-    pooled = pool_runs(features, order, cuts)
-    if networks is not None:
-        from gsmerge.networks.apply import merge_features
-
-        pooled = merge_features(pooled, features, order, cuts, networks)
+    pooled = networks.merge(pool_runs(features, order, cuts), features, order, cuts)
     return FeatureGaussians.concat([take(features, alone), pooled])
 
 
-def refine(features: FeatureGaussians, networks: NetworkContext | None) -> FeatureGaussians:
-    """Apply the refiner's corrections (paper section 4.5); do nothing without networks."""
-    if networks is None:
-        return features
-    from gsmerge.networks.apply import refine_features
-
-    with stage("refine"):
-        return refine_features(features, networks)
+def refine(features: FeatureGaussians, networks: Corrector) -> FeatureGaussians:
+    """Apply the refiner's corrections, if there is one (paper section 4.5)."""
+    return networks.refine(features)
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -40,7 +40,7 @@ def test_public_functions_are_typed(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "parameters"),
     [
-        ("compact", ["scene", "options", "progress", "earlier", "settings"]),
+        ("compact", ["scene", "options", "progress", "settings"]),
         ("superpixels", ["image", "count", "segmentation"]),
         ("render", ["gaussians", "cameras", "background"]),
         ("Gaussians", ["means", "quats", "scales", "opacities", "sh0", "shN"]),

@@ -20,7 +20,6 @@ import tomllib
 import gsmerge
 from gsmerge.io.formats import spz, usd
 from gsmerge.kernels.build import find_platform
-from gsmerge.raster.cuda import INSTALL
 from gsmerge.research.charts import INSTALL_HINT
 
 pytest.importorskip("setuptools", minversion="77")
@@ -108,8 +107,8 @@ def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
 
 def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str, Any]) -> None:
     extras = project["optional-dependencies"]
-    hints = [INSTALL, INSTALL_HINT, spz.INSTALL, usd.INSTALL]
-    assert [f'pip install "{extras[name][0]}"' for name in ("cuda", "chart", "spz4", "usd")] == hints
+    hints = [INSTALL_HINT, spz.INSTALL, usd.INSTALL]
+    assert [f'pip install "{extras[name][0]}"' for name in ("chart", "spz4", "usd")] == hints
     assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "runtime" / "work.py").read_text()
     pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
     assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []

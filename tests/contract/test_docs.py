@@ -207,7 +207,6 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "report",
         "save-cameras",
         "strict",
-        "earlier",
         "embed-cameras",
         "engine",
         "address",

@@ -39,8 +39,8 @@ def test_no_stage_knows_the_options_of_another() -> None:
 
 
 def test_only_the_plan_reads_what_is_left_to_it() -> None:
-    """Effort, device, recipe and checkpoint names."""
-    open_choices = {"effort", "device", "recipe", "checkpoint"}
+    """Effort, recipe and checkpoint names."""
+    open_choices = {"effort", "recipe", "checkpoint"}
     for path in sorted(path for room in ("facts", "stages", "fit") for path in (PACKAGE / room).rglob("*.py")):
         read = {
             node.attr

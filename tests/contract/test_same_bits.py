@@ -26,12 +26,10 @@ REFUSED = {
     *(f"np.linalg.{name}" for name in LINEAR.split()),
     *(f"cv2.{name}" for name in OPENCV.split()),
 }
-# What computes no result: a GPU's arithmetic, pages and pictures for people, research.
+# What computes no result: pages and pictures for people, research.
 OTHERS = (
-    "fit/gpu/",
     "view/",
     "research/",
-    "raster/cuda.py",
     "measure/lpips.py",
     "measure/preview.py",
     "networks/tensors.py",

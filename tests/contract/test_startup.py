@@ -56,13 +56,9 @@ def test_import_loads_nothing_heavy() -> None:
     "settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join
 )
 def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
-    """Which take longer to load than a small scene takes to merge.
-
-    The scene counts as a large one, for which a GPU would be taken.
-    """
+    """Which take longer to load than a small scene takes to merge."""
     arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply"), *settings]
-    large = "import gsmerge.fit.gpu\ngsmerge.fit.gpu.MIN_PIXELS, gsmerge.fit.gpu.has_driver = 0, lambda: False\n"
-    code = f"{large}from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
+    code = f"from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
     modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
     assert modules.isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
@@ -77,12 +73,6 @@ def test_compacting_needs_neither_torch_nor_scipy(settings: list[str], made_scen
         arguments = ["compact", str(made_scene), "-o", str(output), *settings]
         run_python(f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0")
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
-
-
-def test_naming_a_device_loads_no_torch() -> None:
-    """Whether there is a GPU is asked when it is to be used."""
-    code = "from gsmerge import CompactOptions\nCompactOptions().with_settings({'device': 'cuda'})"
-    assert "torch" not in loaded_after(code)
 
 
 def test_submodule_imports_do_not_hide_functions() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import errno
 import itertools
-import json
 import os
 import shutil
 import signal
@@ -18,11 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from messages import ERROR, noted, says
+from messages import ERROR, says
 
 import gsmerge
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
-from gsmerge.fit import gpu
 from gsmerge.io import write_gaussians
 
 from .conftest import Run, assert_refused, listing
@@ -131,21 +129,6 @@ def test_failures_while_writing_leave_nothing(
     assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
     assert "No space" in outcome.err
     assert listing(scene_copy) == before
-
-
-def test_gpu_that_is_not_there_is_noted(
-    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The CPU does the work; where CUDA was asked for a note says why, before the work, too."""
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    monkeypatch.setattr(gpu, "cuda_problem", gpu.cuda_problem.__wrapped__)
-    for device, is_noted in (("cuda", True), ("auto", False)):
-        plan = run("compact", scene_copy, "--device", device, "--dry-run", "--json", code=0)
-        assert json.loads(plan.out)["options"]["device"] == "cpu"
-        assert noted(json.loads(plan.out)["notes"], "CPU", "torch", "CUDA") == is_noted
-    call = ("compact", scene_copy, "-o", tmp_path / "a.ply", "--device", "cuda", "--effort", "draft", "--json")
-    outcome = run(*call, code=0)
-    assert noted(json.loads(outcome.out)["notes"], "CPU", "torch", "CUDA")
 
 
 @pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])

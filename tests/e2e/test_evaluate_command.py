@@ -8,11 +8,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import pytest
 from bare_files import write_without_grid
 from messages import ERROR, says
-from tiny_scene import edited_json
 
 from .conftest import Run
 
@@ -65,22 +63,6 @@ def test_photos_of_a_given_size(scene_copy: Path, small: Path, run: Run) -> None
     assert "photo_side" not in usual
     means = [one["results"][1]["mean"] for one in (document, usual, as_they_are)]
     assert means[1] == means[2] != means[0]
-
-
-def test_alignment(scene_copy: Path, run: Run) -> None:
-    """Of held-out photos taken with another exposure and from a place that is not quite theirs."""
-    targets = scene_copy / "targets" / "transforms.json"
-    with edited_json(targets) as document:
-        for frame in document["frames"]:
-            frame["transform_matrix"][0][3] += 0.03
-            photo = targets.parent / frame["file_path"]
-            cv2.imwrite(str(photo), cv2.convertScaleAbs(cv2.imread(str(photo)), alpha=0.7, beta=10))
-    call = ("evaluate", scene_copy, "--targets", targets, "--no-context", "--lpips", "none", "--align", "color,pose")
-    mean = json.loads(run(*call, "--json").out)["results"][0]["mean"]["target"]
-    aligned = {name: scores["psnr_visible"] for name, scores in mean["aligned"].items()}
-    assert mean["psnr_visible"] + 2 < aligned["color"] < aligned["both"]
-    assert mean["pose_change"]["shift"] > 0
-    assert "moved" in run(*call).out
 
 
 def test_agrees_with_the_measuring_example(scene_copy: Path, small: Path, run: Run, target_psnr) -> None:

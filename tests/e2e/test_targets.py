@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import scenes
@@ -14,7 +13,7 @@ from messages import noted
 
 from gsmerge import Scene, compact, read_ply
 from gsmerge.errors import UsageError
-from gsmerge.settings.budget import DEVICES, Device
+from gsmerge.settings.budget import DEVICES
 
 from .conftest import Run
 
@@ -92,34 +91,8 @@ def test_auto_without_a_fit_reports_its_curve(made_scene: Path, tmp_path: Path, 
 
 def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scenes.identical(compact(scene, fit="none", budget="quest3").gaussians, compact(scene, fit="none").gaussians)
-    monkeypatch.setitem(DEVICES, "quest3", Device(200))
+    monkeypatch.setitem(DEVICES, "quest3", 200)
     assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 200
-
-
-@pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit_steps": 12}], ids=["no-fit", "fit"])
-def test_a_device_limits_overdraw(settings: dict[str, Any], scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both limits are met with fewer Gaussians, and the report has both; one that is met already changes nothing."""
-    free = compact(scene, **settings)
-    monkeypatch.setitem(DEVICES, "quest3", Device(10**6, 1000, 1000))
-    wide = compact(scene, **settings, budget="quest3")
-    assert scenes.identical(wide.gaussians, free.gaussians)
-    before = wide.report.choices["overdraw"]["after"]
-    mean = max(kind["mean"] for kind in before.values())
-    monkeypatch.setitem(DEVICES, "quest3", Device(10**6, 0.75 * mean, 1000))
-    result = compact(scene, **settings, budget="quest3")
-    overdraw = result.report.choices["overdraw"]
-    assert overdraw["limit"] == {"num_gaussians": 10**6, "mean": 0.75 * mean, "crowded": 1000}
-    assert overdraw["met"]
-    assert overdraw["before"] == before
-    assert 0.6 * mean < max(kind["mean"] for kind in overdraw["after"].values()) <= 0.75 * mean
-    assert len(result.gaussians) < len(free.gaussians)
-
-
-def test_overdraw_that_cannot_be_met_is_said(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(DEVICES, "mobile", Device(10**6, 1e-6, 1e-6))
-    result = compact(scene, fit="none", budget="mobile")
-    assert not result.report.choices["overdraw"]["met"]
-    assert noted(result.report.notes, "overdraw", "1e-06")
 
 
 @pytest.mark.parametrize("settings", [{"quality": "-0.2dB"}, {"quality": "30dB"}])

@@ -106,7 +106,6 @@ USAGE = {
     "evaluate room --lpips none -o room/transforms.json": "room/transforms.json*input*--output",
     "evaluate room --lpips none --merge-seconds 1": "--merge-seconds*0 AFTER*1",
     "evaluate room alone.ply --lpips none --merge-seconds run.json -o run.json --overwrite": "run.json*input*--output",
-    "evaluate room --lpips none --align=color": "--align*held-out*--targets",
     "evaluate room --lpips none --zoom=a,2": "--zoom*.5,1,2,4*'a,2'",
     "evaluate room --lpips none --zoom=0": "zoom*0.0625 to 16*0.0",
     "evaluate room --lpips none --photo-side -1": "--photo-side*0",

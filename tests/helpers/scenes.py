@@ -18,9 +18,8 @@ from floors import nudged
 from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactReport, CompactResult
 from gsmerge.facts.views import subset
-from gsmerge.fit import ON_CPU, FitBackend, FitJob, FitOptions
-from gsmerge.fit.engine import Engine
-from gsmerge.fit.schedule import plan_run
+from gsmerge.fit import FitJob, FitOptions
+from gsmerge.fit.schedule import FitPlan, plan_run
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
@@ -279,11 +278,9 @@ def tuned(options: FitOptions, **constants: float) -> FitOptions:
     return replace(options, tuning=replace(options.tuning, **constants))  # type: ignore[arg-type]
 
 
-def engine_for(
-    photos: tuple[Photos, ...], options: FitOptions, count: int = 0, *, backend: FitBackend = ON_CPU, **job: Any
-) -> Engine:
-    """The engine of a fit to photos; ``job``: more of it."""
-    return backend.make_engine(plan_run(FitJob(photos, options, count, **job)))
+def plan_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **job: Any) -> FitPlan:
+    """The plan of a fit to photos; ``job``: more of it."""
+    return plan_run(FitJob(photos, options, count, **job))
 
 
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:

@@ -27,7 +27,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
         "seconds": {"segment": 1.0, "encode": 0.5},
         "psnr_before": 20.0,
         "psnr_after": 24.5,
-        "choices": {"scored_views": 4, "start_scores": {"analytic": float("inf")}},
+        "choices": {"scored_views": 4, "agreement": {"share": float("inf")}},
         "notes": ["a note"],
         "options": CompactOptions(seed=5).to_dict(),
         "peak_memory_bytes": 10**9,
@@ -43,7 +43,7 @@ def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
 
 def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
     document = json.loads(report.to_json(make_document(files)))
-    assert document["choices"]["start_scores"]["analytic"] is None  # infinity is no JSON
+    assert document["choices"]["agreement"]["share"] is None  # infinity is no JSON
     assert document["input"]["sha256"] == hashlib.sha256(b"x" * 2_500_000).hexdigest()
     assert document["ratio"] == 0.025
     assert list(document["seconds"]) == ["read", "segment", "encode", "write"]
@@ -80,22 +80,6 @@ def test_result_table(files: tuple[Path, Path]) -> None:
     assert max(map(len, table[1:])) <= 80
     short = report.result_table(make_document(files, psnr_before=None, psnr_after=None))
     assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
-
-
-def test_overdraw_stands_beside_its_limit(files: tuple[Path, Path]) -> None:
-    """Of the kinds of pictures the worst, before and after."""
-    outside = {"mean": 9, "crowded": 70}
-    before, after = (
-        {"views": {"mean": mean, "crowded": crowded}, "outside": outside} for mean, crowded in ((50, 90), (39, 60))
-    )
-    drawn = {"before": before, "after": after, "limit": {"num_gaussians": 9000, "mean": 40, "crowded": 80}, "met": True}
-    document = make_document(files)
-    document["choices"] = {**document["choices"], "overdraw": drawn}
-    assert "; at most 9,000 Gaussians; overdraw 39.0 of 40, 95 %: 70 of 80; " in report.summary_line(document)
-    line, limit = report.result_table(document)[4:6]
-    assert limit.split() == ["limit", "9,000", "Gaussians"]
-    assert line.split() == ["overdraw", "50.0", "39.0", "at", "most", "40;", "95", "%:", "70,", "at", "most", "80"]
-    assert len(line) <= 80
 
 
 def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:

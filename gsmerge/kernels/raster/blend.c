@@ -218,34 +218,6 @@ API int32_t contributions(const float *restrict conics, const int32_t *restrict 
   return 0;
 }
 
-// Count the Gaussians that show in each pixel, those behind opaque ones as well: a GPU that blends them draws them all.
-API int32_t count_layers(const float *restrict conics, const int32_t *restrict flatten_ids,
-                         const int64_t *restrict isect_offsets, int64_t tile_width, int32_t *restrict layers, int64_t m,
-                         int64_t n, int64_t ends, int64_t h, int64_t w) {
-  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
-  if (!lists_are_sound(&lists, 0, ends - 1)) return OUTSIDE;
-  float state[PLANE] __attribute__((aligned(64)));
-  Batch batch;
-  clear_batch(&batch);
-  for (int64_t tile = 0; tile < ends - 1; tile++) {
-    Tile t = open_tile(state, 1, tile, tile_width, h, w);
-    v16i counts[TILE] = {{0}};
-    int64_t end = isect_offsets[tile + 1];
-    for (int64_t start = isect_offsets[tile]; start < end; start += BATCH) {
-      int64_t stop = mini(end, start + BATCH);
-      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
-      for (int64_t j = 0; j < stop - start; j++) {
-        Curve curve = curve_of(&batch, (int)j);
-        for (int32_t y = first_row(&t, &batch, j); y <= last_row(&t, &batch, j); y++)
-          counts[y] -= exponents(&curve, (float)y - curve.my) >= LN_CUT;  // lanes that hold are -1
-      }
-    }
-    for (int32_t y = 0; y < t.num_y; y++)
-      for (int32_t x = 0; x < t.num_x; x++) layers[(t.top + y) * w + t.left + x] = counts[y][x];
-  }
-  return 0;
-}
-
 // The part of one tile in which each Gaussian of a list shows, as the walks take it: first and last row, first column.
 API int32_t parts_of_tile(const float *conics, const int32_t *flatten_ids, int64_t left, int64_t top, int32_t *parts,
                           int64_t m, int64_t n) {

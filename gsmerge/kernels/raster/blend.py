@@ -67,11 +67,6 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     """
 
 
-@native(STATUS, **LISTS, layers=i4("h", "w", out=True))
-def count_layers(conics, flatten_ids, isect_offsets, tile_width, layers):
-    """Count the Gaussians that show in each pixel, whatever is in front of them -> ``layers [h,w]``."""
-
-
 @native(
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip

@@ -13,15 +13,12 @@ scale, and the mean through its image position and through the projection's deri
 
 from __future__ import annotations
 
-import numpy as np
-
 from gsmerge.kernels.signature import STATUS, f4, i2, i4, i8, native, u1
 
 TILE = 16  # pixels per side; one row of a tile is one AVX-512 vector
 MAX_SIZE = 32767 * TILE  # pixels per side of a view: tile columns and rows are kept in 16 bits
 CONIC = 8  # numbers per conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, first row, last row
 SUMS = 9  # per Gaussian: those of w g (3), of v = d loss / d exponent, and of v times x, y, xx, xy, yy from the mean
-LN_CUT = np.float32(np.log(1 / 255))  # ln of the smallest weight that is drawn
 
 # Positions in the camera's array of numbers.
 ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20

@@ -11,7 +11,7 @@ H > 1 are made. ``f`` is that of colours of unknown mean and variance (normal-in
 positions anywhere in the superpixel's area: without it Γ would favour few large superpixels in every picture, as the
 density of positions grows as a superpixel shrinks.
 
-The authors' CUDA code differs: it has neither α nor Γ nor positions in a split, overwrites a_0 by a_n (so that Γ(a_n)
+The authors' own code differs: it has neither α nor Γ nor positions in a split, overwrites a_0 by a_n (so that Γ(a_n)
 is lost), sets b_0 to a_0 times a deviation instead of a variance, and accepts log H > -2 in both directions.
 """
 

@@ -78,7 +78,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """
     gaussians = own_gaussians(prepared.scene)
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
-    return fit_scene(start, prepared.scene, prepared.photo_views, options, plan.seed, plan.backend).gaussians
+    return fit_scene(start, prepared.scene, prepared.photo_views, options, plan.seed).gaussians
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:

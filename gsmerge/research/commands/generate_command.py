@@ -26,8 +26,6 @@ if TYPE_CHECKING:
         opt.option("style", str, "room, garden, mixed: these two in turn, or building: many rooms.", default="mixed"),
         opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any; a walk in a building.",
                    default="mixed"),
-        opt.option("moments", int, "So many scenes each are moments of one, through which a ball flies.", default=1,
-                   min=1, max=1000),
     ),
     *opt.panel(
         "Errors",
@@ -76,12 +74,6 @@ def _options(args: opt.Args) -> GenerateOptions:
     views, (width, height) = (int(counts[1]), int(counts[2] or counts[1])), map(int, sides.groups())
     with opt.usage_errors():
         options = GenerateOptions(
-            views=views,
-            width=width,
-            height=height,
-            style=args.style,
-            path=args.path,
-            noise=args.noise,
-            moments=args.moments,
+            views=views, width=width, height=height, style=args.style, path=args.path, noise=args.noise
         )
     return options if args.ranges is None else replace(options, ranges=read_ranges(args.ranges))

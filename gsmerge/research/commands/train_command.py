@@ -29,7 +29,8 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
         opt.option("steps", int, "Steps of the training, over file and preset.", wording="6000", min=1),
         opt.option("cache", Path, "Folder for the prepared examples, which several runs may share.",
                    wording="OUTPUT/examples"),
-        opt.changed("device", help="Where the networks run; windows are rendered on the CPU."),
+        opt.option("device", ("cpu", "cuda", "auto"), "Where the networks run; windows are rendered on the CPU. auto: "
+                   "CUDA where torch finds it.", default="cpu"),
     ),
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
     opt.RUN,
@@ -46,7 +47,7 @@ def train(args: opt.Args) -> None:
     if args.config is not None:
         options = read_config(args.config, options)
     with opt.usage_errors():
-        options, device = replace(options, **args.given(("steps", "seed"))), choose_device(args.device or "cpu")
+        options, device = replace(options, **args.given(("steps", "seed"))), choose_device(args.device)
     options.require_weights()
     threads = args.threads or max(1, available_threads() // local_count())
     with join_processes(device) as processes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,7 @@ from gsmerge.research.generate.photograph import (
     radiance,
     trace_scene,
 )
-from gsmerge.research.generate.shapes import Array, ball, compose, invert, norm, pack
+from gsmerge.research.generate.shapes import Array, compose, invert, norm
 from gsmerge.research.generate.textures import Palette, pyramid
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
@@ -46,7 +46,6 @@ METERED = 200  # views that the exposure is set by
 MAX_TARGETS = {BUILDING: 50}  # held-out views of a scene
 MAX_VIEWS = 2000
 MAX_TEXTURE = 512  # side of a building's textures, pixels, of which there are a dozen for every room
-BALL_WAY, BALL_RADIUS = 0.35, 0.1  # of a ball: half its way and its radius, in the least distance of cameras
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
@@ -149,16 +148,12 @@ class GenerateOptions(Settings):
         choices=(MIXED, *STYLES, BUILDING))  # fmt: skip
     path: str = setting(MIXED, "Path of the cameras; mixed: any, or a walk in a building.", choices=(MIXED, *PATHS))
     noise: float = setting(1.0, "Factor on the simulated errors of the network.", least=0, most=10)
-    moments: int = setting(1, "Scenes that are moments of one: a ball flies through it past the same cameras.",
-        "Photos and the network's depths have errors of their own at each moment.", least=1, most=1000)  # fmt: skip
     ranges: NoiseOptions = setting(NoiseOptions(), "The errors and habits.")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.views[0] > self.views[1]:
             raise ValueError(f"views: expected the least and the most, got {self.views[0]} to {self.views[1]}")
-        if self.style == BUILDING and self.moments > 1:
-            raise ValueError(f"moments: expected 1 in a building, got {self.moments}")
         if self.style == BUILDING and self.path not in (MIXED, "walk"):
             raise ValueError(f"path: expected walk or mixed in a building, got {self.path!r}")
 
@@ -183,7 +178,6 @@ class SyntheticScene:
 
 def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
     """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
-    index, moment = divmod(index, options.moments)
     rng = np.random.default_rng([seed, index])
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
@@ -198,8 +192,6 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         scene, pose = _find_building(rng, large, num_views)
     else:
         scene, pose = _find_stage(rng, style, path, large, num_views)
-    if options.moments > 1:
-        scene = _with_ball(scene, moment / (options.moments - 1))
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
     metered = poses[:: 2 * -(-num_views // METERED)]
@@ -212,7 +204,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
 
     def take(i: int) -> tuple[Float, Array, Gaussians | None]:
         """Take the photo at a place; at views, estimate its pose and predict Gaussians from it."""
-        image = _photo(scene, poses[i], large, noise, gain, seeds[i], moment)
+        image = _photo(scene, poses[i], large, noise, gain, seeds[i])
         if i not in errors:
             return image, moved[i], None
         deviation, seed = errors[i]
@@ -221,8 +213,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
         normals = np.einsum("hwk,ik->hwi", hits.normals, world[:3, :3]).astype(np.float32)
         seen = image if large == lens else cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        draws = np.random.default_rng([seed, moment] if moment else seed)
-        predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, draws)
+        predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
         return image, estimate, predicted
 
     held_out = _held_out(num_views, MAX_TARGETS.get(style, num_views))
@@ -283,19 +274,8 @@ def _find_building(rng: np.random.Generator, lens: Pinhole, num_views: int) -> t
     return LitScene(tuple(stages), tuple(zones), tuple(portals)), pose
 
 
-def _with_ball(scene: LitScene, part: float) -> LitScene:
-    """Add a ball that glows, so that it changes no light, at a ``part`` of its way across the focus, 0 to 1."""
-    lit = scene.stages[0]
-    reach = BALL_WAY * lit.stage.distance[0]
-    centre = lit.stage.focus + reach * np.array([2 * part - 1, -0.3 - 0.5 * np.sin(np.pi * part), 0.3 - 0.6 * part])
-    radius, (first, *_) = BALL_RADIUS * lit.stage.distance[0], lit.stage.shapes
-    thrown = replace(ball(centre, (radius, radius, radius), first.material), glow=True)
-    stage = replace(lit.stage, shapes=(*lit.stage.shapes, thrown))
-    return replace(scene, stages=(replace(lit, stage=stage, shapes=pack(stage.shapes)),))
-
-
-def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int, moment: int) -> Float:
-    """Take a photo with the errors of lens, exposure and sensor; those of the sensor differ between moments."""
+def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+    """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
     linear = radiance(scene, pose, lens, SAMPLES)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
@@ -303,8 +283,7 @@ def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: floa
     away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
     image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
-    sensor = np.random.default_rng([seed, moment]) if moment else rng
-    image = np.clip(image + sensor.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
+    image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
 
 

@@ -39,6 +39,7 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
+from gsmerge.stages.encode import make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
@@ -322,9 +323,9 @@ def match_crop(
         ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
         return Matches(local, len(ids))
     example = crop.example
-    context = None if networks is None else NetworkContext(networks, example.members, example.cameras, seed)
+    corrector = make_corrector(networks, example.members, example.cameras, seed)
     with torch.no_grad():
-        return match(parts, options.match_options(), context)
+        return match(parts, options.match_options(), corrector)
 
 
 def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,6 @@ from slow_renderer import Reference, render_arrays
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
-from gsmerge.raster.composite import count_layers, covered_pixels
 from gsmerge.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
@@ -92,31 +91,6 @@ def test_contributions_match_the_weights() -> None:
     weights = reference(gaussians, cameras).weights
     np.testing.assert_allclose(mass, weights.sum((1, 2)), atol=0.02)
     np.testing.assert_allclose(peak, weights.max((1, 2)), atol=0.01)
-
-
-def test_layers_are_counted_behind_opaque_ones_too() -> None:
-    gaussians, cameras = random_gaussians(60, 14), turned_camera()
-    gaussians = replace(gaussians, opacities=np.maximum(gaussians.opacities, 0.97))
-    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
-    expected = sum((reference(gaussians[[i]], cameras).weights[0] > 0).astype(int) for i in range(60))
-    layers = count_layers(plan)
-    assert np.abs(layers - expected).max() <= 1
-    assert (layers == expected).mean() > 0.99
-    assert layers.max() > 4
-
-
-def test_covered_pixels_of_a_small_gaussian() -> None:
-    camera = turned_camera()
-    ahead = np.linalg.inv(camera.viewmats[0])[:3] @ np.array([0, 0, 5.0, 1])
-    quat = np.float32([[0.8, 0.4, 0.4, 0.2]])
-    gaussian = Gaussians(
-        np.float32([ahead, -ahead]), np.repeat(quat, 2, 0), np.float32([[0.4, 0.2, 0.6]] * 2), np.float32([0.7, 0.7]),
-        np.zeros((2, 1, 3), np.float32), np.zeros((2, 0, 3), np.float32),
-    )  # fmt: skip
-    plan = plan_view(prepare(gaussian), camera.viewmats[0], camera.Ks[0], WIDTH, HEIGHT)
-    seen, behind = covered_pixels(plan)
-    assert seen == pytest.approx(count_layers(plan).sum(), rel=0.05)
-    assert behind == 0
 
 
 def test_any_colours_are_blended_as_they_are() -> None:

@@ -13,7 +13,6 @@ from gsmerge.kernels.raster.blend import (
     blend,
     blend_backward,
     contributions,
-    count_layers,
     gather_slots,
     parts_of_tile,
     survey,
@@ -48,7 +47,6 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
         lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),
         lambda: blend_backward(*walked, colors, first, last, image, left, image, None, slots),
         lambda: list_weights(*walked, SIDE, SIDE),
-        lambda: count_layers(*walked, np.empty((SIDE, SIDE), np.int32)),
     ]
 
 

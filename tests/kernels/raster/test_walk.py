@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from gsmerge.kernels.raster.blend import parts_of_tile
-from gsmerge.kernels.raster.project import LN_CUT, TILE
+from gsmerge.kernels.raster.project import TILE
 
 BATCH = 32  # Gaussians that the kernels take at once
 LEFT, TOP = 32, 48  # the tile's first pixel
+LN_CUT = np.float32(np.log(1 / 255))  # ln of the smallest weight that is drawn
 
 
 def parts_of(conics: np.ndarray) -> np.ndarray:

@@ -30,8 +30,7 @@ def test_runs_that_may_share_a_folder_have_one_name() -> None:
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"jobs": 0}, ("jobs", 1, 0)), ({"retries": -1}, ("retries", 0, -1)),
-        ({"sequence": True, "output": "a.usdz"}, ("sequence", "a.usdz")), ({"timeout": 0.0}, ("timeout", "0.0")),
+        ({"jobs": 0}, ("jobs", 1, 0)), ({"retries": -1}, ("retries", 0, -1)), ({"timeout": 0.0}, ("timeout", "0.0")),
         ({"timeout": math.nan}, ("timeout", "nan")), ({"max_memory": 0}, ("max_memory", 1, 0)),
         ({"engine": "slurm"}, ("engine", "'slurm'")), ({"address": "auto"}, ("address", "ray", "local")),
         ({"engine": "ray", "max_memory": 5}, ("max_memory", "local", "Ray")),

@@ -148,14 +148,6 @@ def test_what_others_work_on_comes_last(context: BatchContext, monkeypatch: pyte
     assert time.monotonic() - start >= 0.1
 
 
-def test_a_sequence_waits_for_what_others_work_on(context: BatchContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next scene starts from that result."""
-    monkeypatch.setattr("gsmerge.batch.schedule.BUSY_RETRY_SECONDS", 0.05)
-    context = replace(context, options=replace(context.options, sequence=True))
-    pool = Script({"0": [BUSY, BUSY, SKIPPED]}, room=1)
-    assert handed_out(pool, context, 3) == [("0", SKIPPED), ("1", DONE), ("2", DONE)]
-
-
 def test_a_batch_that_cannot_record_ends(context: BatchContext) -> None:
     with refuses(SceneError, "batch.jsonl", "told so"):
         handed_out(Script({"1": [STUCK]}), context, 3)

@@ -20,7 +20,7 @@ from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.plan import plan_whole
 from gsmerge.runtime import memory
-from gsmerge.settings.budget import DEVICES, Device
+from gsmerge.settings.budget import DEVICES
 from gsmerge.stages.segment import measure_size
 from gsmerge.types import Cameras, Scene
 
@@ -74,10 +74,10 @@ def test_a_budget_is_met_exactly(scene: Scene) -> None:
 
 def test_a_device_limits_the_whole(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as it draws in all, not in each block; fewer where superpixels ask for fewer."""
-    monkeypatch.setitem(DEVICES, "quest3", Device(600))
+    monkeypatch.setitem(DEVICES, "quest3", 600)
     assert len(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians) == 600
     free = compact(scene, blocks=2, **SETTINGS)
-    monkeypatch.setitem(DEVICES, "quest3", Device(5000))
+    monkeypatch.setitem(DEVICES, "quest3", 5000)
     assert scenes.identical(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians, free.gaussians)
 
 

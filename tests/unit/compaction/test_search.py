@@ -46,7 +46,7 @@ def make_plan(
         ({"budget": 400}, 400, 400),
         ({"budget": "20KB"}, 287, 287),
         ({"budget": "auto"}, None, 50_000_000),
-        ({"budget": "quest3"}, None, DEVICES["quest3"].count),
+        ({"budget": "quest3"}, None, DEVICES["quest3"]),
     ],
 )
 def test_limits(settings: dict[str, object], exact: int | None, most: int) -> None:

@@ -177,10 +177,10 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
     usual, sharp = (
-        fit_full(start, scenes.engine_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
+        fit_full(start, scenes.plan_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
         for scale in (1, 2)
     )
-    assert scenes.identical(usual, fit_full(start, scenes.engine_for(scenes.pair_of(scene), LONG))[0])
+    assert scenes.identical(usual, fit_full(start, scenes.plan_for(scenes.pair_of(scene), LONG))[0])
     views = range(len(near))
     assert score_photos(sharp, near, views).psnr > score_photos(usual, near, views).psnr + 0.3
 

@@ -14,6 +14,7 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import outside_views, score_fog
+from gsmerge.fit.scores import score_images
 from gsmerge.fit.survey import survey_photos, visible_mask
 from gsmerge.raster import composite, contributions, plan_view, prepare
 from gsmerge.raster.photos import Photos
@@ -29,7 +30,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     result, report = fit(start, FitJob(photos, QUICK, seed=4))
     outside = outside_views(prepare(start), photos[1], QUICK)
     assert outside is not None
-    expected, own = fit_full(start, scenes.engine_for(photos, QUICK, seed=4, outside=outside))
+    expected, own = fit_full(start, scenes.plan_for(photos, QUICK, seed=4, outside=outside))
     assert report == replace(own, fog=score_fog(prepare(result), outside))
     assert scenes.identical(result, expected)
 
@@ -96,16 +97,16 @@ def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
 
 
 def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
-    pictures: list[np.ndarray] = []
-    survey = survey_photos(truth, photos, lambda images: pictures.extend(images) or 0.0)
+    plan, pictures = scenes.plan_for(photos, QUICK), list[np.ndarray]()
+    survey = survey_photos(truth, plan)
     half, state = photos[1], start_state(truth)
     np.testing.assert_array_equal(survey.visible(1 / 255), visible_mask(truth, half, 1 / 255))
     sums = np.zeros((len(half), len(truth)))
     for view in range(len(half)):
-        plan = plan_view(state.splats, **half.camera(view))
-        image, _ = composite(plan, state.colors)
-        np.testing.assert_array_equal(pictures[view], image)
-        sums[view] = contributions(plan)[0]
+        drawn = plan_view(state.splats, **half.camera(view))
+        pictures.append(composite(drawn, state.colors)[0])
+        sums[view] = contributions(drawn)[0]
+    assert survey.score == score_images(pictures, plan, half)
     np.testing.assert_array_equal(survey.sums, sums.sum(0))
     np.testing.assert_array_equal(survey.squares, (sums**2).sum(0))
     rows = np.arange(0, len(truth), 3)

@@ -304,49 +304,6 @@ def test_documents_have_zooms_where_they_were_asked_for(scene: Scene, actual: Ev
     assert f"{sizes[0]['psnr_visible']:.2f}" in lines[-1]
 
 
-@pytest.mark.parametrize("align", [("colour",), ("pose", "pose")])
-def test_bad_alignments(align: tuple[str, ...], scene: Scene) -> None:
-    with refuses(ValueError, "align", ",".join(align)):
-        EvaluateOptions(align=align)
-    with refuses(ValueError, "align", "held-out", "none"):
-        evaluate(scene, {}, None, replace(PLAIN, align=("color",)))
-
-
-def test_aligned_scores_stand_beside_the_plain_ones(scene: Scene, half: Gaussians, actual: Evaluation) -> None:
-    options = replace(PLAIN, align=("pose", "color"))
-    aligned = evaluate(scene, {"half": half}, held_out(), options)
-    for one, plain in zip(aligned.results[1].scores, actual.results[1].scores, strict=True):
-        assert replace(one, aligned={}, pose_change=None) == plain
-        if one.split == "context":
-            assert one.aligned == {}
-            continue
-        assert list(one.aligned) == ["color", "pose", "both"]
-        color, pose, both = (masked.psnr or 0 for _, masked in one.aligned.values())
-        assert color > (plain.masked.psnr or 0)
-        assert pose >= (plain.masked.psnr or 0) - 1e-3
-        assert both > pose
-    document = evaluation_document(aligned, {})
-    mean = document["results"][1]["mean"]["target"]
-    assert list(mean["aligned"]) == ["color", "pose", "both"]
-    assert set(mean["pose_change"]) == {"degrees", "shift"}
-    assert mean["aligned"]["both"]["psnr_visible"] == aligned.results[1].mean("target", align="both")[1].psnr
-    row = list(csv.DictReader(io.StringIO(evaluation_csv(document))))[-1]
-    assert float(row["psnr_visible_align_color"]) == aligned.results[1].scores[-1].aligned["color"][1].psnr
-    assert float(row["pose_degrees"]) == aligned.results[1].scores[-1].pose_change.degrees
-    lines = evaluation_lines(document)
-    assert "aligned" in lines[-8]
-    assert "degrees" in lines[-2]
-
-
-def test_colours_alone(scene: Scene) -> None:
-    views = held_out()
-    dimmed = replace(views, images=0.6 * views.images + 0.1)
-    actual = evaluate(scene, {}, dimmed, replace(PLAIN, align=("color",))).results[0]
-    assert actual.mean_pose_change("target") is None
-    assert actual.scores[-1].pose_change is None
-    assert (actual.mean("target", align="color")[1].psnr or 0) > (actual.mean("target")[1].psnr or 0) + 5
-
-
 def test_csv_has_a_row_for_each_result_and_view(actual: Evaluation) -> None:
     document = evaluation_document(actual, {"half": {"bytes": 12, "path": "half.ply"}})
     rows = list(csv.DictReader(io.StringIO(evaluation_csv(document))))
@@ -368,7 +325,7 @@ def test_names_in_csv_are_no_formulas(actual: Evaluation) -> None:
 def document_of(actual: Evaluation) -> dict[str, Any]:
     """A document with facts of files and costs, under a name that is markup."""
     odd = replace(actual, results=(actual.results[0], replace(actual.results[1], name="a|b<i>")))
-    speeds = [{"device": "cpu", "width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
+    speeds = [{"width": 4, "height": 3, "threads": 1, "seconds": s} for s in (0.2, 0.1)]
     facts: dict[str, dict[str, Any]] = {
         "input": {"path": "in.ply", "bytes": 4000, "overdraw": 9.0, "speeds": speeds[:1]},
         "a|b<i>": {"bytes": 1000, "bytes_by_attribute": {"means": 34 * len(actual.results[1].scores)},

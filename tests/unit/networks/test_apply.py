@@ -19,6 +19,7 @@ from gsmerge.networks.apply import (
     refine_features,
     run_heads,
 )
+from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.research.training.modules import Networks
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
@@ -83,7 +84,7 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
 
 
 def test_no_networks_and_nothing_to_do(scene: Made) -> None:
-    assert refine(scene.features, None) is scene.features
+    assert refine(scene.features, ANALYTIC) is scene.features
     context = scene.networks(noisy())
     none = take(encode_features(scene.features, context), np.zeros(0, np.int64))
     assert len(refine(none, context)) == 0

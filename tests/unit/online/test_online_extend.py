@@ -56,11 +56,10 @@ def test_a_first_batch_is_an_encoded_scene(k: int, scene: Scene) -> None:
     scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
-def test_shipped_networks_compete_in_every_batch(pairs: list[Scene]) -> None:
-    """Unless a checkpoint is named."""
+def test_shipped_networks_correct_every_batch(pairs: list[Scene]) -> None:
     compactor = Compactor(superpixels="10%")
     for pair in pairs[:2]:
-        assert sorted(compactor.extend(pair).choices["start_scores"]) == ["analytic", "learned"]
+        assert compactor.extend(pair).choices["networks"]["checkpoint"] == "shipped"
 
 
 def test_a_first_batch_keeps_its_frame_and_views(scene: Scene) -> None:

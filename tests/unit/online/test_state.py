@@ -16,6 +16,7 @@ from gsmerge import Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
+from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.online.options import merge_settings
 from gsmerge.online.state import (
     GroupSet,
@@ -49,7 +50,7 @@ def uneven(some: Made) -> FeatureGaussians:
 
 @pytest.fixture(scope="module")
 def groups(some: Made, uneven: FeatureGaussians) -> GroupSet:
-    actual = bake(uneven, some.members, None, 4)
+    actual = bake(uneven, some.members, ANALYTIC, 4)
     rng = np.random.default_rng(1)
     fitted_sh0 = actual.fitted_sh0 + rng.normal(0, 0.1, actual.fitted_sh0.shape).astype(np.float32)
     return replace(actual, fitted_sh0=fitted_sh0, color_precision=rng.random(len(actual), np.float32))
@@ -79,7 +80,7 @@ def ones_and_most(groups: GroupSet, most: int) -> tuple[Gaussians, Gaussians]:
 
 @pytest.mark.parametrize("most", [1, 2, 4, 8])
 def test_baked_is_what_the_stages_decode(most: int, some: Made, uneven: FeatureGaussians) -> None:
-    actual = bake(uneven, some.members, None, most)
+    actual = bake(uneven, some.members, ANALYTIC, most)
     ones, children = ones_and_most(actual, most)
     assert_close(ones, feature_to_gaussians(uneven))
     expected = decode(uneven, some.members, replace(ALL, k=most)) if most > 1 else feature_to_gaussians(uneven)
@@ -99,7 +100,7 @@ def test_heads_are_in_what_is_baked(some: Made) -> None:
     assert_close(ones, decode(features, some.members, ALL, networks=networks), rtol=1e-3)
     expected = decode(features, some.members, replace(ALL, k=4), networks=networks)
     assert_same_children(children, expected)
-    plain = bake(features, some.members, None, 4)
+    plain = bake(features, some.members, ANALYTIC, 4)
     assert not np.array_equal(plain.children.sh0, actual.children.sh0)
 
 
@@ -204,12 +205,12 @@ def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Scene
         assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
 
 
-def test_the_device_of_another_machine_is_not_asked_for(pixels: Scene) -> None:
+def test_a_setting_that_is_gone_is_passed_over(pixels: Scene) -> None:
     encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
     options = encoded.about["options"] | {"device": "cuda"}
     state = from_encoded(replace(encoded, about=encoded.about | {"options": options}))
     settings, _ = merge_settings({}, state.about["options"])
-    assert (settings.device, settings.segment.superpixels) == ("cpu", "5%")
+    assert settings.segment.superpixels == "5%"
 
 
 def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:

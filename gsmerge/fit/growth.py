@@ -1,0 +1,78 @@
+"""Growth of the Gaussians under optimisation: those with the largest errors are halved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.fit.fit_state import CARRIED, State, state_of
+from gsmerge.geometry import lower_median, quat_to_rotmat
+from gsmerge.kernels.elementary import exp, log, power
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.raster import composite, plan_view, splat_adjoint
+from gsmerge.raster.photos import Photos
+from gsmerge.runtime.threads import in_turn
+
+OFFSET = 0.7  # of the halves from the middle, in standard deviations; their own shrinks so that the sum keeps its own
+FADED = 0.005  # opacity that is as good as none; halves of what has more have at least 1 / 255, which renderers draw
+DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
+
+
+def grow_to(state: State, half: Photos, count: int) -> State:
+    """Drop faded Gaussians, then halve others until there are ``count``, or no visible one is left to halve.
+
+    ``half``: the half-size photos, whose errors choose which Gaussians are halved.
+    """
+    before, opacities = 0, state.splats.opacities
+    if len(opacities):
+        state = state[opacities >= min(FADED, float(lower_median(opacities)))]  # of a faint scene most stay
+    while before < len(state.x) < count:
+        before, state = len(state.x), grow(state, error_masses(state, half), count)
+    return state
+
+
+def grow(state: State, masses: np.ndarray, count: int) -> State:
+    """Halve the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
+
+    Each is halved at most once, so the number at most doubles, and what no photo shows is left
+    alone. The halves start with their parent's momentum, share of the box and least size; the old
+    ones come first and in order, the second halves after them.
+    """
+    num = min(count - len(state.x), int((masses > 0).sum()))
+    if num <= 0:
+        return state
+    picked = np.sort(np.argsort(-masses, kind="stable")[:num])
+    parents, rows = state.x[picked], np.arange(num)
+    longest = parents[:, SIZE:QUAT].argmax(1)
+    reach = OFFSET * exp(parents[rows, SIZE + longest])
+    rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
+    shift = rotations[rows, :, longest] * reach[:, None]
+    halves = parents.copy()
+    halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)
+    clear = 1 / (1 + exp(halves[:, LOGIT].astype(np.float64)))  # 1 - opacity
+    halves[:, LOGIT] = log(1 / power(clear, DEPTH) - 1)
+    x = np.concatenate([state.x, halves])
+    x[picked] = halves
+    x[picked, :3] -= shift
+    x[len(state.x) :, :3] += shift
+    source = np.concatenate([np.arange(len(state.x)), picked])
+    grown = state_of(x, state.splats.shN[source])
+    old = np.ones(len(x), bool)
+    old[picked] = old[len(state.x) :] = False
+    grown.x0[old], grown.units[old] = state.x0[old[: len(state.x)]], state.units[old[: len(state.x)]]
+    for name in set(CARRIED) - {"x0", "units"}:
+        getattr(grown, name)[:] = getattr(state, name)[source]
+    return grown
+
+
+def error_masses(state: State, half: Photos) -> np.ndarray:
+    """Sum ``[n]`` blending weight times absolute pixel error of each Gaussian over all half-size photos."""
+
+    def one_view(view: int) -> np.ndarray:
+        plan = plan_view(state.splats, **half.camera(view))
+        image, _ = composite(plan, state.view_colors())
+        return splat_adjoint(plan, np.abs(image - half.image(view)).mean(-1, keepdims=True))[:, 0]
+
+    masses = np.zeros(len(state.x))
+    for of_view in in_turn(one_view, range(len(half))):
+        masses += of_view
+    return masses

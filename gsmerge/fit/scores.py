@@ -1,0 +1,35 @@
+"""Scores of a fit: PSNR on held-out blocks, and errors of whole photos."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsmerge.fit.fit_state import State
+from gsmerge.fit.photo_sizes import holdout_psnr
+from gsmerge.fit.schedule import FitPlan
+from gsmerge.raster.photos import Photos, photo_errors, render_photos
+from gsmerge.types import Gaussians
+
+
+def score_images(images: Sequence[np.ndarray], plan: FitPlan, half: Photos) -> float:
+    """Return the PSNR (dB) of renders on the held-out blocks of the half-size photos; NaN if nothing is held out."""
+    options = plan.job.options
+    if options.fit == "none" or not options.judged:
+        return float("nan")
+    return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
+
+
+def score_state(state: State, plan: FitPlan, half: Photos) -> float:
+    """Return the PSNR (dB) of a state on the held-out blocks of the half-size photos; see :func:`score_images`."""
+    return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
+
+
+def photo_error(gaussians: Gaussians, photos: Photos) -> float:
+    """Return the mean squared error of renders against whole photos."""
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+        return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
+
+    return float(np.mean(photo_errors(gaussians, photos, score)))

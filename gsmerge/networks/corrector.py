@@ -1,0 +1,42 @@
+"""What corrects the analytic stages: nothing here, networks in :class:`gsmerge.networks.apply.NetworkContext`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.types import FeatureGaussians, Gaussians
+
+
+class Corrector:
+    """The closed formulas alone: every stage's result stays as it is."""
+
+    @property
+    def max_children(self) -> int:
+        """Most Gaussians of a Feature Gaussian."""
+        return MAX_CHILDREN
+
+    def encode(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Correct pooled Feature Gaussians and add their latents."""
+        return features
+
+    def decode_for_matching(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Replace means and covariances by decoded ones, by which Feature Gaussians are matched."""
+        return features
+
+    def merge(
+        self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
+    ) -> FeatureGaussians:
+        """Correct Feature Gaussians pooled from the rows ``order`` of ``parts``, in runs from ``cuts``."""
+        return pooled
+
+    def refine(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Correct merged Feature Gaussians by their neighbours."""
+        return features
+
+    def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
+        """Correct the children of Feature Gaussians; ``parents [n]`` are rows of ``features``, ascending."""
+        return children
+
+
+ANALYTIC = Corrector()
