@@ -91,7 +91,7 @@ def read_targets(load: Loaded, source: Source, entry: Entry, size: tuple[int, in
     chosen = replace(chosen, viewmats=world.move_viewmats(chosen.viewmats))
     photos = stored_photos(SceneFiles(load.files.ply, source.path, source.photos), chosen)
     pinholes, photos, _ = as_pinholes(chosen, photos)
-    if photos is None:
+    if not len(photos):
         raise SystemExit(f"{source.path}: no photo found for {chosen.names[0]}")
     read = Views(to_cameras(pinholes, photo_size(photos)), as_floats(photos), chosen.names)
     return read if size is None else crop_views(read, size)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
     from gsmerge.compaction.compact import compact as compact
+    from gsmerge.compaction.inspect import inspect as inspect
     from gsmerge.compaction.result import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from gsmerge.io import write_ply as write_ply
     from gsmerge.measure.evaluate import Evaluation as Evaluation
     from gsmerge.measure.evaluate import evaluate as evaluate
-    from gsmerge.measure.inspect import inspect as inspect
     from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
@@ -54,6 +54,7 @@ __version__ = "0.1.0"
 
 _PUBLIC = {
     "compaction.compact": ("compact",),
+    "compaction.inspect": ("inspect",),
     "compaction.result": ("CompactReport", "CompactResult"),
     "compaction.tensors": ("compact_tensors",),
     "encoded.encoded": ("Encoded",),
@@ -64,7 +65,6 @@ _PUBLIC = {
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),
     "measure.evaluate": ("Evaluation", "evaluate"),
-    "measure.inspect": ("inspect",),
     "online.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
     "scene.read": ("read_scene",),

@@ -119,7 +119,7 @@ def _read_gaussians(path: Path) -> FileCheck:
         problems += [problem for problem in [spz.problem_at_end(path)] if problem]
     elif suffix == ".ply":
         if holds_cameras(path):
-            pinholes, *_ = as_pinholes(read_cameras(path), None)
+            pinholes, *_ = as_pinholes(read_cameras(path), ())
             to_cameras(pinholes)
         read_sharp_camera(path)
         left = ply.bytes_after_rows(path)
@@ -146,8 +146,7 @@ def _read_scene(path: Path) -> FileCheck:
         problems.append(_problem(error, path))
     else:
         notes += [note for note in load.notes if note not in file_notes(load.info)]
-        photos = load.views.images
-        scene = replace(scene, num_views=len(load.views.cameras), num_photos=0 if photos is None else len(photos))
+        scene = replace(scene, num_views=len(load.views.cameras), num_photos=len(load.views.images))
     return replace(scene, problems=tuple(problems), notes=tuple(dict.fromkeys(notes)))
 
 

@@ -350,6 +350,11 @@ class Scene:
         return self.valid if self.missing is None else self.valid & ~self.missing
 
     @property
+    def stored_rows(self) -> np.ndarray:
+        """Mask ``[n]`` of the rows that are finite Gaussians from the file; without pixels these are all."""
+        return np.ones(len(self.gaussians), bool) if self.pixel_ids is None else self.stored.reshape(-1)
+
+    @property
     def file_gaussians(self) -> Gaussians:
         """Gaussians that come from the file, without those added for missing pixels."""
         return self.gaussians if self.missing is None else self.gaussians[~self.missing.reshape(-1)]

@@ -19,15 +19,13 @@ _OTHERS = 4  # nearest views that a photo is compared with
 _AROUND = 6  # pixels on either side over which colours are compared
 
 
-def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
+def fill_from_depths(scene: Scene, depths: np.ndarray, images: np.ndarray) -> Scene:
     """Add a Gaussian at the depth of ``depths [v,h,w]`` for each pixel that the file has no row for.
 
-    Units, and whether depth is along z or a distance, follow from the other pixels. The colour is the photo's; opacity,
-    rotation and size in pixels are copied from the pixel before it in the row. The scene is unchanged if it has no
-    photos, lacks nothing, or its Gaussians do not lie at the maps' depths.
+    Units, and whether depth is along z or a distance, follow from the other pixels. The colour is that of the photos
+    ``images [v,h,w,3]``; opacity, rotation and size in pixels are copied from the pixel before it in the row. The scene
+    is unchanged if its Gaussians do not lie at the maps' depths.
     """
-    if scene.images is None or scene.missing is None:
-        return scene
     V = scene.cameras.viewmats
     views, height, width = scene.valid.shape
     valid, g = scene.valid.reshape(views, -1), scene.gaussians
@@ -63,14 +61,14 @@ def fill_from_depths(scene: Scene, depths: np.ndarray) -> Scene:
     growth = new_z.reshape(-1)[rows] / z.reshape(-1)[source]
     full.scales[rows] = g.scales[source] * growth.astype(np.float32)[:, None]
     full.quats[rows], full.opacities[rows] = g.quats[source], g.opacities[source]
-    full.sh0[rows] = rgb_to_sh0(scene.images.reshape(-1, 1, 3)[rows])
+    full.sh0[rows] = rgb_to_sh0(images.reshape(-1, 1, 3)[rows])
     kept = scene.valid.reshape(-1).copy()
     kept[rows] = True
     return replace(scene, gaussians=full, pixel_ids=grid_ids(kept))
 
 
-def guess_depths(scene: Scene) -> np.ndarray:
-    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and other pixels.
+def guess_depths(scene: Scene, images: np.ndarray) -> np.ndarray:
+    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and other pixels, from its photos.
 
     Pixels with rows keep their depths. Others get the depth beside them, or that of the far, at which the nearest other
     photos have the same colours; border pixels the depth of the pixel beside them.
@@ -90,7 +88,7 @@ def guess_depths(scene: Scene) -> np.ndarray:
             beside = depth.reshape(-1)[_nearest_kept(kept)[inner]]
             farthest = float(np.quantile(depth[kept], _LARGEST))
             depths = np.concatenate([beside[None], np.repeat(farthest * _FACTORS[:, None], len(beside), 1)])
-            depth[inner] = _agreeing_depths(scene, view, inner, depths)
+            depth[inner] = _agreeing_depths(scene, images, view, inner, depths)
         maps[view] = np.where(kept, depth, depth[np.ix_(y, x)])
     return maps
 
@@ -119,10 +117,10 @@ def _without_borders(stored: np.ndarray) -> np.ndarray:
     return np.arange(lines).clip(min(first, most), lines - 1 - min(last, most))
 
 
-def _agreeing_depths(scene: Scene, view: int, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+def _agreeing_depths(scene: Scene, images: np.ndarray, view: int, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Choose of ``depths [d,p]`` those under which photos agree, for some ``pixels [h,w]``; the first in doubt."""
-    images, cameras = scene.images, scene.cameras
-    if images is None or not pixels.any():
+    cameras = scene.cameras
+    if not pixels.any():
         return depths[0]
     y, x = np.nonzero(pixels)
     places = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)

@@ -57,10 +57,10 @@ class _Pictures:
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
-def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | None) -> CameraFile | None:
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile | None:
     """Estimate the intrinsics of cameras that have poses alone; return cameras with a note, or None if that fails.
 
-    ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8. Where only they show
+    ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8, or none. Where only they show
     the focal length, pixels are taken to be square, and the principal point to be in the middle.
     """
     camera_size = int(camera_file.widths[0]), int(camera_file.heights[0])
@@ -71,7 +71,7 @@ def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos | 
     readings = [camera_file.viewmats, *(poses.viewmats for poses in other_poses)]
     K = _intrinsics_of_rays(ply, camera_file, readings, size)
     what = "the rays of the pixels"
-    if K is None and photos is not None:
+    if K is None and len(photos):
         K = _intrinsics_of_colors(ply, readings, photos, size)
         what = "the photos' colours"
     if K is None:

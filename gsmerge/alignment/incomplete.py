@@ -54,8 +54,13 @@ _AS_GOOD = 1.05  # of that distance: no worse, where the scale is solved from mo
 _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits as well
 
 
-def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading | None]:
-    """Yield readings with missing pixels, the likely order first; None for each order that is impossible."""
+def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading]:
+    """Yield readings with missing pixels, those of the likely order first."""
+    return (reading for reading in _read_orders(inputs) if reading is not None)
+
+
+def _read_orders(inputs: AlignmentInput) -> Iterator[Reading | None]:
+    """Yield the reading in each order; None where it is impossible."""
     cameras = inputs.cameras
     missing = len(cameras) * cameras.width * cameras.height - len(inputs.gaussians)
     if missing < 0:
@@ -137,7 +142,7 @@ def _solve_scale(
 
 def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
     """Return what measures the distances of some rows' base colours from the photos; None without photos."""
-    if inputs.images is None:
+    if not len(inputs.images):
         return None
     base = sh0_to_rgb(inputs.gaussians.sh0[ids, 0])
     photos = inputs.images.reshape(len(inputs.cameras), -1, 3)

@@ -22,6 +22,8 @@ from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
+SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
+SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
@@ -208,7 +210,7 @@ class AlignmentInput:
     gaussians: Gaussians  # the file's n rows
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
-    images: np.ndarray | None  # ``[c,h,w,3]``, or None
+    images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     labellings: Sequence[tuple[int, ...]]  # orders that the views may be in: the file's, that of the names
     # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
@@ -279,18 +281,28 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
     return median(errors), _color_distance(inputs, pairs)
 
 
+def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
+    """Return whether a reading is near enough to be true, and far nearer than shuffled pixels."""
+    return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, SMALLEST_PX)
+
+
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
     """Measure the mean distance, 0 to 1, between base colours and photos at a layout's pixels; NaN without photos."""
     return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
 def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
-    if inputs.images is None or not len(pairs.rows):
+    if not len(pairs.rows):
         return math.nan
     base = sh0_to_rgb(gather(inputs.gaussians.sh0, pairs.rows)[:, 0])
     x, y = pairs.pixels.astype(np.int64).T
-    colors = gather(inputs.images, pairs.views, y, x)
+    colors = photo_colors(inputs.images, pairs.views, y, x)
     return float(np.abs(base.clip(0, 1) - colors).mean(1).mean())
+
+
+def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at some pixels; NaN where there are no photos."""
+    return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
 @dataclass(frozen=True)

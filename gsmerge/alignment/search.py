@@ -11,35 +11,35 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.cameras import describe_convention, describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.cameras import describe_reading, max_pixels, move_cameras, other_conventions
 from gsmerge.alignment.estimate import ESTIMATED, WITH_PHOTOS
+from gsmerge.alignment.explain import explain_count
+from gsmerge.alignment.judge import Fit, Recovery, accept_reading, choose_fit
 from gsmerge.alignment.layouts import (
     MAY_BE_UNALIGNED,
     GridFit,
     Layout,
+    check_photo_size,
     other_grids,
     photo_grid,
-    small_photos_error,
     square_grids,
     subsample,
     view_orders,
 )
-from gsmerge.alignment.recovery import SMALLEST_PX, Recovery, explain_count, is_seen, possible_layouts, recover
-from gsmerge.alignment.score import MARGIN, AlignmentInput, color_error, scale_by, score_layout
+from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
+from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
 from gsmerge.alignment.unaligned import check_cameras, choose_cameras
 from gsmerge.alignment.upright import solve_upright, upright_error, upright_rotation
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
-_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
 _MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
-_CERTAIN_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
 
@@ -51,7 +51,7 @@ class AlignmentResult:
     # A block is a view, or one layer of a view with several Gaussians per pixel
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
-    images: np.ndarray | None  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32
+    images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
     camera_file: CameraFile | None  # as it was read in the end; None where there are no cameras
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each
     transform: PhotoTransform | None = None  # what was done to the photos
@@ -76,16 +76,16 @@ class _Source:
 
     ply: GaussianFile
     camera_file: CameraFile
-    photos: Photos | None
+    photos: Photos
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
     seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
 
     @cached_property
-    def images(self) -> np.ndarray | None:
+    def images(self) -> np.ndarray:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
-        return None if self.photos is None else as_floats(self.photos)
+        return as_floats(self.photos)
 
     def may_be(self, grid: GridFit) -> bool:
         """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
@@ -96,8 +96,8 @@ class _Source:
 
     def inputs(self, grid: GridFit, *, photos: bool = True) -> AlignmentInput:
         """Put rows, cameras and photos at the size of a grid together; without photos where only positions matter."""
-        images = None
-        if photos and self.photos is not None:
+        images = NO_IMAGES
+        if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
         return AlignmentInput(
             gaussians=self.ply.gaussians,
@@ -110,30 +110,25 @@ class _Source:
             scale=self.scale,
         )
 
+    def fit(self, grids: Iterable[GridFit], *, photos: bool = True, exact_frames: bool = False) -> list[Fit]:
+        """Read the rows in each of some grids; leave out those whose pixels they are not."""
+        fits = []
+        for grid in grids:
+            inputs = self.inputs(grid, photos=photos)
+            recovery = accept_reading(inputs, read_grid(inputs, exact_frames=exact_frames))
+            fits += [] if recovery is None else [Fit(grid, recovery)]
+        return fits
 
-@dataclass(frozen=True)
-class _Fit:
-    """A grid of which rows are the pixels."""
-
-    grid: GridFit
-    recovery: Recovery
-
-    @property
-    def px(self) -> float:
-        """Median distance of the Gaussians from their pixels in the worst view, pixels."""
-        return self.recovery.best.worst_px
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether a grid of another size may fit as well: borders are cut off, and the scale was solved for."""
-        best = self.recovery.best
-        return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _CERTAIN_PX
+    def choose(self, rounds: Iterable[Sequence[Fit]]) -> Fit | None:
+        """Choose a fit of the first round that has one, among those that compete in it; None where none has."""
+        chosen = (choose_fit(fits, self.inputs) for fits in rounds)
+        return next((fit for fit in chosen if fit is not None), None)
 
 
 def align(
     ply: GaussianFile,
     camera_file: CameraFile,
-    photos: Photos | None = None,
+    photos: Photos = (),
     *,
     order: str = "auto",
     scale: float | None = None,
@@ -148,7 +143,7 @@ def align(
     Args:
         ply: The file's rows.
         camera_file: Its cameras.
-        photos: c uint8 photos of one size.
+        photos: c uint8 photos of one size, or none.
         order: The order of the rows where it is known, see :class:`gsmerge.settings.reading.ReadHints`.
         scale: Size of the Gaussians' world in units of the cameras', where it is given.
         depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
@@ -162,23 +157,26 @@ def align(
     try:
         grid = photo_grid(camera_file, photo_size(photos))
     except SceneError:
-        fit = _choose_first(source, _fit_other_sizes(source))
+        fit = source.choose(_fit_other_sizes(source))
         if fit is None:
             raise
     else:
-        fit = _choose_first(source, _fits(source, grid))
-    if fit is not None:
-        return _make_result(source, fit)
-    small = small_photos_error(ply.info, camera_file, photo_size(photos)) if order not in MAY_BE_UNALIGNED else None
-    if small is not None:
-        raise small
+        fit = source.choose(_fits(source, grid))
+    return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
+
+
+def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+    """Choose cameras that see rows without pixels; SceneError where none do, or the rows should have pixels."""
+    info, camera_file = source.ply.info, source.camera_file
+    if source.order not in MAY_BE_UNALIGNED:
+        check_photo_size(info, camera_file, photo_size(source.photos))
     inputs = source.inputs(grid)
     rotation = upright_rotation(inputs)
     if rotation is not None:
         return _align_upright(source, grid, rotation)
-    why = explain_count(ply.info, inputs, camera_file)
-    if scale is not None:
-        inputs = replace(inputs, cameras=scale_by(scale).move(inputs.cameras))
+    why = explain_count(info, inputs, camera_file)
+    if source.scale is not None:
+        inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
     cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
     return AlignmentResult(
         None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
@@ -187,17 +185,17 @@ def align(
 
 def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
-    for fitted in (grid, *square_grids(grid)):
+    for fitted in (grid, *square_grids(grid)) if len(source.photos) else ():
         inputs = source.inputs(fitted)
         frame = solve_upright(inputs, rotation)
         if frame is not None:
             break
     else:
-        raise upright_error(source.ply.info, source.photos is not None)
+        raise upright_error(source.ply.info, len(source.photos))
     moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
-    recovery = recover(moved)
+    recovery = accept_reading(moved, read_grid(moved))
     if recovery is not None:
-        return _make_result(source, _Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
+        return _make_result(source, Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
     return AlignmentResult(
         None,
         moved.cameras,
@@ -209,13 +207,18 @@ def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> Alig
     )
 
 
-def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
-    """Yield fits of the photos' size and others, with poses as stored, moved and in other conventions; likely first."""
+def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
+    """Yield rounds of fits that compete, the likely ones first.
+
+    Grids are of the photos' size and of others; poses are as stored, moved, and in other conventions.
+    """
+    if source.order == "none":
+        return
     other_sizes = _fit_other_sizes(source)
     large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
     if large:
         yield next(other_sizes, [])
-    fits = _fit_all(source, [grid])
+    fits = source.fit([grid])
     if fits and fits[0].is_doubtful:
         fits = [min((*fits, *next(other_sizes, [])), key=lambda fit: fit.px)]
     yield fits
@@ -223,21 +226,19 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[_Fit]]:
         yield _fit_moved(source, grid)
     if not large:
         yield next(other_sizes, [])
-    if source.order != "none":
-        rows = source.ply.gaussians, source.ply.valid
-        grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
-        seen = (other for other in grids if check_cameras(*rows, other.cameras, None).ok)
-        yield _fit_all(source, seen)
+    rows = source.ply.gaussians, source.ply.valid
+    grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+    yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
     yield from other_sizes
 
 
-def _fit_other_sizes(source: _Source) -> Iterator[list[_Fit]]:
+def _fit_other_sizes(source: _Source) -> Iterator[list[Fit]]:
     """Yield fits of other sizes than the photos'; next, those in other conventions of the poses as well."""
     if source.order != "none":
         yield _fit_sizes(source, source.camera_file)
     if source.order not in MAY_BE_UNALIGNED:
         camera_files = _conventions(source.camera_file)
-        fits = (_choose(source, _fit_sizes(source, camera_file, exact_frames=True)) for camera_file in camera_files)
+        fits = (source.choose([_fit_sizes(source, camera_file, exact_frames=True)]) for camera_file in camera_files)
         yield list(filter(None, fits))
 
 
@@ -252,15 +253,7 @@ def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
     return replace(grid, camera_file=camera_file, cameras=replace(grid.cameras, viewmats=camera_file.viewmats))
 
 
-def _fit_all(
-    source: _Source, grids: Iterable[GridFit], *, photos: bool = True, exact_frames: bool = False
-) -> list[_Fit]:
-    """Recover the pixels of the rows in each of some grids; leave out those whose pixels they are not."""
-    recoveries = ((grid, recover(source.inputs(grid, photos=photos), exact_frames=exact_frames)) for grid in grids)
-    return [_Fit(grid, recovery) for grid, recovery in recoveries if recovery is not None]
-
-
-def _fit_moved(source: _Source, grid: GridFit) -> list[_Fit]:
+def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
     """Fit a grid without missing pixels under slightly moved cameras; nothing where that does not fit.
 
     Nothing, too, where another convention fits or the photos' colours disagree: views in the wrong order look the
@@ -281,10 +274,10 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[_Fit]:
     if moved is None:
         return []
     grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moved.moves)
-    return [fit for fit in _fit_all(source, [grid], exact_frames=True) if fit.recovery.confirmed is not False]
+    return [fit for fit in source.fit([grid], exact_frames=True) if fit.recovery.confirmed is not False]
 
 
-def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> list[_Fit]:
+def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> list[Fit]:
     """Fit grids of other sizes than the photos', by positions alone: the likeliest of which some fit.
 
     Sizes that only the number of rows suggests are tried in the cameras' own frame first; with ``exact_frames`` all
@@ -296,45 +289,14 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
         grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
         guesses += [grid for grid in grids if grid.guessed]
         exact = exact_frames or any(grid.guessed for grid in grids)
-        fits = _fit_all(source, grids, photos=False, exact_frames=exact)
+        fits = source.fit(grids, photos=False, exact_frames=exact)
         if fits:
             return fits
-    fits = [] if exact_frames else _fit_all(source, guesses[:_MAX_TRIED], photos=False)
+    fits = [] if exact_frames else source.fit(guesses[:_MAX_TRIED], photos=False)
     return [fit for fit in fits if fit.recovery.best.layout.kind != "pruned"]  # the number of rows leaves none out
 
 
-def _choose_first(source: _Source, rivals: Iterable[list[_Fit]]) -> _Fit | None:
-    """Choose a fit from the first of several lists that has one."""
-    return next(filter(None, (_choose(source, fits) for fits in rivals)), None)
-
-
-def _choose(source: _Source, fits: Sequence[_Fit]) -> _Fit | None:
-    """Choose the fit that is nearest to its pixels, and of several alike the one whose photos have the colours.
-
-    None where a grid of another size is about as near, SceneError where poses in another convention are.
-    """
-    best = min(fits, key=lambda fit: fit.px, default=None)
-    if best is None:
-        return None
-    rivals = sorted((fit for fit in fits if fit.px < MARGIN * max(best.px, SMALLEST_PX)), key=lambda fit: fit.px)
-    conventions = list(dict.fromkeys(fit.grid.camera_file.convention for fit in rivals))
-    if len(conventions) > 1:
-        both = " and as ".join(map(describe_convention, conventions[:2]))
-        problem = f"expected poses that fit in one reading, found that they fit as {both}"
-        raise SceneError(source.camera_file.path, problem, "convert them to the format's own")
-    exact = best.recovery.best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
-    if exact and any(fit.grid.size != best.grid.size for fit in rivals):
-        return None
-    near = max(_ALIKE * best.px, best.px + _ALIKE_PX)
-    same = (fit for fit in fits if fit.grid.camera_file is best.grid.camera_file and fit.grid.size == best.grid.size)
-    alike = [fit for fit in same if fit.px <= near]
-    if len(alike) == 1:
-        return best
-    errors = [color_error(source.inputs(fit.grid), fit.recovery.best.layout) for fit in alike]
-    return alike[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
-
-
-def _make_result(source: _Source, fit: _Fit) -> AlignmentResult:
+def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
     """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians."""
     inputs, grid, best = source.inputs(fit.grid), fit.grid, fit.recovery.best
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows

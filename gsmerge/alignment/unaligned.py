@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
-from gsmerge.alignment.score import MARGIN, AlignmentInput, candidate_similarities
+from gsmerge.alignment.score import MARGIN, AlignmentInput, candidate_similarities, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
@@ -60,7 +60,7 @@ def check_cameras(
     gaussians: Gaussians,
     valid: np.ndarray,
     cameras: Cameras,
-    images: np.ndarray | None,
+    images: np.ndarray,
     samples: int = _SEEN_SAMPLES,
     *,
     foremost: bool = False,
@@ -83,9 +83,9 @@ def check_cameras(
         visible |= inside
         if foremost:
             inside[inside] = _are_foremost(xy[inside], depth[inside], cameras.width * cameras.height)
-        if images is not None and inside.any():
+        if inside.any():
             x, y = xy[inside].astype(np.int64).T
-            photo = images[view, y, x]
+            photo = photo_colors(images, np.full(len(x), view), y, x)
             errors.append(np.abs(colors[inside] - photo).mean(1))
             shuffled_errors.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.mean()), np.nan
@@ -106,7 +106,7 @@ def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
 
 
 def choose_poses(
-    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None, convention: Convention
+    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
     """Choose the pose convention under which the cameras see most Gaussians, with colours nearest to the photos.
 
@@ -200,7 +200,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     The true scale stands out: at any other the colours fit less. It is solved for where no frame stands out
     at the cameras' own.
     """
-    if inputs.images is None:
+    if not len(inputs.images):
         return None
     frames = [IDENTITY, *_exporter_frames(inputs)]
     best = _best_frame(inputs, frames)
@@ -216,8 +216,8 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN
     """Score what the cameras see in a frame; 0 where the photos cannot tell."""
     # the first camera may see all Gaussians at any scale
     seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
-    images = None if inputs.images is None else inputs.images[seen]
-    check = check_cameras(inputs.gaussians, inputs.valid, frame.move(inputs.cameras)[seen], images, samples)
+    cameras = frame.move(inputs.cameras)[seen]
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[seen], samples)
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
 

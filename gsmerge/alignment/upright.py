@@ -79,8 +79,6 @@ def _uneven(points: np.ndarray) -> float:
 
 def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | None:
     """Solve for the frame of upright rows from their colours in the photos; None where too few stretches agree."""
-    if inputs.images is None:
-        return None
     for pixels, tries in _possible_orders(len(inputs.gaussians), inputs.cameras):
         frame = _agreed_frame(inputs, _match(inputs, tries, pixels), rotation)
         if frame is not None:
@@ -110,7 +108,6 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
 def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) -> Correspondences:
     """Find stretches in the photos; return rows of those that are alike and in one place, a block for each."""
-    assert inputs.images is not None
     colors, images = byte_colors(inputs.gaussians), inputs.images
     shown = [shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
     rows = np.array([t.start + t.step * np.arange(_LENGTH) for t in tries])
@@ -167,9 +164,9 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
     return replace(frame, description=text, kind=rotation.kind)
 
 
-def upright_error(ply: FileInfo, has_photos: bool) -> SceneError:
+def upright_error(ply: FileInfo, num_photos: int) -> SceneError:
     """Make the SceneError for upright rows whose place no photo shows."""
-    photos = "photos that do not show" if has_photos else "no photos that show"
+    photos = "photos that do not show" if num_photos else "no photos that show"
     return SceneError(
         ply.path,
         "expected cameras in the frame of the rows, found rows that were centred, rescaled and turned upright (by how"

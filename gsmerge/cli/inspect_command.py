@@ -10,8 +10,8 @@ from gsmerge.cli.console import print_document, stage_progress
 def inspect(args: opt.Args) -> None:
     """Say what a scene holds, whether its pixels line up, and what compact would make of it."""
     hints = args.hints()
-    from gsmerge.measure.inspect import inspect as inspect_scene
-    from gsmerge.measure.inspect import inspection_lines
+    from gsmerge.compaction.inspect import inspect as inspect_scene
+    from gsmerge.compaction.inspect import inspection_lines
     from gsmerge.report import document_head
     from gsmerge.runtime.record import record_run
 

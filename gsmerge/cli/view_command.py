@@ -41,8 +41,8 @@ def view(args: opt.Args) -> None:
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
-    if pair.scene.images is not None:
-        count_for(segmentation, *pair.scene.images.shape[1:3])  # refuses more than pixels, before anything is measured
+    size = pair.scene.cameras.height, pair.scene.cameras.width
+    count_for(segmentation, *size)  # refuses more superpixels than pixels, before anything is measured
     say_notes(pair.notes, quiet=args.silent)
     document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": pair.notes}
     if args.dry_run:

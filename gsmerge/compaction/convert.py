@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsmerge.compaction.placement import (
+    NUM_FULL,
+    add_colmap,
+    find_placement,
+    name_photos,
+    output_notes,
+    pad_harmonics,
+    place,
+)
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import scene_frame
-from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.io import (
     GaussianFile,
     atomic_outputs,
     file_notes,
-    lost_harmonics,
     output_format,
     read_cameras,
     read_gaussians,
     write_gaussians,
 )
-from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 from gsmerge.io.cameras.npz_files import holds_images
@@ -34,21 +38,17 @@ from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, input_format
 from gsmerge.io.formats.write import add_levels
-from gsmerge.io.image_names import match_images
 from gsmerge.io.photo_files import read_images
-from gsmerge.kernels.matrices import matmul
-from gsmerge.measure.visibility import front_rows
 from gsmerge.report import document_head, human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.files import result_cameras
-from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
 from gsmerge.types import Cameras, Gaussians, PicturedScene
 
-NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
 
 
@@ -130,55 +130,6 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
 
 
-def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
-    """Add zeros to harmonics that are fewer than ``count`` above degree 0."""
-    missing = max(0, count - gaussians.shN.shape[1])
-    return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
-
-
-def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:
-    """Find the map from the scene's frame into that of its file; the ``cameras`` say where up is."""
-    if not options.moves:
-        return IDENTITY
-    rotation = np.eye(3)
-    if options.up is not None:
-        axis = np.zeros(3)
-        axis[AXES.index(options.up) // 2] = -1 if options.up[0] == "-" else 1
-        upward = np.array([0.0, -1.0, 0.0]) if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
-        rotation = turn_to(normalize(upward), axis)
-    if options.rotate is not None:
-        rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
-    scale = 1.0 if options.scale is None else float(options.scale)
-    return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
-
-
-def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x between opposite ones.
-
-    Rodrigues' formula, for an axis and angle that the two vectors give.
-    """
-    cosine = float((start * end).sum())
-    if cosine < -1 + 1e-12:
-        about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
-        about = normalize(about - (about * start).sum() * start)
-        return 2 * np.outer(about, about) - np.eye(3)
-    x, y, z = np.cross(start, end)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + cosine))
-
-
-def place(
-    gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
-) -> tuple[Gaussians, Cameras]:
-    """Move Gaussians and cameras into a frame, and leave out harmonics above a degree."""
-    if sh_degree is not None:
-        gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
-    if frame is IDENTITY:
-        return gaussians, cameras
-    wide = replace(gaussians, means=gaussians.means.astype(np.float64))  # until they are written
-    return frame.move_gaussians(wide), frame.move(cameras)
-
-
 def _read_cameras(options: ConvertOptions) -> CameraFile | None:
     path = options.cameras or result_cameras(options.inputs[0])
     return None if path is None else read_cameras(path)
@@ -200,38 +151,6 @@ def _clean(
     seen = replace(scene, gaussians=canonical, cameras=frame.enter_cameras(cameras))
     left, counts = clean(canonical, options.clean, seen, frame.leave)
     return frame.leave(left), counts
-
-
-def add_colmap(
-    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, names: Sequence[str]
-) -> list[Path]:
-    """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
-
-    Returns the present paths of all its files.
-    """
-    files = [points, *map(add, files_beside(path))]
-    contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
-    for file, name in zip(files, MODEL_NAMES, strict=True):
-        file.write_bytes(contents[name])
-    return files
-
-
-def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
-    """Name views by their files in a folder of photos, as COLMAP does; where it has others, by the cameras' file."""
-    if photos is not None and photos.is_dir():
-        with suppress(SceneError):
-            return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]
-    return [name.removeprefix("./").removeprefix("images/") for name in names]  # as a transforms.json has them
-
-
-def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
-    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
-    lost = lost_harmonics(out, sh_degree, spz_version)
-    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
-    if COLMAP.names(out) and not place.is_dir():
-        files = "the photos" if photos is None or not photos.is_dir() else photos
-        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
-    return notes
 
 
 def _write(

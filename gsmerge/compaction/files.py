@@ -10,7 +10,9 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.convert import (
+from gsmerge.compaction.estimate import estimate, estimate_lines
+from gsmerge.compaction.methods import check_method
+from gsmerge.compaction.placement import (
     NUM_FULL,
     add_colmap,
     find_placement,
@@ -19,7 +21,6 @@ from gsmerge.compaction.convert import (
     pad_harmonics,
     place,
 )
-from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
@@ -35,7 +36,6 @@ from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP
 from gsmerge.io.formats.write import add_levels
-from gsmerge.measure.inspect import estimate, estimate_lines
 from gsmerge.plan import load_networks
 from gsmerge.report import document_head, report_document, to_json
 from gsmerge.runtime.memory import release_memory

@@ -34,6 +34,7 @@ from gsmerge.io.cameras.camera_file import (
     check_size,
 )
 from gsmerge.io.formats.read import clear_invalid
+from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.read import NO_CAMERAS
 from gsmerge.types import Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
@@ -378,7 +379,7 @@ def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
 
 def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
     """Refuse poses that see the Gaussians only in another convention; return notes."""
-    poses, check, note = choose_poses(gaussians, valid, cameras, images, W2C_OPENCV)
+    poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
     if poses is not None:
         raise _convention_error(poses.convention, poses.description, check.description)
     return [text for text in (note, None if check.ok else check.description) if text]

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, overload
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -67,7 +67,8 @@ class PhotoReader:
         return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
 
 
-Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB
+Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB; empty where there are none
+NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # photos as floats, where there are none
 
 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
@@ -94,10 +95,10 @@ def decode_images(paths: Sequence[Path]) -> Photos:
     return parallel_map(lambda path: decode_image(path, sizes[0]), paths)
 
 
-def change_photos(photos: Photos, size: Size, change: Callable[[int, np.ndarray], np.ndarray]) -> Photos:
-    """Apply ``change(number, photo)`` to every photo, at each use for a reader; ``size`` is the new size."""
+def change_photos(photos: Photos, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None) -> Photos:
+    """Apply ``change(number, photo)`` to every photo, at each use for a reader; ``size``: of the new ones."""
     if isinstance(photos, PhotoReader):
-        return PhotoReader(len(photos), size, lambda photo: change(photo, photos[photo]))
+        return PhotoReader(len(photos), size or photos.size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
 
 
@@ -116,7 +117,7 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
 
 def as_floats(images: Photos) -> np.ndarray:
     """Convert c uint8 images of one size to ``[c,h,w,3]`` float32 in [0, 1]."""
-    width, height = photo_size(images)
+    width, height = photo_size(images) or (1, 1)
     out = make_array((len(images), height, width, 3), np.float32)
 
     def convert(i: int) -> None:
@@ -127,19 +128,21 @@ def as_floats(images: Photos) -> np.ndarray:
     return out
 
 
-@overload
-def photo_size(photos: Photos) -> Size: ...
-
-
-@overload
-def photo_size(photos: Photos | None) -> Size | None: ...
-
-
-def photo_size(photos: Photos | None) -> Size | None:
+def photo_size(photos: Photos) -> Size | None:
     """Return (width, height) of the photos; None without any."""
-    if photos is None or isinstance(photos, PhotoReader):
-        return None if photos is None else photos.size
-    return photos[0].shape[1], photos[0].shape[0]
+    if isinstance(photos, PhotoReader):
+        return photos.size
+    return (photos[0].shape[1], photos[0].shape[0]) if len(photos) else None
+
+
+def photo_array(images: np.ndarray | None) -> np.ndarray:
+    """Return photos ``[c,h,w,3]`` as they are, and an array of none where there are none."""
+    return NO_IMAGES if images is None else images
+
+
+def select_photos(images: np.ndarray, ids: Sequence[int]) -> np.ndarray:
+    """Select photos ``[c,h,w,3]`` by their numbers; of none there are none."""
+    return images[list(ids)] if len(images) else images
 
 
 def same_shape(size: Size, other: Size) -> bool:
@@ -399,7 +402,7 @@ class PhotoTransform:
             whole = cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
             return np.ascontiguousarray(whole[self.top : self.top + self.height, self.left : self.left + self.width])
 
-        return change_photos(images, (self.width, self.height), one)
+        return change_photos(images, one, (self.width, self.height))
 
 
 def resize_to(size: Size, to: Size) -> PhotoTransform:

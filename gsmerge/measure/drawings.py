@@ -15,6 +15,7 @@ from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
 from gsmerge.measure.preview import (
     FOLDER,
@@ -131,12 +132,12 @@ def plan_panel(options: DrawOptions) -> Drawing:
 
     def draw(_: int) -> Iterator[Picture]:
         parts = [(path.name, gaussians) for path, gaussians in framed.scenes]
-        view_photos = None if photos is None else photos[used]
+        view_photos = photos[used] if len(photos) else None
         how = {"background": options.background, "antialiased": options.antialiased}
         rows = view_pictures(parts, cameras, view_photos, max_views=len(ids), **how)
-        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=view_photos is not None, **how)])
+        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=len(photos) > 0, **how)])
 
-    facts = {"scenes": framed.counts(), "views": ids, "photos": photos is not None, "notes": framed.notes}
+    facts = {"scenes": framed.counts(), "views": ids, "photos": len(photos) > 0, "notes": framed.notes}
     return Drawing([options.output], facts, draw)
 
 
@@ -254,7 +255,7 @@ def _with_views(load: Loaded) -> Loaded:
         return load
     with record_run() as record:
         scene = add_views(load.scene)
-    views = SceneViews(scene.cameras, None, scene.names, tuple(range(len(scene))))
+    views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
     return replace(load, scene=scene, views=views, notes=(*load.notes, *record.notes))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import count
@@ -147,7 +147,8 @@ class _Split:
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
     covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None until its renders show them
-    drawn: Gaussians | None  # the input, whose renders stand in for photos; None where there are photos
+    reference: str  # what the pictures are: photos, or what stands in for them
+    drawn: Gaussians | None = None  # the input, where its renders stand in
 
     def with_covered(self, masks: NDArray[np.bool_]) -> _Split:
         """Fill in the pixels ``[v,h,w]`` that the input covers, if they are not known."""
@@ -223,7 +224,8 @@ def evaluate(
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        splits, scores = _splits(scene, inputs, targets, renderer), []
+        reference = PHOTOS if scene is photos else ROW_COLORS
+        splits, scores = _splits(scene, reference, inputs, targets, renderer), []
         named = {INPUT: inputs, **results} if options.own else results
         fogs = options.fog and bool(results)
         fog = measure_fog(inputs, results, scene.cameras, renderer.near, progress) if fogs else {}
@@ -241,16 +243,13 @@ def evaluate(
                 splits = {kind: part.with_covered(opaque[kind]) for kind, part in splits.items()}
             scores.append(replace(score, fog=fog.get(name, {})))
     counts = {name: len(split.views.names) for name, split in splits.items()}
-    stand_in = RENDERS if scene.images is None else ROW_COLORS
-    reference = PHOTOS if photos.images is not None else _name_reference(stand_in, counts)
-    return Evaluation(tuple(scores), reference, counts, tuple(_notes(photos, splits, scores)), options)
+    return Evaluation(tuple(scores), _name_reference(splits), counts, tuple(_notes(photos, splits, scores)), options)
 
 
-def _name_reference(stand_in: str, splits: Container[str]) -> str:
-    """Name what results are compared with where something stands in for the photos of the input views."""
-    if "context" not in splits:
-        return PHOTOS
-    return f"{PHOTOS}, and {stand_in} in its own views" if "target" in splits else stand_in
+def _name_reference(splits: Mapping[str, _Split]) -> str:
+    """Name what results are compared with: photos, and what stands in for those of the input views."""
+    first, *others = dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits)
+    return f"{first}, and {others[0]} in its own views" if others else first
 
 
 def near_plane(scene: Scene) -> float:
@@ -260,7 +259,7 @@ def near_plane(scene: Scene) -> float:
 
 def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultScores]) -> Iterator[str]:
     """Name results that are worse than the input where it matters, and say what figures may mislead about."""
-    photos = scene.images is not None and "context" in splits
+    photos = "context" in splits and splits["context"].reference == PHOTOS
     mended = photos and not photos_count_as_they_are(scene)
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
@@ -274,27 +273,33 @@ def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultSc
         yield MENDED
 
 
-def _splits(scene: Scene, inputs: Gaussians, targets: Views | None, renderer: _Renderer) -> dict[str, _Split]:
-    """Split the views into input and held-out views, with photos or the input's renders, and visible pixels."""
+def _splits(
+    scene: Scene, reference: str, inputs: Gaussians, targets: Views | None, renderer: _Renderer
+) -> dict[str, _Split]:
+    """Split the views into input and held-out views, with visible pixels.
+
+    Pictures of input views are the scene's, which are what ``reference`` says, or renders of the input.
+    """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
     sources = scene.cameras if scene.aligned else cameras  # whose pixels the points come from
     points = context_points(scene, renderer.near, sources)
 
-    def split(views: Views, drawn: Gaussians | None, masks: np.ndarray | None = None) -> _Split:
+    def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
         visible = visible_pixels(points, views.cameras, renderer.near, sources)
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
-        return _Split(views, visible, None, drawn)
+        return _Split(views, visible, None, reference)
 
-    target = {} if targets is None else {"target": split(targets, None)}
+    target = {} if targets is None else {"target": split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
         return target
     if scene.images is not None:
         views = shrink_views(Views(scene.cameras, scene.images, scene.names), side)
+        context = split(views, reference, scene.masks)
     else:
-        views = Views(cameras, np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))]), scene.names)
-    context = split(views, inputs if scene.images is None else None, scene.masks)
+        drawn = np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))])
+        context = replace(split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
     if scene.missing is not None:
         stored = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.stored])
         context = context.with_covered(stored)

@@ -89,12 +89,12 @@ def view_pictures(
     renders = [render(gaussians, cameras[ids], **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
     for row, view in enumerate(ids):
-        pictures = [] if photos is None else [(f"photo, view {view}", to_picture(photos[view]))]
-        for i, (name, gaussians) in enumerate(scenes):
-            against = photos[view] if photos is not None else renders[0][row] if i else None
-            quality = "" if against is None else f", {psnr(renders[i][row], against):.1f} dB"
-            pictures.append((f"{name}: {len(gaussians):,}{quality}", to_picture(renders[i][row])))
-        views.append(pictures)
+        columns = [(f"{name}: {len(part):,}", drawn[row]) for (name, part), drawn in zip(scenes, renders, strict=True)]
+        if photos is not None:
+            columns.insert(0, (f"photo, view {view}", photos[view]))
+        first, *others = columns
+        compared = [(f"{text}, {psnr(image, first[1]):.1f} dB", image) for text, image in others]
+        views.append([(text, to_picture(image)) for text, image in (first, *compared)])
     return views
 
 

@@ -54,13 +54,12 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
         raise SceneError(path, "expected views that the scene was not made of, found none")
     chosen = select_views(camera_file, places)
     photos = stored_photos(SceneFiles(load.files.ply, path, _folder(path, chosen, images)), chosen)
-    if photos is None:
+    if not len(photos):
         root = path if path.is_dir() else path.parent
         missing = next((name for name in chosen.names if find_image(root, name) is None), chosen.names[0])
         raise SceneError(path, f"no photo found for {missing}", "name their folder with --target-images")
     pinholes, photos, _ = as_pinholes(chosen, photos)
     photos, notes = limit_photo_size(photos, 0, AUTO.max_side, unaligned=False)
-    assert photos is not None
     inverse = {view: place for place, view in shared.items()}
     complete = 0 < len(inverse) == len(load.scene)
     return HeldOutViews(
@@ -93,7 +92,7 @@ def _folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | N
         if not Path(images).is_dir():
             raise SceneError(images, "expected a folder of photos")
         return Path(images)
-    if cameras.images is not None:
+    if len(cameras.images):
         return path
     root = path if path.is_dir() else path.parent
     says = any((root / name).is_file() for name in cameras.names)

@@ -33,7 +33,7 @@ from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
-from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, TURNED, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
@@ -61,7 +61,7 @@ class SceneViews:
     """All c views of the camera file, in the frame of the Gaussians and at the size of the scene's pictures."""
 
     cameras: Cameras
-    images: np.ndarray | None  # ``[c,h,w,3]`` photos
+    images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     names: tuple[str, ...]
     used: tuple[int, ...]  # which of them the scene has, each once, in its order
 
@@ -95,8 +95,8 @@ class Loaded:
 
     def without_photos(self) -> Loaded:
         """Return a copy without the photos of the camera file, to free their memory; the scene keeps its photos."""
-        cameras = None if self.cameras is None else replace(self.cameras, images=None)
-        return replace(self, cameras=cameras, views=replace(self.views, images=None))
+        cameras = None if self.cameras is None else replace(self.cameras, images=())
+        return replace(self, cameras=cameras, views=replace(self.views, images=NO_IMAGES))
 
     @property
     def comments(self) -> tuple[str, ...]:
@@ -203,7 +203,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
         scene=scene,
         info=replace(used[0].info, num_nonfinite=sum(load.info.num_nonfinite for load in used)),
         files=files,
-        views=SceneViews(scene.cameras, scene.images, scene.names, tuple(range(len(scene)))),
+        views=SceneViews(scene.cameras, photo_array(scene.images), scene.names, tuple(range(len(scene)))),
         exporters=tuple(dict.fromkeys(exporter for load in used for exporter in load.exporters)),
         notes=(*notes, *joined.notes),
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
@@ -240,7 +240,7 @@ def align_scene(
     default_order = camera_file.order if exporter is None else exporter.order
     order = default_order if hints.order == "auto" else hints.order
     files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
-    pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else None)
+    pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else ())
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
@@ -253,8 +253,8 @@ def align_scene(
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
     size = photo_size(limited)
-    if files.masks is not None and (pictures is None or pictures is not whole):
-        notes.append(f"masks are not used: {'there are no photos' if pictures is None else 'the photos have bars'}")
+    if files.masks is not None and not (size and pictures is whole):
+        notes.append(f"masks are not used: {'the photos have bars' if size else 'there are no photos'}")
     if pictures is not whole:  # files with bars are not read again
         return _make_load(ply, files, hints, result, notes)
     large, masks, more = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
@@ -263,11 +263,13 @@ def align_scene(
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
     """Make a scene without views, in which some are placed later; SceneError if there are photos to use."""
-    if files.images is not None and hints.order != "none":
-        raise photos_without_cameras(files)
-    notes = [] if files.images is None else [f"the photos in {files.images} are not used: no cameras fit them"]
+    notes = []
+    if files.images is not None:
+        if hints.order != "none":
+            raise photos_without_cameras(files)
+        notes = [f"the photos in {files.images} are not used: no cameras fit them"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
-    return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, None, None, problem=problem), notes)
+    return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
 
 def _make_load(
@@ -285,27 +287,28 @@ def _make_load(
     gaussians, pixel_ids, missing, more = _place_rows(ply, result)
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
-        cameras, images = cameras[views], None if images is None else images[views]
+        cameras, images = cameras[views], select_photos(images, views)
     gaussians = _color_from_photos(gaussians, images, files)
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]
     masks, described = check_masks(masks, files)
     more += described
-    scene = Scene(gaussians, cameras, images, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
-    if camera_file is not None and layout is not None:
-        scene, note = _put_back(scene, camera_file, layout, views)
-        more += note
-        if layout.per_pixel == 1:
-            camera_file = select_views(camera_file, views)
+    photos = images if len(images) else None
+    scene = Scene(gaussians, cameras, photos, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
-    exporters = choose_exporters(hints.exporter, ply.info, layout, frame, source)
-    scene, turned = _with_rotations(scene, hints, exporters, frame)
-    more += turned
-    if not scene.aligned and camera_file is not None:
-        more.append("the rows belong to no pixels that could be found: unaligned")
-        if hints.exporter != "auto":
-            more[-1] += f"; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
+    exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
+    if layout is None or frame is None:
+        scene = read_rotations(scene, hints.quats)
+        more += [] if camera_file is None else [_unaligned_note(hints)]
+    else:
+        assert camera_file is not None, "pixels are those of cameras"
+        scene, note = _put_back(scene, camera_file, layout, views)
+        scene, turned = _with_rotations(scene, hints, exporters, frame)
+        more += [*note, *turned]
+        alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
+        if layout.per_pixel == 1:
+            camera_file = select_views(camera_file, views)
     return Loaded(
         scene=scene,
         info=ply.info,
@@ -314,18 +317,26 @@ def _make_load(
         views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
         exporters=exporters,
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
-        alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored) if scene.aligned else None,
+        alignment=alignment,
         recovery=result.recovery,
         problem=result.problem,
         moves=result.moves,
     )
 
 
-def _color_from_photos(gaussians: Gaussians, images: np.ndarray | None, files: SceneFiles) -> Gaussians:
+def _unaligned_note(hints: ReadHints) -> str:
+    """Say that rows have no pixels, and what was not tried."""
+    note = "the rows belong to no pixels that could be found: unaligned"
+    if hints.exporter == "auto":
+        return note
+    return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
+
+
+def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFiles) -> Gaussians:
     """Give Gaussians of depth maps without images the photos' colours; others stay. SceneError without photos."""
     if input_format(files.ply) is not DEPTHS or holds_images(files.ply):
         return gaussians
-    if images is None or images.size != 3 * len(gaussians):
+    if images.size != 3 * len(gaussians):
         problem = "expected images with the depth maps, found none, and no photos of their views"
         raise SceneError(files.ply, problem, "name their folder with --images")
     return replace(gaussians, sh0=rgb_to_sh0(images.reshape(-1, 1, 3)))
@@ -333,12 +344,15 @@ def _color_from_photos(gaussians: Gaussians, images: np.ndarray | None, files: S
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
     """Put pixels back that the exporter dropped, where their depths are known or can be guessed; with a note."""
+    images = scene.images
+    if images is None or scene.missing is None:
+        return scene, []
     depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
     source = "from the depth maps"
     if depths is not None:
-        full = fill_from_depths(scene, depths[views])
-    elif layout.kind == "pruned" and layout.per_pixel == 1 and scene.missing is not None:
-        full = fill_from_depths(scene, guess_depths(scene))
+        full = fill_from_depths(scene, depths[views], images)
+    elif layout.kind == "pruned" and layout.per_pixel == 1:
+        full = fill_from_depths(scene, guess_depths(scene, images), images)
         source = "at depths where the photos agree"
     else:
         return scene, []
@@ -388,11 +402,11 @@ def _counts_up(ids: np.ndarray) -> bool:
 
 
 def _with_rotations(
-    scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity | None
+    scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity
 ) -> tuple[Scene, list[str]]:
     """Read rotations as given, as the given exporter stores them, or as fits the surface; with a note."""
-    turn = frame.rotation if frame is not None and frame.kind in TURNED else None
-    if hints.quats != "auto" or not scene.aligned:
+    turn = frame.rotation if frame.kind in TURNED else None
+    if hints.quats != "auto":
         return read_rotations(scene, hints.quats, turn), []
     if hints.exporter != "auto":
         return read_rotations(scene, exporters[0].quats, turn), []
@@ -416,10 +430,9 @@ def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadH
             load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)
             break
     else:
-        pictures = stored_photos(files, camera_file) if photos else None
-        images = None if pictures is None else as_floats(pictures)
+        pictures = stored_photos(files, camera_file) if photos else ()
         cameras = to_cameras(camera_file, photo_size(pictures))
         note = "the cameras do not fit the Gaussians and stay as their file has them"
-        as_stored = AlignmentResult(None, cameras, images, camera_file)
+        as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
         load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
     return load if load.scene.aligned else replace(load, notes=load.notes[:-1])  # without that there are no pixels

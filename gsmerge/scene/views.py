@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -81,52 +80,60 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
         photos = stored_photos(files, stored)
         estimated = estimate_focal(ply, stored, photos)
         if estimated is None:
-            reason = "no focal length fits the Gaussians" if photos is not None else "no photos that show them"
+            reason = "no focal length fits the Gaussians" if len(photos) else "no photos that show them"
             raise missing_intrinsics(stored.path, f", and {reason}")
         return estimated
-    cameras = read_sharp_camera(files.ply)
-    if cameras is None and files.images is not None and files.images.is_dir():
-        paths = list_images(files.images)
-        width, height = image_size(paths[0]) if paths else (0, 0)
-        names = [path.relative_to(files.images).as_posix() for path in paths]
-        rows = ply.gaussians, ply.valid
-        cameras = estimate_cameras(files.ply, *rows, names, width, height)
-        cameras = _read_grid(ply, files, paths) if cameras is None else cameras
-        if cameras is None:
-            size, read = (width, height), partial(decode_images, paths)
-            cameras = estimate_with_photos(files.ply, *rows, names, size, read)
-    elif cameras is None:
-        cameras = _read_grid(ply, files, images_beside(files.ply) if files.images is None else [])
+    sharp = read_sharp_camera(files.ply)
+    if sharp is not None:
+        return sharp
+    if files.images is None:
+        return _estimate_grid(ply, files.ply, images_beside(files.ply), files.ply.parent)
+    return _estimate_cameras(ply, files.ply, files.images) if files.images.is_dir() else _estimate_grid(ply, files.ply)
+
+
+def _estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile | None:
+    """Estimate cameras of the photos in a folder; None where rows and photos do not tell.
+
+    SceneError where the rows are a grid whose views no photo shows.
+    """
+    paths = list_images(folder)
+    size = image_size(paths[0]) if paths else (0, 0)
+    names = [photo.relative_to(folder).as_posix() for photo in paths]
+    rows = ply.gaussians, ply.valid
+    cameras = estimate_cameras(path, *rows, names, *size)
+    if cameras is not None:
+        return cameras
+    cameras = _estimate_grid(ply, path, paths, folder)
+    if cameras is None:
+        return estimate_with_photos(path, *rows, names, size, partial(decode_images, paths))
+    if paths and cameras.photo_map is None:
+        grid = f"{len(cameras)} views of {cameras.widths[0]} x {cameras.heights[0]} pixels"
+        problem = f"expected photos of the {grid} whose grid the Gaussians are"
+        raise SceneError(folder, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
     return cameras
 
 
-def _read_grid(ply: GaussianFile, files: SceneFiles, paths: Sequence[Path]) -> CameraFile | None:
-    """Estimate the cameras of rows that are a grid, and find the photos of its views; None where they are none.
-
-    SceneError where a folder of images has none of them.
-    """
-    grid = estimate_from_rows(files.ply, ply.gaussians, ply.valid)
+def _estimate_grid(
+    ply: GaussianFile, path: Path, paths: Sequence[Path] = (), folder: Path = Path()
+) -> CameraFile | None:
+    """Estimate the cameras of rows that are a grid, and find its photos among some of a folder; None for other rows."""
+    grid = estimate_from_rows(path, ply.gaussians, ply.valid)
     if grid is None:
         return None
     cameras, pictures = grid
     match = match_photos(pictures, paths)
-    if match is not None:
-        chosen = (paths[photo].relative_to(files.images or files.ply.parent) for photo in match.chosen)
-        Ks = cameras.Ks.copy()
-        Ks[:, :2, 2] += match.trim
-        return replace(
-            cameras,
-            Ks=Ks,
-            widths=cameras.widths + 2 * match.trim,
-            heights=cameras.heights + 2 * match.trim,
-            names=tuple(path.as_posix() for path in chosen),
-            photo_map=(match.size, match.transform),
-        )
-    if files.images is None or not paths:
+    if match is None:
         return cameras
-    views, height, width = pictures.shape[:3]
-    problem = f"expected photos of the {views} views of {width} x {height} pixels whose grid the Gaussians are"
-    raise SceneError(files.images, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
+    Ks = cameras.Ks.copy()
+    Ks[:, :2, 2] += match.trim
+    return replace(
+        cameras,
+        Ks=Ks,
+        widths=cameras.widths + 2 * match.trim,
+        heights=cameras.heights + 2 * match.trim,
+        names=tuple(paths[photo].relative_to(folder).as_posix() for photo in match.chosen),
+        photo_map=(match.size, match.transform),
+    )
 
 
 def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
@@ -134,24 +141,21 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
 
     WorldMirror squeezes what is too tall into ``images``, and cuts it in ``images_resized``.
     """
-    seen = None if files.images is None else files.images.parent / _SEEN_PLACE
-    if files.images is None or seen is None or files.images.name == _SEEN_PLACE or not seen.is_dir():
+    usual = files.images
+    if usual is None or usual.name == _SEEN_PLACE or not (usual.parent / _SEEN_PLACE).is_dir():
         return files, []
+    seen = usual.parent / _SEEN_PLACE
 
     def ratio(images: Path) -> float:
         photos = stored_photos(replace(files, images=images), camera_file)
-        if photos is None:
-            return math.nan
         cameras = to_cameras(camera_file, photo_size(photos))
         return check_cameras(ply.gaussians, ply.valid, cameras, as_floats(photos)).color_ratio
 
     try:
-        better = ratio(seen) < _SHOWS_BETTER * ratio(files.images)
+        better = ratio(seen) < _SHOWS_BETTER * ratio(usual)
     except SceneError:  # photos of other views
         return files, []
-    note = (
-        f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {files.images.name} are not"
-    )
+    note = f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {usual.name} are not"
     return (replace(files, images=seen), [note]) if better else (files, [])
 
 
@@ -166,35 +170,37 @@ def photos_without_cameras(files: SceneFiles) -> SceneError:
     return SceneError(files.ply, problem, remedy)
 
 
-def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    """Read the photos of the cameras from a folder, from a file that holds them, or from where the camera file says."""
-    photos = _stored_photos(files, camera_file)
-    photos = photos if photos is None else _turn_photos(photos, _photo_turns(files, camera_file))
+def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
+    """Read the photos of the cameras from a folder, from a file that holds them, or from where the camera file says.
+
+    Empty where there are none.
+    """
+    paths = _photo_paths(files, camera_file)
+    photos = decode_images(paths) if paths else _photos_inside(files, camera_file)
+    photos = _turn_photos(photos, _photo_turns(files, camera_file))
     old, size = photo_size(photos), (int(camera_file.widths[0]), int(camera_file.heights[0]))
-    if photos is None or old is None or camera_file.source != SHARP or old == size:
+    if old is None or camera_file.source != SHARP or old == size:
         return photos
     return resize_to(old, size).photos(photos)
 
 
-def _stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos | None:
-    paths = _photo_paths(files, camera_file)
-    if paths is not None or files.images is None:
-        return decode_images(paths) if paths else None
+def _photos_inside(files: SceneFiles, camera_file: CameraFile) -> Photos:
+    """Read the photos that a file holds; empty without such a file."""
+    if files.images is None:
+        return ()
     if is_frame(files.images):
         return read_images(files.plys)
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
-    if same_file and stored is None and files.images.suffix == CHUNK:
-        return None
-    if stored is None or len(stored) != len(camera_file):
-        count = 0 if stored is None else len(stored)
-        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {count}")
+    without = same_file and files.images.suffix == CHUNK and not len(stored)
+    if not without and len(stored) != len(camera_file):
+        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {len(stored)}")
     return stored
 
 
 def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
     """Return the quarter turns that SHARP, alone among the models, makes by the orientation tag."""
-    paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else None
+    paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else []
     turns = quarter_turns(paths[0]) if paths else 0
     if turns % 2 == 0 or not paths:
         return turns
@@ -211,16 +217,15 @@ def _turn_photos(photos: Photos, turns: int) -> Photos:
     if turns == 0:
         return photos
     size = photo_size(photos)
-    turned = size[::-1] if turns % 2 else size
 
     def turn(_: int, photo: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.rot90(photo, turns))
 
-    return change_photos(photos, turned, turn)
+    return change_photos(photos, turn, size[::-1] if size and turns % 2 else size)
 
 
-def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | None:
-    """Find the photo file of every camera; None where there are none, or they are inside another file."""
+def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path]:
+    """Find the photo file of every camera; empty where there are none, or they are inside another file."""
     if files.images is None:
         folder = Path(camera_file.path).parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
@@ -230,8 +235,8 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path] | Non
             and all(name.removeprefix("view ").isdecimal() for name in camera_file.names)
         ):
             paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
-        return paths if len(paths) == len(camera_file) else None
-    return None if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
+        return paths if len(paths) == len(camera_file) else []
+    return [] if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
 
 
 def images_beside(ply: Path) -> list[Path]:
@@ -243,7 +248,7 @@ def images_beside(ply: Path) -> list[Path]:
 def find_larger_and_masks(
     files: SceneFiles,
     camera_file: CameraFile,
-    photos: Photos | None,
+    photos: Photos,
     size: Size | None,
     transform: PhotoTransform | None,
     cameras: Cameras,
@@ -255,14 +260,15 @@ def find_larger_and_masks(
     rows; ``cameras`` are the scene's, in the order of the camera file. Masks ``[c,h,w]`` bool come from files and from
     transparency; None if all pixels count. Also returns notes.
     """
-    if photos is None or size is None:
+    file_size = photo_size(photos)
+    if file_size is None or size is None:
         return None, None, []
     paths = _photo_paths(files, camera_file)
-    file_size = photo_size(photos) if paths is None else image_size(paths[0])
-    turns = 0 if paths is None else _photo_turns(files, camera_file)
+    file_size = image_size(paths[0]) if paths else file_size
+    turns = _photo_turns(files, camera_file)
     stored = file_size[::-1] if turns % 2 else file_size
     window = _file_window(stored, size, transform, cameras)
-    lenses = () if paths is None else camera_file.lenses
+    lenses = camera_file.lenses if paths else ()
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
     def cut(view: int, picture: np.ndarray) -> np.ndarray:
@@ -272,15 +278,15 @@ def find_larger_and_masks(
         return np.ascontiguousarray(np.rot90(picture, turns)[window.rows, window.columns])
 
     def read(view: int) -> np.ndarray:
-        return cut(view, photos[view] if paths is None else decode_image(paths[view], file_size))
+        return cut(view, decode_image(paths[view], file_size) if paths else photos[view])
 
     large = None
     if window.is_larger:
         width, height = (part.stop - part.start for part in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
-    names = camera_file.names if paths is None else [path.as_posix() for path in paths]
+    names = [path.as_posix() for path in paths] or list(camera_file.names)
     named, notes = _match_masks(files.masks, names)
-    alphas = [None] * len(names) if paths is None else paths
+    alphas: Sequence[Path | None] = paths or [None] * len(names)
 
     def read_parts(view: int) -> list[np.ndarray]:
         """Read what a mask, upright, and the photo's transparency, as it is stored, say."""
@@ -367,12 +373,13 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
     return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * shown).max() < 1))
 
 
-def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | None, list[str]]:
+def cut_bars(photos: Photos, camera_file: CameraFile) -> tuple[Photos, list[str]]:
     """Cut off bars around photos if the rest has the cameras' shape, with a note; otherwise change nothing."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
-    fits = camera_file.photo_map is not None or any(same_shape(shape, size) for shape in shapes if size is not None)
-    if photos is None or size is None or not shapes or fits:
+    if size is None or not shapes or camera_file.photo_map is not None:
+        return photos, []
+    if any(same_shape(shape, size) for shape in shapes):
         return photos, []
     counts = [count_bars(photos[view], _BAR_SPREAD) for view in range(len(photos))]
     above, below, left, right = (int(count) for count in np.median(counts, 0))
@@ -384,18 +391,16 @@ def cut_bars(photos: Photos | None, camera_file: CameraFile) -> tuple[Photos | N
         return np.ascontiguousarray(photo[above : size[1] - below, left : size[0] - right])
 
     note = f"the photos of {size[0]} x {size[1]} have bars around pictures of {inner[0]} x {inner[1]}: they are cut off"
-    return keep_photos(change_photos(photos, inner, cut)), [note]
+    return keep_photos(change_photos(photos, cut, inner)), [note]
 
 
-def limit_photo_size(
-    photos: Photos | None, rows: int, max_side: int, *, unaligned: bool
-) -> tuple[Photos | None, list[str]]:
+def limit_photo_size(photos: Photos, rows: int, max_side: int, *, unaligned: bool) -> tuple[Photos, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
 
     Photos whose pixels may be the file's ``rows`` Gaussians keep their size, unless they are known to be ``unaligned``.
     """
     size = photo_size(photos)
-    if photos is None or size is None:
+    if size is None:
         return photos, []
     pixels = len(photos) * size[0] * size[1]
     if not unaligned and (_FLOAT_PIXEL * pixels <= _MAX_BYTES or 2 * rows > pixels):
@@ -404,15 +409,13 @@ def limit_photo_size(
     return photos if transform is None else keep_photos(transform.photos(photos)), notes
 
 
-def limit_view_size(
-    cameras: Cameras, images: np.ndarray | None, max_side: int
-) -> tuple[Cameras, np.ndarray | None, list[str]]:
+def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; with a note."""
     transform, notes = _limit((cameras.width, cameras.height), max_side)
     if transform is not None:
-        cameras = transform.cameras(cameras)
-        smaller = None if images is None else transform.photos(images)
-        images = None if smaller is None else np.stack([smaller[view] for view in range(len(smaller))])
+        cameras, smaller = transform.cameras(cameras), transform.photos(images)
+        pictures = np.array([smaller[view] for view in range(len(smaller))], images.dtype)
+        images = pictures.reshape(-1, cameras.height, cameras.width, 3)
     return cameras, images, notes
 
 

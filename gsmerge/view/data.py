@@ -15,7 +15,7 @@ from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
-from gsmerge.io.photo_files import encode_indexed
+from gsmerge.io.photo_files import encode_indexed, photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate, near_plane
 from gsmerge.measure.fog import ALL, Fog
@@ -129,7 +129,7 @@ def collect(
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
     theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
     """
-    pictures = with_row_colors(scene).images
+    pictures = photo_array(with_row_colors(scene).images)
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     stills: dict[tuple[str, str, int], bytes] = {}
@@ -149,6 +149,8 @@ def collect(
     means = frame.enter(named[evaluation.results[:2][-1].name]).means
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
+        encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
+        encoded = encoded or [None] * len(names)
         for i, name in enumerate(short_names(names)):
             camera = frame.enter_cameras(places[[i]])
             views.append(PageView(
@@ -157,7 +159,7 @@ def collect(
                 held_out=split == "target",
                 camera=camera,
                 distance=middle_depth(means, camera),
-                photo=None if photos is None else encode_still(to_picture(photos[i])),
+                photo=encoded[i],
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
@@ -192,11 +194,11 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
 
 
 def with_outlines(
-    views: Sequence[PageView], photos: np.ndarray | None, options: SegmentOptions
+    views: Sequence[PageView], photos: np.ndarray, options: SegmentOptions
 ) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
-    """Add outlines of superpixels to the input views; also return the least and largest number of superpixels."""
-    places = [i for i, view in enumerate(views) if not view.held_out]
-    if photos is None or not places:
+    """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
+    places = [i for i, view in enumerate(views) if view.photo and not view.held_out]
+    if not places:
         return tuple(views), None
     pictures = photos[[views[i].place for i in places]]
     groups = segment(pictures, options)

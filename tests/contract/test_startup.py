@@ -78,7 +78,7 @@ def test_compacting_needs_neither_torch_nor_scipy(settings: list[str], made_scen
 def test_submodule_imports_do_not_hide_functions() -> None:
     """Modules may share their names with public functions, but not at the top."""
     print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
-    assert run_python(f"import gsmerge.raster, gsmerge.measure.inspect\n{print_kinds}").split() == [
+    assert run_python(f"import gsmerge.raster, gsmerge.compaction.inspect\n{print_kinds}").split() == [
         "function",
         "function",
     ]

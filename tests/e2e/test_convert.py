@@ -12,7 +12,8 @@ import pytest
 from messages import noted, refuses
 
 import gsmerge
-from gsmerge.compaction.convert import ConvertOptions, convert_files, find_placement, join_gaussians, turn_to
+from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
+from gsmerge.compaction.placement import find_placement, turn_to
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile

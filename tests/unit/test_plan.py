@@ -11,10 +11,10 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.compaction.estimate import estimate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.measure.inspect import estimate
 from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, plan_whole, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES

@@ -79,9 +79,7 @@ class CameraFile:
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
-    images: np.ndarray | PhotoReader | None = (
-        None  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
-    )
+    images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
     # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
@@ -117,7 +115,7 @@ def make_camera_file(
     source: str,
     convention: Convention,
     views: Sequence[View],
-    images: np.ndarray | PhotoReader | None = None,
+    images: Photos = (),
     order: str = "auto",
 ) -> CameraFile:
     """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
@@ -301,7 +299,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
     return Cameras(camera_file.viewmats, Ks, *size)
 
 
-def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraFile, Photos | None, list[str]]:
+def as_pinholes(camera_file: CameraFile, photos: Photos) -> tuple[CameraFile, Photos, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
     SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of one.
@@ -311,7 +309,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos | None) -> tuple[CameraF
     pinholes = replace(camera_file, lenses=())
     name = next(lens.name for lens in camera_file.lenses if lens is not None)
     size = photo_size(photos)
-    if photos is None or size is None:
+    if size is None:
         problem = f"expected a pinhole camera, or images to undistort, found {name} with lens distortion and no images"
         raise SceneError(camera_file.path, problem, "name the images with --images, or undistort them first")
     for w, h in sizes_of(camera_file):
@@ -348,7 +346,7 @@ def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | Non
         maps = _rectify_maps(Ks[view], lens, (photo.shape[1], photo.shape[0]))
         return cv2.remap(photo, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    return change_photos(photos, photo_size(photos), one)
+    return change_photos(photos, one)
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:

@@ -8,13 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from plyfile import PlyData
 
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, View, make_camera_file
 from gsmerge.io.formats.ply import open_ply
-from gsmerge.io.photo_files import PhotoReader
+from gsmerge.io.photo_files import Photos
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class StoredCameras(NamedTuple):
     """Cameras as a file stores them, before conversion."""
 
     views: list[View]
-    images: np.ndarray | PhotoReader | None = None  # ``[c,h,w,3]`` uint8 sRGB
+    images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
     convention: Convention | None = None  # where the numbers show another one than the format's
 

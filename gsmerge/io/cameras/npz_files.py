@@ -22,6 +22,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.photo_files import Photos
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
@@ -55,8 +56,10 @@ def read_da3(source: CameraSource) -> StoredCameras:
     poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
     Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
-    images = None if images is None else _as_images(path, images, len(poses))
-    grid = images if images is not None else depths
+    photos: Photos = ()
+    grid = depths
+    if images is not None:
+        photos = grid = _as_images(path, images, len(poses))
     Ks = None if Ks is None else Ks.astype(np.float64)
     width = height = 0
     if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
@@ -65,8 +68,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
-        return StoredCameras(_views(poses, Ks, (0, 0)), images, convention=C2W_OPENCV)
-    return StoredCameras(_views(poses, Ks, (width, height)), images)
+        return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
+    return StoredCameras(_views(poses, Ks, (width, height)), photos)
 
 
 def read_dump(source: CameraSource) -> StoredCameras:

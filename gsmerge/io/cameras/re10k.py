@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_VIEWS, ReadBudget, read_budget, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.photo_files import PhotoReader, decode_embedded, photo_size
+from gsmerge.io.photo_files import Photos, decode_embedded, photo_size
 from gsmerge.io.pickles import Names, read_pickle
 from gsmerge.types import StrPath
 
@@ -92,11 +92,11 @@ def _rows(path: StrPath, cameras: Any) -> np.ndarray:
         return cameras.read().astype(np.float64)
 
 
-def _photos(budget: ReadBudget, images: Any, names: list[str]) -> np.ndarray | PhotoReader | None:
-    """Decode the photos ``[v,h,w,3]`` uint8; None where the chunk has none."""
+def _photos(budget: ReadBudget, images: Any, names: list[str]) -> Photos:
+    """Decode the photos ``[v,h,w,3]`` uint8; none where the chunk has none."""
     listed = isinstance(images, list | tuple)
     if images is None or (listed and not images):
-        return None
+        return ()
     if not listed or len(images) != len(names):
         count = len(images) if listed else type(images).__name__
         raise SceneError(budget.path, f"expected {len(names)} images, one per camera, found {count}")

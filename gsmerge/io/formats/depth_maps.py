@@ -77,15 +77,15 @@ def read_rows(path: Path) -> StoredRows:
     in size.
     """
     depths, cameras = _read_frame(path) if is_frame(path) else _read_views(path)
-    images = None if cameras.images is None else np.asarray(cameras.images)
-    if images is not None and images.shape[:3] != depths.shape:
+    grey = np.broadcast_to(np.uint8(_GREY), (*depths.shape, 3))  # takes no memory
+    images = np.asarray(cameras.images) if len(cameras.images) else grey
+    if images.shape[:3] != depths.shape:
         problem = f"expected images of the depth maps' size {list(depths.shape)}, found {list(images.shape[:3])}"
         raise SceneError(path, problem)
     check_pixels(path, depths.shape[2], depths.shape[1])
     check_count(read_budget(path), depths.size, 0, _PIXEL_BYTES)
-    pictures = np.full((*depths.shape, 3), _GREY, np.uint8) if images is None else images
-    parts = [_pack(*view) for view in zip(depths, pictures, cameras.Ks, cameras.viewmats, strict=True)]
-    sizes = {"means": depths.nbytes, "sh0": 0 if images is None else images.nbytes}
+    parts = [_pack(*view) for view in zip(depths, images, cameras.Ks, cameras.viewmats, strict=True)]
+    sizes = {"means": depths.nbytes, "sh0": 0 if images is grey else images.nbytes}
     return replace(to_stored(parts, "depth maps", sizes), format=str(depths.dtype))
 
 

@@ -14,6 +14,7 @@ from tiny_scene import Tiny, edited_json, make_tiny
 from gsmerge.alignment import choose_poses, other_conventions
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
+from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
 
@@ -72,7 +73,7 @@ def test_a_tie_is_said() -> None:
     c2w[:, :3, 3] *= 0.1
     wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
     cameras = Cameras(np.linalg.inv(c2w), np.tile(wide, (3, 1, 1)), 20, 14)
-    poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, None, W2C_OPENCV)
+    poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, NO_IMAGES, W2C_OPENCV)
     assert poses is None
     assert seen.ok
     assert said is not None

@@ -12,7 +12,7 @@ from exports import export_rows, save_export, smooth_scene, turned
 from messages import noted, refuses
 from tiny_scene import make_tiny, write_images
 
-from gsmerge.alignment import recovery, unaligned
+from gsmerge.alignment import readings, unaligned
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
 from gsmerge.scene.read import load_scene
@@ -85,13 +85,13 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
 def test_no_frame_is_solved_for_rows_that_no_camera_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of VolSplat's rows allows many grids; none of them is worth a search."""
     efforts = []
-    usual = recovery.candidate_similarities
+    usual = readings.candidate_similarities
 
     def count(*args: object, effort: int = 2, **options: object) -> object:
         efforts.append(effort)
         return usual(*args, effort=effort, **options)
 
-    monkeypatch.setattr(recovery, "candidate_similarities", count)
+    monkeypatch.setattr(readings, "candidate_similarities", count)
     load_scene(save_export(tmp_path, SMOOTH, turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])))
     assert set(efforts) == {0}
 

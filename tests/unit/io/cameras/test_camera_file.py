@@ -22,10 +22,10 @@ from tiny_scene import (
     write_transforms,
 )
 
+from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
-from gsmerge.measure.inspect import inspect
 from gsmerge.scene.read import load_scene
 
 

@@ -35,7 +35,7 @@ def test_transforms_with_global_intrinsics(tmp_path: Path, tiny: Tiny) -> None:
     assert_same(actual, tiny)
     assert actual.names == tuple(f"images/{n}" for n in tiny.names)
     assert actual.source == "transforms.json"
-    assert actual.images is None
+    assert len(actual.images) == 0
 
 
 def test_transforms_with_intrinsics_of_each_view(tmp_path: Path, tiny: Tiny) -> None:

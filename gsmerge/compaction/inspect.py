@@ -9,35 +9,29 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import check_cameras
+from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
-from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise, missing_notes
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import GaussianFile, file_notes
-from gsmerge.io.formats.ply import file_bytes, is_from_gsmerge
+from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.measure.visibility import MAX_SAMPLES, inside_views
-from gsmerge.plan import plan_whole, resolve_budget, stands_alone
+from gsmerge.io.photo_files import photo_array
+from gsmerge.measure.coverage import TRANSPARENT, coverage, extents
 from gsmerge.report import finite, human_bytes
-from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.record import record_part, report_progress
-from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.read import align_scene, read_rows
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import largest_count
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import Gaussians, PicturedScene, Scene, StrPath
+from gsmerge.types import PicturedScene, Scene, StrPath
 
-HUGE_SCALE_SHARE = 0.1  # of the box's diagonal: larger scales show no detail
-MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
-_TRANSPARENT, _OPAQUE = 1 / 255, 0.995  # opacities: one step of an 8-bit image; where optical depth is capped
+_OPAQUE = 0.995  # opacity from which optical depth is capped
 _SATURATED = 1e-6  # of an opacity's distance to 0 or 1: its logit changes in float32
 _OWN = "gsmerge"  # the exporter's name of files that gsmerge wrote
 _FILE_KEYS = (
@@ -76,11 +70,11 @@ def inspect(
         ``bytes_by_attribute``, ``layout``, ``format``, ``exporter``, ``extra_columns`` and ``extra_elements`` (which
         mean nothing here), ``sh_degree``, ``opacity_encoding``. Of the Gaussians: ``count``, ``num_nonfinite``,
         ``num_clipped_scales``, ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255),
-        ``num_saturated`` (within 1e-6 of 0 or 1), ``extents`` (:func:`extents`). Of the views: ``cameras``,
-        ``camera_format``, ``images``, ``num_views``, ``width`` and ``height`` (0 without a grid of pixels),
-        ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order), ``alignment`` (or
+        ``num_saturated`` (within 1e-6 of 0 or 1), ``extents`` (where they lie, how large they are). Of the views:
+        ``cameras``, ``camera_format``, ``images``, ``num_views``, ``width`` and ``height`` (0 without a grid of
+        pixels), ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order), ``alignment`` (or
         ``alignment_problem``, why it could not be measured), ``sight`` (what the cameras see), ``coverage`` (shares of
-        the pixels and of the Gaussians in each view), ``num_sky_views``. ``compact``: :func:`estimate` with the
+        the pixels and of the Gaussians in each view), ``num_sky_views``. ``compact``: the estimate of a run with the
         defaults, None where ``compact`` would refuse the scene; ``auto``: what ``--budget auto`` makes of it, with
         ``share``, ``num_gaussians`` and ``why``, None where a curve would decide. ``notes``: warnings.
 
@@ -113,7 +107,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
         "bytes": info.file_bytes,
         "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
         "num_opaque": int((opacities >= _OPAQUE).sum()),
-        "num_transparent": int((opacities < _TRANSPARENT).sum()),
+        "num_transparent": int((opacities < TRANSPARENT).sum()),
         "num_saturated": int(((opacities <= _SATURATED) | (opacities >= 1 - _SATURATED)).sum()),
     }
 
@@ -155,11 +149,10 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
-        stored = scene.stored.reshape(-1) if scene.aligned else np.ones(len(gaussians), bool)
-        sight = check_cameras(gaussians, stored, scene.cameras, scene.images)
-        if scene.images is not None:
-            means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
-            num_sky_views = len(sky_regions(means, scene.cameras, scene.images))
+        stored, images = scene.stored_rows, photo_array(scene.images)
+        sight = check_cameras(gaussians, stored, scene.cameras, images)
+        means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
+        num_sky_views = len(sky_regions(means, scene.cameras, images))
     facts |= {"notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
@@ -177,117 +170,6 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "alignment": asdict(load.alignment),
         "rows": load.recovery.description,
     }
-
-
-def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure where finite Gaussians lie and how large they are, world units, on a sample if there are many.
-
-    Returns:
-        ``box_low`` and ``box_high``: 1 % and 99 % of the positions per axis; ``diagonal`` of that box;
-        ``share_outliers`` beyond ten times the box about its middle; ``share_floaters``: isolated, or beyond that;
-        ``scale_median`` of each Gaussian's largest scale; ``scale_max`` of all; ``share_huge``: scales above a tenth
-        of the diagonal. Zeros where there are no Gaussians.
-    """
-    names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
-    if len(gaussians) == 0:
-        return {"box_low": [0.0] * 3, "box_high": [0.0] * 3, **dict.fromkeys(names, 0.0)}
-    step = -(-len(gaussians) // MAX_SAMPLES)
-    points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
-    low, high = np.percentile(points, BOX_QUANTILES, axis=0)
-    diagonal = np.linalg.norm(high - low)
-    values = (
-        diagonal, beyond_scene(points).mean(), floater_share(gaussians), np.median(largest[::step]), largest.max(),
-        (largest[::step] > HUGE_SCALE_SHARE * diagonal).mean(),
-    )  # fmt: skip
-    shares = {name: float(value) for name, value in zip(names, values, strict=True)}
-    return {"box_low": low.tolist(), "box_high": high.tolist(), **shares}
-
-
-def coverage(scene: Scene) -> list[dict[str, Any]]:
-    """Measure, for each view, the share of its pixels with a visible Gaussian. Layers count as views.
-
-    For each view: its ``name``, ``share_of_pixels`` that have a visible Gaussian of their own (None without pixels),
-    and ``share_of_gaussians`` whose centre is inside the picture.
-    """
-    if len(scene) == 0:
-        return []
-    shares = _shares_inside(scene, MAX_SAMPLES)
-    pixels: list[float | None] = [None] * len(scene)
-    if scene.aligned:
-        visible = (scene.gaussians.opacities >= _TRANSPARENT).reshape(scene.valid.shape) & scene.stored
-        pixels = [float(view.mean()) for view in visible]
-    keys = ("name", "share_of_pixels", "share_of_gaussians")
-    return [dict(zip(keys, view, strict=True)) for view in zip(scene.names, pixels, shares, strict=True)]
-
-
-def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
-    """Estimate size, time and memory of a run without running it.
-
-    Returns:
-        ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
-        known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
-        ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
-        machine has enough.
-    """
-    size = measure_size(scene)
-    if options.budget.auto and scene.aligned:
-        options = resolve_budget(options, canonicalise(scene)[0])
-    whole = plan_whole(size, options)
-    limits, settings = whole.limits, whole.settings(options)
-    pixels = max(limits.num_pixels, scene.num_gaussians)
-    most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
-    count = min(scene.num_gaussians or pixels, most)
-    at_once, num_rest = gaussians_at_once(pixels, whole.blocks), 3 * scene.gaussians.shN.shape[1]
-    drawn = pixels if options.method == "unmerged-fit" else count
-    seconds = wall_seconds(
-        at_once * whole.blocks, len(scene), settings, threads=options.threads or available_threads(),
-        photos=size.photos, fit_steps=whole.fit.steps,
-        num_drawn=drawn * float(np.mean(_shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
-    )  # fmt: skip
-    memory = memory_bytes(at_once, photos=size.photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
-    distributed = limits.count is not None or options.budget.auto
-    return {
-        "num_gaussians": count,
-        "ratio": count / max(1, scene.num_gaussians),
-        "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        "blocks": whole.blocks,
-        "method": options.method,
-        "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
-        **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings, photos=size.photos),
-        "fit_steps": whole.fit.steps,
-        "seconds": float(f"{seconds:.2g}"),
-        "memory_bytes": int(float(f"{memory:.2g}")),
-        "memory_problem": memory_problem(memory),
-    }
-
-
-def _shares_inside(scene: Scene, most: int) -> list[float]:
-    """Measure the share of the Gaussians, of at most so many, whose centres lie in each view."""
-    rows = np.arange(0, len(scene.gaussians), max(1, -(-len(scene.gaussians) // most)))
-    if scene.aligned:
-        rows = rows[scene.stored.reshape(-1)[rows]]
-    points = scene.gaussians.means[rows].astype(np.float64)
-    return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]
-
-
-def estimate_lines(run: Mapping[str, Any]) -> list[str]:
-    """Describe an estimate in lines of text."""
-    per_view = run["superpixels_per_view"]
-    superpixels = "superpixels where the scene needs them"
-    if per_view is not None:
-        superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
-    method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
-    if per_view == 0:
-        method = "neighbours merged pair by pair, because no view is known"
-    return [
-        f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
-        f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
-        " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
-        f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
-        *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
-    ]
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:

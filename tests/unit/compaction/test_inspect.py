@@ -12,8 +12,9 @@ from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_npz
 
 from gsmerge import compact, read_scene
+from gsmerge.compaction.inspect import inspect, inspection_lines
 from gsmerge.io import read_ply, write_ply
-from gsmerge.measure.inspect import extents, inspect, inspection_lines
+from gsmerge.measure.coverage import extents
 
 
 def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:

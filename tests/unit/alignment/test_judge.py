@@ -10,9 +10,11 @@ import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, write_transforms
 from tiny_scene import make_tiny, write_images
 
-from gsmerge.alignment import recovery
-from gsmerge.alignment.recovery import COLOR_MARGIN, SHUFFLED_MARGIN, Recovery, recover
-from gsmerge.alignment.score import AlignmentInput
+from gsmerge.alignment import readings
+from gsmerge.alignment.judge import COLOR_MARGIN, Recovery, accept_reading
+from gsmerge.alignment.readings import read_grid
+from gsmerge.alignment.score import SHUFFLED_MARGIN, AlignmentInput
+from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.scene.read import load_scene
 from gsmerge.types import SH_C0, Cameras
 
@@ -20,10 +22,15 @@ from gsmerge.types import SH_C0, Cameras
 def clues_of(smooth: Smooth, images: np.ndarray | None, labellings: list[list[int]] | None = None) -> AlignmentInput:
     """Three cameras, the Gaussians and any photos."""
     w2c, Ks = smooth.w2c, np.tile(smooth.K, (3, 1, 1))
-    photos = None if images is None else images.astype(np.float32) / 255
+    photos = NO_IMAGES if images is None else images.astype(np.float32) / 255
     valid = np.ones(len(smooth.gaussians), bool)
     cameras = Cameras(w2c, Ks, smooth.width, smooth.height)
     return AlignmentInput(smooth.gaussians, valid, cameras, photos, labellings or [[0, 1, 2]], lambda: None)
+
+
+def recover(inputs: AlignmentInput, *, exact_frames: bool = False) -> Recovery | None:
+    """Read the rows of one grid and judge."""
+    return accept_reading(inputs, read_grid(inputs, exact_frames=exact_frames))
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +118,7 @@ def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:
 def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files in which the rows as they are leave a doubt are."""
     tiny, searched = smooth_scene(48, 36), []
-    monkeypatch.setattr(recovery, "possible_layouts", lambda inputs: searched.append(inputs) or [])
+    monkeypatch.setattr(readings, "possible_layouts", lambda inputs: searched.append(inputs) or [])
     plain = clues_of(tiny, tiny.images)
     actual = recover(plain)
     assert isinstance(actual, Recovery)

@@ -1,0 +1,152 @@
+"""Read the rows of one grid: in every layout that their number allows, in every frame of the cameras, cheap first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.alignment.incomplete import read_incomplete
+from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.alignment.resection import projective_error
+from gsmerge.alignment.score import (
+    QUICK_SAMPLES,
+    SAMPLES,
+    SHUFFLED_MARGIN,
+    SMALLEST_PX,
+    AlignmentInput,
+    Reading,
+    beats_shuffled,
+    candidate_similarities,
+    fits_all_cameras,
+    pixel_errors,
+    pixel_limit,
+    sample_layout,
+    score_layout,
+    score_shuffled,
+)
+from gsmerge.geometry import IDENTITY, median
+
+ENOUGH, FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
+_SIMPLER_PX = 0.02  # ... and this many pixels
+_PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
+# pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
+_SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
+_SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
+
+
+def read_grid(inputs: AlignmentInput, *, exact_frames: bool = False) -> list[Reading]:
+    """Read the rows as the pixels of a grid, by ever more effort until a reading fits; empty where none does.
+
+    ``exact_frames``: only try cameras in the frame of their file and files without missing pixels, which is quick.
+    """
+    readings: list[Reading] = []
+    for tier in _tiers(inputs, exact_frames=exact_frames):
+        readings += tier
+        if any(reading.ok for reading in readings):
+            return readings
+    return []
+
+
+def _tiers(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
+    """Yield readings, those side by side that cost as much, the cheap first."""
+    finite = int(inputs.valid.sum())
+    if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
+        return
+    inputs = _without_same_labellings(inputs)
+    yield _read_plain(inputs)
+    layouts = possible_layouts(inputs)
+    for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
+        yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
+    if not exact_frames:
+        yield from ([reading] for reading in read_incomplete(inputs))
+
+
+def _read_plain(inputs: AlignmentInput) -> list[Reading]:
+    """Read the rows in order under the stored cameras, as most files need; empty in doubt, for a longer search."""
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    expected = len(cameras) * cameras.width * cameras.height
+    if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
+        return []
+    layouts = plain_layout(len(cameras), cameras.width, cameras.height).with_views_in(inputs.labellings)
+    best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+    far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+    alone = best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others)
+    return [best] if alone and beats_shuffled(best, score_shuffled(inputs, best)[0]) else []
+
+
+def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
+    """Return whether some camera, in any frame, could show the rows of one of the layouts in their pixels."""
+    return any(_is_seen(inputs, layout) for layout in layouts)
+
+
+def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
+    limit = max(_SEEN_LIMITS * pixel_limit(layout.width, layout.height), _SEEN_SHARE * min(layout.width, layout.height))
+    count = len(layout.views)
+    for block in sorted({0, count // 2, count - 1}):
+        part = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
+        pairs = inputs.pairs(subsample(part, _SEEN_SAMPLES))
+        if projective_error(pairs.points, pairs.pixels) <= limit:
+            return True
+    return False
+
+
+def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
+    """Drop orders that only exchange views of one pose with equal photos, or without any: either is right."""
+    cameras, images, (first, *labellings) = inputs.cameras, inputs.images, inputs.labellings
+    parts = cameras.viewmats[:, :3], cameras.Ks, images
+
+    def same(other: Sequence[int]) -> bool:
+        moved = [(a, b) for a, b in zip(first, other, strict=True) if a != b]
+        return all(np.array_equal(part[a : a + 1], part[b : b + 1]) for part in parts for a, b in moved)
+
+    return replace(inputs, labellings=[first, *(first if same(other) else other for other in labellings)])
+
+
+def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
+    """List the layouts that fit the number of rows, or the depth maps next to the cameras."""
+    cameras, count = inputs.cameras, len(inputs.gaussians)
+    layouts = list(exact_layouts(count, len(cameras), cameras.width, cameras.height))
+    if count < len(cameras) * cameras.width * cameras.height and inputs.order in ("auto", "view-major"):
+        depths = inputs.depths()
+        if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
+
+
+def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:
+    """Score a layout in its best frame for each likely order of the views; any order with effort 2."""
+    layouts = {labelled.views: labelled for labelled in layout.with_views_in(inputs.labellings)}
+    lacks_views = len(set(layout.views)) < len(inputs.cameras)
+    nearest = _nearest_views(inputs, layout) if (lacks_views or effort == 2) and inputs.scale is None else None
+    if nearest is not None:
+        layouts.setdefault(nearest, replace(layout, views=nearest))
+    return [best_frame(inputs, labelled, QUICK_SAMPLES, effort) for labelled in layouts.values()]
+
+
+def best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> Reading:
+    """Score a layout in the frame of the cameras that fits it best, the simplest of those about as near."""
+    pairs = inputs.pairs(sample_layout(layout, samples))
+    frames = candidate_similarities(pairs, inputs.cameras, scale=inputs.scale, effort=effort)
+    readings = [score_layout(inputs, layout, frame, pairs) for frame in frames]
+    lowest = min(reading.worst_px for reading in readings)
+    best = next(reading for reading in readings if reading.worst_px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX))
+    solved = best.ok and best.frame is not IDENTITY and inputs.scale is None
+    ok = fits_all_cameras(best.frame, pairs, inputs.cameras) if solved else best.ok
+    return replace(best, ok=ok, quick=samples < SAMPLES)
+
+
+def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | None:
+    """Find for each block the camera into whose pixels it projects best; None where two choose the same."""
+    pairs = inputs.pairs(subsample(layout, 300))
+    chosen = []
+    for block in range(len(layout.views)):
+        block_pairs = pairs.select(pairs.blocks == block)
+        if not len(block_pairs.rows):
+            return None
+        views = (np.full(len(block_pairs.rows), view) for view in range(len(inputs.cameras)))
+        errors = [median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
+        chosen.append(int(np.argmin(errors)))
+    return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None

@@ -1,0 +1,84 @@
+"""Estimate the size, time and memory of a run without running it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gsmerge.facts.partition import gaussians_at_once
+from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.scene_size import measure_size
+from gsmerge.io.formats.ply import file_bytes
+from gsmerge.measure.coverage import shares_inside
+from gsmerge.plan import plan_whole, resolve_budget, stands_alone
+from gsmerge.report import human_bytes
+from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.threads import available_threads
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.stages.segment import largest_count
+from gsmerge.types import Scene
+
+MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
+
+
+def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
+    """Estimate size, time and memory of a run without running it.
+
+    Returns:
+        ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
+        known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
+        ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
+        machine has enough.
+    """
+    size = measure_size(scene)
+    if options.budget.auto and scene.aligned:
+        options = resolve_budget(options, canonicalise(scene)[0])
+    whole = plan_whole(size, options)
+    limits, settings = whole.limits, whole.settings(options)
+    pixels = max(limits.num_pixels, scene.num_gaussians)
+    most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
+    count = min(scene.num_gaussians or pixels, most)
+    at_once, num_rest = gaussians_at_once(pixels, whole.blocks), 3 * scene.gaussians.shN.shape[1]
+    drawn = pixels if options.method == "unmerged-fit" else count
+    seconds = wall_seconds(
+        at_once * whole.blocks, len(scene), settings, threads=options.threads or available_threads(),
+        photos=size.photos, fit_steps=whole.fit.steps,
+        num_drawn=drawn * float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
+    )  # fmt: skip
+    memory = memory_bytes(at_once, photos=size.photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    distributed = limits.count is not None or options.budget.auto
+    return {
+        "num_gaussians": count,
+        "ratio": count / max(1, scene.num_gaussians),
+        "bytes": file_bytes(count, scene.gaussians.sh_degree),
+        "blocks": whole.blocks,
+        "method": options.method,
+        "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
+        **{name: settings[name] for name in ("k", "match", "checkpoint")},
+        "fit": fit_of(settings, photos=size.photos),
+        "fit_steps": whole.fit.steps,
+        "seconds": float(f"{seconds:.2g}"),
+        "memory_bytes": int(float(f"{memory:.2g}")),
+        "memory_problem": memory_problem(memory),
+    }
+
+
+def estimate_lines(run: Mapping[str, Any]) -> list[str]:
+    """Describe an estimate in lines of text."""
+    per_view = run["superpixels_per_view"]
+    superpixels = "superpixels where the scene needs them"
+    if per_view is not None:
+        superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
+    method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
+    if per_view == 0:
+        method = "neighbours merged pair by pair, because no view is known"
+    return [
+        f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
+        f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
+        " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
+        f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
+        *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
+    ]

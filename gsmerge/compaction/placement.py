@@ -1,0 +1,105 @@
+"""Bring Gaussians and cameras into the frame and the files of an output: turned, cut to a degree, as a COLMAP model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
+from gsmerge.io import lost_harmonics
+from gsmerge.io.atomic import AddOutput
+from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
+from gsmerge.io.formats.table import COLMAP
+from gsmerge.io.image_names import match_images
+from gsmerge.kernels.matrices import matmul
+from gsmerge.measure.visibility import front_rows
+from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.types import Cameras, Gaussians
+
+NUM_FULL = 15  # harmonics above degree 0 up to degree 3
+
+
+def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
+    """Add zeros to harmonics that are fewer than ``count`` above degree 0."""
+    missing = max(0, count - gaussians.shN.shape[1])
+    return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
+
+
+def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:
+    """Find the map from the scene's frame into that of its file; the ``cameras`` say where up is."""
+    if not options.moves:
+        return IDENTITY
+    rotation = np.eye(3)
+    if options.up is not None:
+        axis = np.zeros(3)
+        axis[AXES.index(options.up) // 2] = -1 if options.up[0] == "-" else 1
+        upward = np.array([0.0, -1.0, 0.0]) if cameras is None else -cameras.viewmats[:, 1, :3].sum(0)
+        rotation = turn_to(normalize(upward), axis)
+    if options.rotate is not None:
+        rotation = matmul(turn_by(np.array(parse_triple("rotate", options.rotate))), rotation)
+    scale = 1.0 if options.scale is None else float(options.scale)
+    return Similarity(rotation, scale, np.array(parse_triple("translate", options.translate)))
+
+
+def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x between opposite ones.
+
+    Rodrigues' formula, for an axis and angle that the two vectors give.
+    """
+    cosine = float((start * end).sum())
+    if cosine < -1 + 1e-12:
+        about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]
+        about = normalize(about - (about * start).sum() * start)
+        return 2 * np.outer(about, about) - np.eye(3)
+    x, y, z = np.cross(start, end)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + cross + matmul(cross, cross) / (1 + cosine))
+
+
+def place(
+    gaussians: Gaussians, cameras: Cameras, frame: Similarity, sh_degree: int | None
+) -> tuple[Gaussians, Cameras]:
+    """Move Gaussians and cameras into a frame, and leave out harmonics above a degree."""
+    if sh_degree is not None:
+        gaussians = replace(gaussians, shN=gaussians.shN[:, : (sh_degree + 1) ** 2 - 1])
+    if frame is IDENTITY:
+        return gaussians, cameras
+    wide = replace(gaussians, means=gaussians.means.astype(np.float64))  # until they are written
+    return frame.move_gaussians(wide), frame.move(cameras)
+
+
+def add_colmap(
+    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, names: Sequence[str]
+) -> list[Path]:
+    """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
+
+    Returns the present paths of all its files.
+    """
+    files = [points, *map(add, files_beside(path))]
+    contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
+    for file, name in zip(files, MODEL_NAMES, strict=True):
+        file.write_bytes(contents[name])
+    return files
+
+
+def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
+    """Name views by their files in a folder of photos, as COLMAP does; where it has others, by the cameras' file."""
+    if photos is not None and photos.is_dir():
+        with suppress(SceneError):
+            return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]
+    return [name.removeprefix("./").removeprefix("images/") for name in names]  # as a transforms.json has them
+
+
+def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
+    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
+    lost = lost_harmonics(out, sh_degree, spz_version)
+    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
+    if COLMAP.names(out) and not place.is_dir():
+        files = "the photos" if photos is None or not photos.is_dir() else photos
+        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
+    return notes
