@@ -83,6 +83,7 @@ def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
     with lock_result(run.folder, job.output, wait=wait) as lock:
         if lock is None:
             return None
+        _clean(job, run, lock)
         try:
             line = _make(job, run, lock)
         except Exception as error:  # a bad scene must not end the batch
@@ -156,10 +157,11 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 def _clean(job: Job, run: Run, lock: ResultLock) -> None:
     """Remove the files that a killed process left, except the lock of a result that may be without a record."""
-    paths = [run.folder / name for name in job.outputs]
-    for folder in {path.parent for path in paths}:
-        remove_stale(folder)
-    lock.is_left = lock.is_left and any(map(os.path.lexists, paths))
+    if lock.is_left:
+        paths = [run.folder / name for name in job.outputs]
+        for folder in {path.parent for path in paths}:
+            remove_stale(folder)
+        lock.is_left = any(map(os.path.lexists, paths))
 
 
 @dataclass
@@ -172,6 +174,7 @@ class ResultLock:
     def leave_if_killed(self) -> None:
         """Say in the file which process works on the result, so that it is known to be of a batch."""
         self.file.write(f"{os.getpid()}\n".encode())
+        os.fsync(self.file.fileno())  # on the disk before the result
         self.is_left = True
 
 

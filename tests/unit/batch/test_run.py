@@ -312,7 +312,7 @@ make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
 def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
     run(scene, out)
     path = out / "batch.jsonl"
-    leave_lock(out)
+    kill(out)
     path.write_bytes(path.read_bytes()[:100])
     assert run(scene, out)["status"] == DONE
     assert results(out) == undisturbed
