@@ -51,8 +51,8 @@ def timed(*arguments: object) -> Cost:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    """Every file but the records and the summary."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix not in (".jsonl", ".csv")]
+    """Every file but the records."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".jsonl"]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
@@ -91,7 +91,7 @@ def throughput(scenes: list[Path], out: Path, options: list[str]) -> Cost:
 def at_work(folder: Path, since: float) -> bool:
     """Whether a scene has been taken up since a moment."""
     try:
-        return any(path.stat().st_mtime > since for path in folder.glob(".batch/*.lock") if path.stem != "run")
+        return any(path.stat().st_mtime > since for path in folder.glob(".batch-*.lock"))
     except FileNotFoundError:
         return False
 
@@ -168,14 +168,14 @@ def main() -> None:
     parser.add_argument("options", nargs="*", help="of gsmerge batch, after --")
     args = parser.parse_args()
     if args.only == "memory":
-        memory(args.out, args.scenes)
+        memory(args.output, args.scenes)
         return
     width, height = map(int, args.size.split("x"))
     made = GenerateOptions(views=(args.views, args.views), width=width, height=height)
-    folder = args.out / f"scenes-{args.views}x{args.size}-{args.scenes}"
+    folder = args.output / f"scenes-{args.views}x{args.size}-{args.scenes}"
     scenes = [scene.folder for scene in generate(folder, args.scenes, made, seed=args.seed)]
-    cost = throughput(scenes, args.out, args.options)
-    if args.kills and not killed(scenes, args.out, args.options, cost, args.kills, args.seed):
+    cost = throughput(scenes, args.output, args.options)
+    if args.kills and not killed(scenes, args.output, args.options, cost, args.kills, args.seed):
         sys.exit(1)
 
 

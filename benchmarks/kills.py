@@ -44,7 +44,7 @@ COMMANDS = {
     "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
 }
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
-RECORDS = ("batch.jsonl", "summary.csv")  # of batches, for the next run
+RECORDS = "batch.jsonl"  # of batches, for the next run
 # Faults to show that they would be reported: functions of ``os`` to replace
 PLANTS: dict[str, dict[str, Callable[..., object]]] = {
     "none": {},
@@ -121,7 +121,7 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 def contents(files: dict[str, bytes]) -> Contents:
     """Hash files; reports without what differs from run to run, batches without their records."""
-    return {name: hashlib.sha256(_settled(name, x)).hexdigest() for name, x in files.items() if name not in RECORDS}
+    return {name: hashlib.sha256(_settled(name, x)).hexdigest() for name, x in files.items() if name != RECORDS}
 
 
 def _settled(name: str, data: bytes) -> bytes:
@@ -149,7 +149,7 @@ def faults_of(files: dict[str, bytes], old: Contents, new: Contents) -> Iterator
     for name in files.keys() & {"lod/lod-meta.json"}:
         missing = [x for x in json.loads(files[name] or b"{}").get("filenames", []) if f"lod/{x}" not in files]
         yield from [f"the index names {missing}"] if missing else []
-    for line in files.get(RECORDS[0], b"").split(b"\n")[:-1]:
+    for line in files.get(RECORDS, b"").split(b"\n")[:-1]:
         for file in json.loads(line)["files"]:
             if hashlib.sha256(files.get(file["path"], b"")).hexdigest() != file["sha256"]:
                 yield f"the record of {file['path']} is of another file"
@@ -210,7 +210,7 @@ def try_command(name: str, place: Place, most: int | None) -> tuple[Counter[str]
         ended = place.run(words, at)
         kind = next((call[3] for call in ended.calls if call[0] == "end"), "the end")
         kinds[kind] += kind != "the end"
-        codes = (0,) if kind == "the end" else (-9, 0) if name == "batch" else (-9,)  # a batch replaces its worker
+        codes = (0,) if kind == "the end" else (-9, 5) if name == "batch" else (-9,)  # 5: of its process
         wrong = [] if ended.code in codes else [f"exit code {ended.code}: {ended.text}"]
         wrong += faults_of(left := read_files(place.out), old, new)
         lasting = old if ended.code else old | new  # chunks of the old index may come back

@@ -1,36 +1,28 @@
-"""Find scenes in any layout, and name the files of their results."""
+"""Find scenes in any layout."""
 
 from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
 
-from gsmerge.batch.batch_options import BatchOptions
-from gsmerge.compaction.files import level_output
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
-from gsmerge.io.formats.table import estimate_counts, may_hold_gaussians
-from gsmerge.runtime.estimate import memory_bytes
-from gsmerge.scene.content_hash import stem_of
+from gsmerge.io.formats.table import may_hold_gaussians
 from gsmerge.scene.files import (
     IMAGE_PLACES,
     PLY_PLACES,
     TRAINED_PLACES,
-    SceneFiles,
     list_plys,
     named_ply,
     other_plys,
 )
 from gsmerge.scene.no_gaussians import find_remedy
-from gsmerge.settings.budget import AUTO
-from gsmerge.settings.compact import CompactOptions
 
 MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
 FOLDERS_PER_SCENE = 5  # that are not counted for it
@@ -38,80 +30,6 @@ _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
 SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
-
-
-class Work(Protocol):
-    """Other work on a scene than compacting it with the batch's settings."""
-
-    @property
-    def settings(self) -> CompactOptions:
-        """Settings from which the time is estimated."""
-
-    def key(self, options: BatchOptions) -> str:
-        """Return a digest of everything that the result depends on."""
-
-    def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Do the work; return the report, with the keys of a record, and the files written."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One scene of a batch."""
-
-    index: int  # its place in the list
-    scene: str  # a ``.ply``, or the folder of one
-    output: str  # name of the result in the output folder
-    num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
-    num_rest: int = 0  # columns of higher harmonics, likewise
-    work: Work | None = None  # what is done with it; None: it is compacted with the settings of the batch
-
-    @property
-    def memory(self) -> int:
-        """Estimated memory of the scene in bytes, within a factor of about two."""
-        return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
-
-
-def find_jobs(
-    arguments: Sequence[str],
-    out: Path,
-    options: BatchOptions,
-    results: Collection[str] = (),
-    unreadable: list[SceneError] | None = None,
-) -> list[Job]:
-    """List all scenes, each once, with the names of their results in the output folder.
-
-    ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
-    sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
-    UsageError if two scenes would be written to one file, or one over another.
-    """
-    jobs: list[Job] = []
-    owners: dict[str, str] = {}
-    inputs: set[str] = set()
-    for scene in find_scenes(arguments, out, unreadable):
-        ply = main_file(scene)
-        real = os.path.realpath(ply)
-        if real in inputs or real in results:
-            continue
-        inputs.add(real)
-        job = Job(len(jobs), str(scene), output_name(options, scene, len(jobs)), *estimate_counts(scene_plys(scene)))
-        for name in result_names(job.output, options):
-            if name in owners:
-                raise UsageError(
-                    f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
-                    f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
-                )
-            owners[name] = str(scene)
-        jobs.append(job)
-    for name in owners:
-        if os.path.realpath(out / name) in inputs:
-            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
-    return jobs
-
-
-def result_names(output: str, options: BatchOptions) -> list[str]:
-    """Return the file names of a result and of its coarser levels."""
-    return [output, *(str(level_output(Path(output), level)) for level in range(1, options.settings.budget.levels))]
 
 
 def scene_plys(scene: Path) -> list[Path]:
@@ -127,19 +45,6 @@ def main_file(scene: Path) -> Path:
         return scene
     plys = other_plys(scene)
     return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
-
-
-def output_name(options: BatchOptions, scene: Path, index: int) -> str:
-    """Return the name of a scene's result in the output folder."""
-    whole = Path(os.path.abspath(scene))
-    stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
-    decode = options.settings.decode
-    k = decode.k if decode.k != AUTO else decode.max_k
-    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": k}
-    try:
-        return os.path.normpath(options.output.format(**values))
-    except ValueError as error:  # a format that fits numbers only
-        raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error
 
 
 def find_scenes(

@@ -55,6 +55,9 @@ BUDGET_WORDS = (
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
 )  # fmt: skip
 
+# Former option -> the one that does the same
+REPLACED = {"rerun": "overwrite", "max_memory": "jobs"}
+
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
     "Compact": ("compact", "convert"),
@@ -156,6 +159,8 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
+    if REPLACED.get(name) in names:
+        return f"{option} is no option: use --{REPLACED[name]}"
     if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:

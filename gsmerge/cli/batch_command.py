@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, TextIO
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -24,11 +26,10 @@ from gsmerge.cli.console import (
 from gsmerge.errors import BatchError, SceneError, TargetError, UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.records import RecordIndex, Totals
-    from gsmerge.batch.schedule import Schedule
+    from gsmerge.batch.records import RecordIndex
+
+MAX_LISTED = 20  # results in the table, failures below it, and folders that cannot be read
 
 
 def parse_jobs(text: str) -> int:
@@ -49,16 +50,11 @@ def parse_jobs(text: str) -> int:
                    "it.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
-    "hint k superpixels budget quality effort fit set",
+    "hint k superpixels budget quality effort fit device set",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
                    metavar="N|auto"),
-        opt.option("max_memory", str, "Memory that all scenes at once may take, such as 8GB.",
-                   wording="most of the free memory"),
-        opt.option("timeout", float, "Seconds that a scene may take.", min=0.001),
-        opt.option("retries", int, "How often a scene is tried again whose process died or took too long.", default=1,
-                   min=0),
     ),
     "engine address",
     opt.output("Folder for the results; scenes whose result it holds are skipped.", default=opt.REQUIRED),
@@ -66,10 +62,9 @@ def parse_jobs(text: str) -> int:
         opt.OUTPUT,
         opt.option("name", str, "Name of a result: {stem}, {parent}, {index} and {k} are filled in.",
                    default="{stem}.ply", metavar="NAME"),
-        opt.option("resume", bool, "Skip scenes that are done, or do them again.", "--resume/--rerun", default=True,
-                   wording="--resume"),
     ),
-    opt.changed("overwrite", False, help="Replace files in the folder that no batch wrote."),
+    opt.changed("overwrite", False, help="Compact scenes again that are done, and replace files in the folder that no "
+                "batch wrote."),
     "strict dry_run seed",
     opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
@@ -82,69 +77,64 @@ def batch(args: opt.Args) -> None:
         raise UsageError(f"--output: expected a folder, found the file {out}")
     hints = args.hints()
     from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.records import MAX_LISTED, RecordIndex
-    from gsmerge.batch.schedule import make_schedule
+    from gsmerge.batch.records import RecordIndex
 
     with opt.usage_errors():
         options = BatchOptions(
             args.settings(), args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
-            _bytes(args.max_memory), args.timeout, args.retries, rerun=not args.resume, overwrite=args.overwrite,
-            engine=args.engine, address=args.address,
+            args.overwrite, args.engine, args.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    index = RecordIndex(out)
-    index.read_on()
+    index = RecordIndex(out).read_on()
     unreadable: list[SceneError] = []
-    jobs = find_jobs(args.scenes, out, options, index.result_paths(), unreadable)
-    schedule = make_schedule(jobs, options)
-    damaged = [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
-    notes = [*damaged, *schedule.notes, *(f"passed by: {error}" for error in unreadable[:MAX_LISTED])]
+    jobs = find_jobs(args.scenes, out, options, set(index.paths()), unreadable)
+    notes = [*damage_notes(index), *(f"passed by: {error}" for error in unreadable[:MAX_LISTED])]
     if args.dry_run:
-        print_plan(args, jobs, options, index, schedule, notes)
+        print_plan(args, jobs, options, notes)
         return
     say_notes(notes, quiet=args.silent)
-    _run(args, jobs, options, index, schedule)
+    _run(args, jobs, options)
     if unreadable:
         raise BatchError(f"{len(unreadable)} folder(s) were passed by; the first: {unreadable[0]}")
 
 
-def _bytes(text: str | None) -> int | None:
-    from gsmerge.settings.budget import parse_bytes
-
-    try:
-        return None if text is None else parse_bytes(text)
-    except ValueError:
-        raise UsageError(f'--max-memory: expected a size such as 8GB, got "{text}"') from None
+def damage_notes(index: RecordIndex) -> list[str]:
+    """Return a note where records could not be read."""
+    return [f"{index.num_damaged} damaged line(s) of the records were ignored"] if index.num_damaged else []
 
 
-def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: RecordIndex, schedule: Schedule) -> None:
+def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     """Compact all scenes, report each, and sum up."""
-    from gsmerge.batch.records import Totals, summary_lines, write_summary
+    from gsmerge.batch.schedule import make_schedule
 
-    totals, out = Totals(len(jobs)), args.output
+    totals, stdout, schedule = Totals(len(jobs)), sys.stdout, make_schedule(jobs, options)
     at_once = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
     say(f"{len(jobs):,} scenes, {at_once}", quiet=args.silent)
+
+    def add(record: dict[str, Any]) -> None:
+        totals.add(record)
+        if args.json:
+            print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
+
     interrupted = False
     try:
-        run_jobs(args, totals, jobs, options, index, schedule, sys.stdout if args.json else None)
+        run_jobs(args, jobs, options, add)
     except KeyboardInterrupt:
         interrupted = True
         raise
     finally:
-        if totals.ended or interrupted:
-            path = write_summary(out)
-            if not args.silent:
-                print("\n".join(map(one_line, summary_lines(totals, path))))
+        if (totals.counts or interrupted) and not args.silent:
+            print("\n".join(map(one_line, totals.lines())))
     worse = ""
     if totals.worse:
-        worse = f"{totals.num_worse} of {totals.total} results show their photos worse than the input"
+        worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
         worse += _first(totals.worse, listed=not args.silent)
     if worse and not args.strict:
         say_warning(worse, quiet=args.silent)
-    check_failures(totals, "scenes", listed=not args.silent)
+    check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
     if worse and args.strict:
@@ -153,35 +143,33 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, index: Reco
 
 def run_jobs(
     args: opt.Args,
-    totals: Totals,
     jobs: Sequence[Job],
     options: BatchOptions,
-    index: RecordIndex,
-    schedule: Schedule,
-    lines: TextIO | None = None,
+    add: Callable[[dict[str, Any]], None],
+    name: str = "scene",
 ) -> None:
-    """Run jobs, show progress, count results in ``totals``, and print records as JSON to ``lines``."""
+    """Run jobs, show progress, and hand each record to ``add``; ``name``: key of a record that names the job."""
     from gsmerge.batch import run_batch
+    from gsmerge.batch.records import FAILED
 
+    num_failed = 0
     with (
         separate_stdout(options.engine, quiet=args.silent),
-        closing(run_batch(jobs, args.output, options, index=index, schedule=schedule)) as records,
-        total_progress(totals.total, quiet=args.silent) as progress,
+        closing(run_batch(jobs, args.output, options)) as records,
+        total_progress(len(jobs), quiet=args.silent) as progress,
     ):
-        for record in records:
-            totals.add(record)
-            if lines is not None:
-                print(json.dumps(record, separators=(",", ":")), file=lines, flush=True)
-            why, num_failed = record["error"] or "", totals.counts["failed"]
+        for num_ended, record in enumerate(records, 1):
+            add(record)
+            why = record["error"] or ""
+            num_failed += record["status"] == FAILED
             failed = f", {num_failed} failed" if num_failed and not why else ""
-            progress(f"{record[totals.name]} {record['status']}{failed}", totals.ended, why)
+            progress(f"{record[name]} {record['status']}{failed}", num_ended, why)
 
 
-def check_failures(totals: Totals, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if a job failed, with the first reason unless the failures were ``listed``."""
-    num_failed = totals.counts["failed"]
-    if num_failed:
-        raise BatchError(f"{num_failed} of {totals.total} {unit} failed{_first(totals.failures, listed=listed)}")
+def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
+    """Raise BatchError if jobs ``failed`` (name, reason), with the first reason unless they were ``listed``."""
+    if failed:
+        raise BatchError(f"{len(failed)} of {total} {unit} failed{_first(failed, listed=listed)}")
 
 
 def _first(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
@@ -189,31 +177,79 @@ def _first(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
     return "" if listed else f"; the first: {scene}: {why}"
 
 
-def pending_jobs(jobs: Sequence[Job], out: Path, options: BatchOptions, index: RecordIndex) -> list[Job]:
-    """List the jobs without an up-to-date result in the folder; all jobs if results are to be made again."""
-    from gsmerge.batch.task import BatchContext, Task, is_done
+@dataclass
+class Totals:
+    """What a run made, for the lines at its end."""
 
-    known = {} if options.rerun else index.known
-    shared = BatchContext(out, options, 0)
-    return [job for job in jobs if not is_done(Task(job, known.get(job.output)), shared)]
+    total: int  # scenes
+    counts: Counter[str] = field(default_factory=Counter)  # of them, by status
+    num_input: int = 0  # Gaussians in the scenes that were done
+    num_output: int = 0  # Gaussians in their results
+    unmet: int = 0  # results that miss their target
+    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
+    worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
+    failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        """Count the record of one scene."""
+        self.counts[record["status"]] += 1
+        report = record["report"]
+        worse = report["worse"] if report else record.get("worse")
+        if worse:
+            self.worse.append((record["scene"], worse))
+        if record["error"] is not None:
+            self.failed.append((record["scene"], record["error"]))
+        if report:
+            self.num_input += report["input"]["num_gaussians"]
+            self.num_output += report["output"]["num_gaussians"]
+            self.unmet += bool(report["unmet"])
+            if len(self.rows) < MAX_LISTED:
+                self.rows.append(_row(record["output"], report))
+
+    def lines(self) -> list[str]:
+        """Write a table of the results, what is worse, what failed, and a line of totals."""
+        from gsmerge.batch.records import DONE, FAILED, SKIPPED
+        from gsmerge.report import text_table
+
+        header = ("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")
+        lines = text_table([header, *sorted(self.rows)]) if self.rows else []
+        if self.counts[DONE] > len(self.rows):
+            lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
+        for status, reasons in (("worse", self.worse), (FAILED, self.failed)):
+            lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
+            lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
+        counts = [f"{self.counts[x]:,} {x}" for x in (DONE, SKIPPED, FAILED) if self.counts[x] or x == DONE]
+        left = self.total - self.counts.total()
+        line = f"{self.total:,} scenes: {', '.join(counts)}" + (f", {left:,} left" if left else "")
+        if self.num_input:
+            share = 100 * self.num_output / self.num_input
+            line += f"; {self.num_input:,} -> {self.num_output:,} Gaussians ({share:.2f} %)"
+        line += f"; {self.unmet:,} missed the target" if self.unmet else ""
+        line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
+        return [*lines, line]
+
+
+def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    psnr = report["psnr_input_views"]
+    quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
+    counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
+    return output, *counts, f"{100 * report['ratio']:.2f} %", *quality, f"{report['total_seconds']:.1f}"
 
 
 def print_plan(
     args: opt.Args,
     jobs: Sequence[Job],
     options: BatchOptions,
-    index: RecordIndex,
-    schedule: Schedule,
     notes: Sequence[str],
     unit: str = "scenes",
 ) -> None:
     """Print what a run would do and how long it would take; ``unit``: word for the jobs."""
-    from gsmerge.batch.schedule import estimate_seconds
+    from gsmerge.batch.schedule import estimate_memory, estimate_seconds, make_schedule, pending_jobs
     from gsmerge.report import document_head, human_bytes
 
-    out, pending = args.output, pending_jobs(jobs, args.output, options, index)
+    out, pending, schedule = args.output, pending_jobs(jobs, args.output, options), make_schedule(jobs, options)
     left = {job.output for job in pending}
-    seconds = estimate_seconds(pending, options, schedule)
+    seconds, memory = estimate_seconds(pending, schedule), estimate_memory(jobs, schedule)
     document = {
         **document_head(),
         "dry_run": True,
@@ -222,19 +258,18 @@ def print_plan(
         "num_pending": len(pending),
         "jobs": schedule.jobs,
         "threads": schedule.threads,
-        "estimate": {"seconds": round(seconds, 1), "memory_bytes": schedule.memory},
+        "estimate": {"seconds": round(seconds, 1), "memory_bytes": memory},
         unit: [
             {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output not in left}
             for j in jobs
         ],
-        "options": options.result_settings()["settings"],
+        "options": options.settings.to_dict(),
         "notes": list(notes),
     }
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do")
-    lines.append(
-        f"at once     {schedule.jobs or 'as many as the cluster has room for'}, {schedule.threads} thread(s) each"
-    )
-    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(schedule.memory)} of memory")
+    at_once = schedule.jobs or "as many as the cluster has room for"
+    lines.append(f"at once     {at_once}, {schedule.threads} thread(s) each")
+    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(memory)} of memory")
     print_document(document, lines, as_json=args.json)

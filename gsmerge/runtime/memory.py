@@ -40,6 +40,14 @@ def machine_memory() -> int | None:
     return min((limit for limit in limits if limit > 0), default=None)
 
 
+def free_memory() -> int | None:
+    """Return the bytes of memory that new processes can take; None if unknown."""
+    with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
+        values = dict(line.split(":", 1) for line in file)
+        return int(values["MemAvailable"].split()[0]) * 1024
+    return machine_memory()
+
+
 def release_memory() -> None:
     """Return freed memory to the operating system.
 

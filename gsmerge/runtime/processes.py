@@ -6,21 +6,20 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from gsmerge.runtime.work import CALLS_PER_PROCESS, Lost
+from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, Lost, Pool
 
-STARTED = "begun"  # what a process sends when it takes a call
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+END_SECONDS = 10.0  # that a process has to end by itself
 
 
 class Worker:
-    """A process of the pool, with its current call."""
+    """A process of the pool, with the key of its current call."""
 
     def __init__(self, threads: int) -> None:
         spawn = multiprocessing.get_context("spawn")
@@ -30,81 +29,65 @@ class Worker:
             self.process.start()
         theirs.close()
         self.key: Any = None
-        self.since: float | None = None
         self.count = 0
+
+    def read_result(self) -> Any:
+        """Return the result of the current call, or Lost where the process has ended; raise what the call raised."""
+        try:
+            is_result, value = self.pipe.recv()
+        except (EOFError, OSError):
+            self.process.join(END_SECONDS)
+            return Lost(_describe_exit(self.process))
+        if not is_result:
+            raise value
+        return value
 
     def stop(self, *, now: bool) -> None:
         """End the process: ``now``, or when it finds the pipe closed."""
         self.pipe.close()
         if now:
             self.process.kill()
-        self.process.join(10)
+        self.process.join(END_SECONDS)
         if self.process.is_alive():
             self.process.kill()
             self.process.join()
 
 
-class ProcessPool:
+class ProcessPool(Pool):
     """A pool of up to ``jobs`` processes on this machine; each makes one call after the other."""
 
-    def __init__(self, jobs: int, threads: int, *, timeout: float | None = None) -> None:
-        self.jobs, self.threads, self.timeout, self.workers = jobs, threads, timeout, list[Worker]()
+    def __init__(self, jobs: int, threads: int) -> None:
+        self.capacity, self.threads, self.workers = jobs, threads, list[Worker]()
 
-    @property
-    def has_room(self) -> bool:
-        """Whether the pool can take another call."""
-        return sum(worker.key is not None for worker in self.workers) < self.jobs
-
-    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
-        """Start a call of a picklable function."""
-        idle = next((worker for worker in self.workers if worker.key is None), None)
-        if idle is None:
-            idle = Worker(self.threads)
-            self.workers.append(idle)
-        idle.key, idle.since = key, None
-        idle.count += 1
+    def submit(self, function: Callable[..., Any], call: Call) -> None:
+        """Start a call."""
+        worker = next((worker for worker in self.workers if worker.key is None), None)
+        if worker is None:
+            worker = Worker(self.threads)
+            self.workers.append(worker)
+        worker.key = call.key
+        worker.count += 1
         with suppress(OSError):  # a process that has ended already is noticed by wait
-            idle.pipe.send((function, arguments))
+            worker.pipe.send((function, call.arguments))
 
-    def wait(self, seconds: float | None) -> list[tuple[Any, Any]]:
-        """Wait up to ``seconds`` (None: forever) for calls to end; return (key, result or Lost) of each."""
-        busy = [worker for worker in self.workers if worker.key is not None]
-        wait([worker.pipe for worker in busy] + [worker.process.sentinel for worker in busy], seconds)
-        ended = []
-        for worker in busy:
-            for result in self._results(worker):
-                ended.append((worker.key, result))
-                worker.key = None
-                if isinstance(result, Lost) or worker.count >= CALLS_PER_PROCESS:
-                    worker.stop(now=isinstance(result, Lost))
-                    self.workers.remove(worker)
+    def wait(self) -> list[tuple[Any, Any]]:
+        """Wait until a call ends; return key and result of each that has."""
+        busy, ended = [worker for worker in self.workers if worker.key is not None], []
+        ready = wait([worker.pipe for worker in busy])
+        for worker in [worker for worker in busy if worker.pipe in ready]:
+            result = worker.read_result()
+            ended.append((worker.key, result))
+            worker.key = None
+            if isinstance(result, Lost) or worker.count >= CALLS_PER_PROCESS:
+                worker.stop(now=isinstance(result, Lost))
+                self.workers.remove(worker)
         return ended
 
-    def _results(self, worker: Worker) -> list[Any]:
-        """Return the result of a call that ended; nothing if it has not."""
-        try:
-            while worker.pipe.poll():
-                message = worker.pipe.recv()
-                if message != STARTED:
-                    return [message]
-                worker.since = time.monotonic()
-            is_lost = not worker.process.is_alive() and not worker.pipe.poll()
-        except (EOFError, OSError):
-            worker.process.join(10)
-            is_lost = True
-        if is_lost:
-            return [Lost(_describe_exit(worker.process))]
-        limit, since = self.timeout, worker.since
-        if limit is not None and since is not None and time.monotonic() > since + limit:
-            return [Lost(f"took longer than {limit:g} s (--timeout)")]
-        return []
-
-    def close(self) -> list[Any]:
-        """End all processes; return the keys of unfinished calls."""
+    def close(self) -> None:
+        """End all processes."""
         for worker in self.workers:
             worker.stop(now=worker.key is not None)
-        keys, self.workers = [worker.key for worker in self.workers if worker.key is not None], []
-        return keys
+        self.workers = []
 
 
 def _describe_exit(process: BaseProcess) -> str:
@@ -116,7 +99,7 @@ def _describe_exit(process: BaseProcess) -> str:
         name = signal.Signals(-code).name
     except ValueError:
         name = str(-code)
-    hint = "; perhaps out of memory, fewer --jobs or --max-memory help" if -code == signal.SIGKILL else ""
+    hint = "; perhaps out of memory, fewer --jobs help" if -code == signal.SIGKILL else ""
     return f"its process was killed ({name}{hint})"
 
 
@@ -148,5 +131,8 @@ def run_worker(pipe: Connection) -> None:
     with suppress(EOFError, OSError):  # raised when the run has ended
         while True:
             function, arguments = pipe.recv()
-            pipe.send(STARTED)
-            pipe.send(function(*arguments))
+            try:
+                answer = True, function(*arguments)
+            except Exception as error:
+                answer = False, error
+            pipe.send(answer)

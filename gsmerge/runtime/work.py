@@ -1,21 +1,20 @@
-"""Engines that make calls: in this process, or in those of a Ray cluster.
+"""Engines that make calls: in this process, in others of this machine, or in those of a Ray cluster.
 
-Ray is an extra, which schedules by threads and memory. A process that dies takes one call with it. Of work in parts,
-such a call is made again, elsewhere, and gives the same. Processes of this machine: :mod:`gsmerge.runtime.processes`.
+Ray is an extra, which schedules by threads and memory. A process that dies takes one call with it; on a cluster such a
+call is made again, elsewhere, and gives the same. Processes of this machine: :mod:`gsmerge.runtime.processes`.
 """
 
 from __future__ import annotations
 
-import faulthandler
 import logging
 import os
 import socket
-import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.runtime.record import Record, record_part, report_progress
@@ -26,8 +25,54 @@ CONNECT_TIMEOUT = 10.0  # seconds to reach a cluster
 RETRIES = 5  # of a call whose process or node was lost
 SMALL_STORE = 100 << 20  # bytes of objects that the calls on a cluster of this machine may share
 CALLS_PER_PROCESS = 200  # then it is replaced by a new one, so that what libraries leave in memory cannot add up
-EXTRA_CALLS = 2  # submitted beyond those that the cluster has processors for
-CLUSTER_SIZE_SECONDS = 5.0  # between two queries of the cluster's size
+
+
+class Call(NamedTuple):
+    """A call to make in another process."""
+
+    key: Any  # by which the caller knows its result
+    arguments: tuple[Any, ...]
+    memory: int = 0  # bytes that it may take
+
+
+class Lost(NamedTuple):
+    """Result of a call whose process or node was lost."""
+
+    reason: str
+
+
+class Pool(ABC):
+    """Processes that make up to ``capacity`` calls at once."""
+
+    capacity: int
+
+    def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
+        """Make calls of a picklable function, each taken when there is room for it.
+
+        Yields the key and the result of each, or :class:`Lost`, as it ends; raises what a call raises.
+        """
+        waiting, active = iter(calls), 0
+        while True:
+            while active < self.capacity and (call := next(waiting, None)) is not None:
+                self.submit(function, call)
+                active += 1
+            if not active:
+                return
+            ended = self.wait()
+            active -= len(ended)
+            yield from ended
+
+    @abstractmethod
+    def submit(self, function: Callable[..., Any], call: Call) -> None:
+        """Start a call."""
+
+    @abstractmethod
+    def wait(self) -> list[tuple[Any, Any]]:
+        """Wait until a call ends; return key and result of each that has."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all processes, and the calls that they make."""
 
 
 @contextmanager
@@ -102,114 +147,76 @@ class Work:
     def _run_there(
         self, cluster: Cluster, title: str, function: Callable[..., T], count: int, calls: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[T, Record]]:
-        processors = cluster.processors
-        needs = cluster.needs(self.threads or max(1, processors // count), self.memory)
-        threads, folder = max(1, int(needs["num_cpus"])), os.getcwd()
-        pool = RayPool(cluster, threads, jobs=max(1, processors // threads), retries=RETRIES)
-        results = dict[int, Any]()
+        needs = cluster.needs(self.threads or max(1, cluster.processors // count), self.memory)
+        pool, results = RayPool(cluster, max(1, int(needs["num_cpus"]))), dict[int, Any]()
 
-        def wait_for_some() -> None:
-            for place, value in pool.wait(None):
-                if isinstance(value, Lost):  # an error ends the run at once
-                    raise _cause(value.error, title, cluster)
-                results[place] = value
-                report_progress(f"{title}: {len(results)} of {count} blocks", len(results), count)
+        def each_call() -> Iterator[Call]:
+            for place, arguments in enumerate(calls):
+                yield Call(place, (pool.threads, function, *arguments), self.memory)
 
-        for place, arguments in enumerate(calls):
-            while not pool.has_room:
-                wait_for_some()
-            pool.submit(place, _call_in_part, threads, folder, function, *arguments, memory=self.memory)
-        while pool.keys:
-            wait_for_some()
+        for place, value in pool.run(_call_in_part, each_call()):
+            if isinstance(value, Lost):
+                raise UsageError(f"engine ray: {title}: {value.reason}; perhaps out of memory, more blocks help")
+            results[place] = value
+            report_progress(f"{title}: {len(results)} of {count} blocks", len(results), count)
         for place in range(len(results)):
             yield results.pop(place)
 
 
-def _call_in_part(threads: int, folder: str, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
-    """Make a call with a record of its own, in the folder that relative paths of the caller's files refer to."""
-    with suppress(OSError):
-        os.chdir(folder)
+def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> tuple[T, Record]:
+    """Make a call with a record of its own."""
     with use_threads(threads), record_part() as record:
         value = function(*arguments)
     return value, replace(record, progress=None)
 
 
-def _cause(error: Any, title: str, cluster: Cluster) -> Exception:
-    """Return what a call raised; UsageError if its process was lost each time."""
-    if isinstance(error, cluster.ray.exceptions.RayTaskError):
-        return error.cause if isinstance(error.cause, Exception) else error
-    text = " ".join(str(error).split())[:200]
-    problem = f"its process or node was lost {RETRIES + 1} times ({type(error).__name__}: {text})"
-    return UsageError(f"engine ray: {title}: {problem}; perhaps out of memory, more blocks help")
-
-
-@dataclass(frozen=True)
-class Lost:
-    """Result of a call whose process or node was lost, with the reason."""
-
-    reason: str
-    error: Any = None  # Ray's
-
-
-class RayPool:
+class RayPool(Pool):
     """A pool of up to ``jobs`` calls on a Ray cluster; 0: as many as it has processors."""
 
-    def __init__(
-        self, cluster: Cluster, threads: int, *, jobs: int = 0, retries: int = 0, timeout: float | None = None
-    ) -> None:
+    def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
-        self.threads, self.jobs, self.timeout = threads, jobs, timeout
-        self.function = self.ray.remote(max_retries=retries, max_calls=CALLS_PER_PROCESS)(_call)
-        self.keys: dict[Any, Any] = {}
-        self.counted, self.capacity = float("-inf"), 1
+        self.threads, self.jobs = threads, jobs
+        self.function = self.ray.remote(max_retries=RETRIES, max_calls=CALLS_PER_PROCESS)(_call_in_folder)
+        self.keys: dict[Any, Any] = {}  # by reference to the result
 
     @property
-    def has_room(self) -> bool:
-        """Whether the pool can take another call."""
-        if self.jobs:
-            return len(self.keys) < self.jobs
-        if time.monotonic() > self.counted + CLUSTER_SIZE_SECONDS:
-            self.capacity = max(1, self.cluster.processors // self.threads) + EXTRA_CALLS
-            self.counted = time.monotonic()
-        return len(self.keys) < self.capacity
+    def capacity(self) -> int:  # type: ignore[override]
+        """Calls at once; a cluster may grow meanwhile."""
+        return self.jobs or max(1, self.cluster.processors // self.threads)
 
-    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
-        """Start a call of a picklable function that may need ``memory`` bytes."""
-        needs = self.cluster.needs(self.threads, memory)
-        self.keys[self.function.options(**needs).remote(self.timeout, function, *arguments)] = key
+    def submit(self, function: Callable[..., Any], call: Call) -> None:
+        """Start a call."""
+        needs = self.cluster.needs(self.threads, call.memory)
+        self.keys[self.function.options(**needs).remote(os.getcwd(), function, *call.arguments)] = call.key
 
-    def wait(self, seconds: float | None) -> list[tuple[Any, Any]]:
-        """Wait up to ``seconds`` (None: forever) for calls to end; return (key, result or Lost) of each."""
-        ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=seconds)
-        if ready and pending:
+    def wait(self) -> list[tuple[Any, Any]]:
+        """Wait until a call ends; return key and result of each that has."""
+        ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=None)
+        if pending:
             ready += self.ray.wait(pending, num_returns=len(pending), timeout=0)[0]
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:
         try:
             return self.ray.get(ref)
+        except self.ray.exceptions.RayTaskError as error:
+            raise error.cause if isinstance(error.cause, Exception) else error from None
         except self.ray.exceptions.RayError as error:
-            late = "" if self.timeout is None else f", or it took longer than {self.timeout:g} s (--timeout)"
-            return Lost(f"its process or node was lost ({type(error).__name__}){late}", error)
+            text = " ".join(str(error).split())[:200]
+            return Lost(f"its process or node was lost {RETRIES + 1} times ({type(error).__name__}: {text})")
 
-    def close(self) -> list[Any]:
-        """Cancel unfinished calls; return an empty list, since what they left may be on any node."""
+    def close(self) -> None:
+        """Cancel the calls that have not ended."""
         for ref in self.keys:
             with suppress(self.ray.exceptions.RayError, ValueError):
                 self.ray.cancel(ref, force=True)
-        return []
 
 
-def _call(seconds: float | None, function: Callable[..., T], *arguments: Any) -> T:
-    """Make a call in a process that ends if it takes longer, even while it runs compiled code."""
-    if seconds is None:
-        return function(*arguments)
-    with open(os.devnull, "w") as nowhere:
-        faulthandler.dump_traceback_later(seconds, exit=True, file=nowhere)
-        try:
-            return function(*arguments)
-        finally:
-            faulthandler.cancel_dump_traceback_later()
+def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) -> T:
+    """Make a call in the folder that relative paths of the caller refer to."""
+    with suppress(OSError):
+        os.chdir(folder)
+    return function(*arguments)
 
 
 def require_ray() -> ModuleType:

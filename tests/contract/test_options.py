@@ -30,8 +30,7 @@ def shown(command: str, name: str) -> Any:
 
 def test_defaults_of_single_commands_are_the_library_s() -> None:
     assert shown("extend", "max_k") == str(OnlineOptions().max_k)
-    assert [shown("batch", name) for name in ("retries", "engine", "timeout")] == [1, "local", None]
-    assert (BatchOptions().retries, BatchOptions().engine, BatchOptions().timeout) == (1, "local", None)
+    assert shown("batch", "engine") == BatchOptions().engine == "local"
     assert shown("batch", "name") == BatchOptions().output
     made = GenerateOptions()
     assert [shown("generate", name) for name in ("style", "path", "noise")] == [made.style, made.path, made.noise]

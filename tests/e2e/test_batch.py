@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 import typer.main
-from batches import FAST, InlinePool, records, results, rows, statuses
+from batches import FAST, InlinePool, records, results, statuses
 from messages import names
 
 import gsmerge
+from gsmerge.batch.records import record
 from gsmerge.cli.app import app
+from gsmerge.cli.batch_command import Totals
 
 from .conftest import Outcome, Run, listing
 
@@ -46,7 +48,7 @@ def first(rooms: Path) -> tuple[int, Path]:
 @pytest.fixture(autouse=True)
 def in_this_process(first: tuple[int, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes are the subject of ``first`` alone, and of ``test_batch_faults.py``; each takes seconds to start."""
-    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture
@@ -61,20 +63,20 @@ def test_one_bad_scene_stops_no_other(first: tuple[int, Path], rooms: Path, run:
     names = [f"room{number}.ply" for number in range(4)]
     assert sorted(results(out)) == names
     assert statuses(out) == {"bad.ply": ["failed"], **{name: ["done"] for name in names}}
-    assert sorted(path.name for path in out.iterdir()) == ["batch.jsonl", *names, "summary.csv"]
-    actual = {row["output"]: row for row in rows(out)}
-    assert "truncated" in actual["bad.ply"]["error"]
-    assert int(actual["room1.ply"]["num_input"]) == 3 * 48 * 32
+    assert sorted(path.name for path in out.iterdir()) == ["batch.jsonl", *names]
+    lines = {record["output"]: record for record in records(out)}
+    assert "truncated" in lines["bad.ply"]["error"]
+    assert lines["room1.ply"]["report"]["input"]["num_gaussians"] == 3 * 48 * 32
     assert run("compact", rooms / "room1", "-o", tmp_path / "one.ply", *FAST, "-q").code == 0
     assert (tmp_path / "one.ply").read_bytes() == (out / "room1.ply").read_bytes()
 
 
 def test_records_are_reports(first: tuple[int, Path]) -> None:
-    for record in records(first[1]):
-        assert (record["schema_version"], record["tool"]["version"]) == (1, gsmerge.__version__)
-        if record["status"] == "done":
-            assert record["report"]["output"]["bytes"] == record["files"][0]["bytes"]
-            assert record["report"]["options"]["threads"] == 1
+    for line in records(first[1]):
+        assert (line["schema_version"], line["tool"]["version"]) == (1, gsmerge.__version__)
+        if line["status"] == "done":
+            assert line["report"]["output"]["bytes"] == line["files"][0]["bytes"]
+            assert line["report"]["options"]["threads"] == 1
 
 
 def test_the_same_again_does_what_failed_and_nothing_else(rooms: Path, out: Path, run: Run) -> None:
@@ -98,7 +100,7 @@ def test_a_mended_scene_is_done_and_json_is_a_line_each(rooms: Path, out: Path, 
     lines = [json.loads(line) for line in outcome.out.splitlines()]
     assert {line["output"]: line["status"] for line in lines}["bad.ply"] == "done"
     assert [line["status"] for line in lines].count("skipped") == 4
-    again = batch(run, mended, out, "--rerun", "--quiet")
+    again = batch(run, mended, out, "--overwrite", "--quiet")
     assert (again.code, again.out, again.err) == (0, "", "")
     assert [actual.count("done") for actual in statuses(out).values()] == [2] * 5
 
@@ -118,6 +120,26 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     new = batch(run, rooms, out.parent / "new", "--dry-run")
     assert "5 of 5 scenes" in new.out
     assert not (out.parent / "new").exists()
+
+
+def test_the_table_at_the_end_has_the_first_results() -> None:
+    totals = Totals(1000)
+    report = {
+        "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
+        "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None,
+    }  # fmt: skip
+    for number in range(300):
+        totals.add(record("done", f"{number}", f"{number}.ply", report=report))
+        totals.add(record("failed", f"{number}", f"{number}.ply", error="no"))
+        totals.add(record("skipped", f"{number}", f"{number}.ply"))
+    totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few"}))
+    *table, last = totals.lines()
+    assert table[0].split() == ["result", "Gaussians", "of", "kept", "dB", "before", "after", "seconds"]
+    assert len(table) == 1 + 20 + 1 + 20 + 1
+    assert [line for line in table if "more" in line] == ["... and 281 more", "... and 280 more failed"]
+    counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
+    assert last == f"{counts}; 1 missed the target"
+    assert Totals(0).lines() == ["0 scenes: 0 done"]
 
 
 def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, run: Run) -> None:

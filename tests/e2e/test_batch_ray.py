@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from batches import FAST, NAMES, holders, records, results, start, statuses, until
+from batches import FAST, NAMES, holders, results, start, statuses, until
 from messages import names
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
@@ -24,8 +24,6 @@ def test_a_killed_process_is_survived(rooms: Path, tmp_path: Path, undisturbed: 
     assert (process.communicate()[0], process.returncode) == ("", 0)
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
-    assert len({record["pid"] for record in records(tmp_path)} - {process.pid}) >= 1
-    assert max(record["attempt"] for record in records(tmp_path)) == 2
 
 
 CLUSTER = """
@@ -63,7 +61,6 @@ def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undist
     assert "nodes: 1" in done.stdout
     assert results(tmp_path) == undisturbed
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
-    assert max(record["attempt"] for record in records(tmp_path)) == 2
 
 
 @needs_ray

@@ -47,7 +47,7 @@ def copied(results: Path, tmp_path: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
-    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture

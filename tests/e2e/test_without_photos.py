@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from batches import InlinePool
+from batches import InlinePool, records
 
 import gsmerge
 from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
@@ -85,11 +84,10 @@ def test_stored_scenes(bare: Path, tmp_path: Path, run: Run) -> None:
 def test_a_batch_says_it_of_every_scene(
     bare: Path, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.batch.schedule.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
     for name, folder in (("bare", bare), ("photos", made_scene)):
         ignore = shutil.ignore_patterns("targets")
         shutil.copytree(folder, tmp_path / "scenes" / name, ignore=ignore)
     run("batch", tmp_path / "scenes", "--output", tmp_path / "out", *QUICK, "-q", code=0)
-    with open(tmp_path / "out" / "summary.csv", newline="", encoding="utf-8") as file:
-        rows = {Path(row["output"]).stem: row["psnr_reference"] for row in csv.DictReader(file)}
-    assert rows == {"bare": ROW_COLORS, "photos": "photos"}
+    actual = {record["output"]: record["report"]["psnr_reference"] for record in records(tmp_path / "out")}
+    assert actual == {"bare.ply": ROW_COLORS, "photos.ply": "photos"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import subprocess
@@ -12,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch import BatchOptions, Job
-from gsmerge.batch.find import output_name
-from gsmerge.batch.records import RECORDS, SUMMARY, RecordIndex
-from gsmerge.batch.task import BatchContext, Task, make_index
+from gsmerge.batch import BatchOptions, Job, find_jobs
+from gsmerge.batch.records import RECORDS
+from gsmerge.batch.run import Run, read_index
+from gsmerge.runtime.work import Call, Pool
 from gsmerge.settings.compact import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
@@ -39,14 +38,8 @@ def statuses(folder: Path) -> dict[str, list[str]]:
 
 def results(folder: Path) -> dict[str, str]:
     """SHA-256 of every file but the records: whatever is left half-done shows."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in (RECORDS, SUMMARY)]
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != RECORDS]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    """The rows of the summary."""
-    with (folder / SUMMARY).open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:
@@ -74,46 +67,36 @@ def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
 
 
 def holders(folder: Path) -> list[int]:
-    """Processes that have begun to compact scenes."""
-    actual = []
-    for path in folder.glob(".batch-*.begun"):
-        try:
-            actual.append(int(path.read_text().split()[0]))
-        except (OSError, IndexError):
-            continue  # it is being written, or has just gone
-    return actual
+    """Processes that have begun to make results."""
+    lines = [path.read_text().split() for path in folder.glob(".batch-*.lock")]
+    return [int(numbers[-1]) for numbers in lines if numbers]
 
 
-class InlinePool:
+class InlinePool(Pool):
     """In place of :class:`gsmerge.runtime.processes.ProcessPool`: one call after the other in this process."""
 
-    def __init__(self, *_: object, **__: object) -> None:
-        make_index.cache_clear()  # as in a new process
+    capacity = 1
+
+    def __init__(self, *_: object) -> None:
+        read_index.cache_clear()  # as in a new process
         self.ended: list[tuple[Any, Any]] = []
 
-    @property
-    def has_room(self) -> bool:
-        return not self.ended
+    def submit(self, function: Callable[..., Any], call: Call) -> None:
+        self.ended.append((call.key, function(*call.arguments)))
 
-    def submit(self, key: Any, function: Callable[..., Any], *arguments: Any, memory: int = 0) -> None:
-        self.ended.append((key, function(*arguments)))
-
-    def wait(self, _: float | None) -> list[tuple[Any, Any]]:
+    def wait(self) -> list[tuple[Any, Any]]:
         ended, self.ended = self.ended, []
         return ended
 
-    def close(self) -> list[Any]:
-        return []
+    def close(self) -> None:
+        pass
 
 
-def one_task(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Task, BatchContext, RecordIndex]:
-    """What :func:`run_task` takes for a single scene, as a run would have it that begins now."""
+def one_job(scene: Path, out: Path, options: BatchOptions = QUICK) -> tuple[Job, Run]:
+    """What :func:`make_result` takes for a single scene, as a run would have it that begins now."""
     out.mkdir(exist_ok=True)
-    index = RecordIndex(out)
-    index.read_on()
-    name = output_name(options, scene, 0)
-    return (
-        Task(Job(0, str(scene), name, 0), index.known.get(name)),
-        BatchContext(out, options, index.end),
-        RecordIndex(out, index.end),
-    )
+    read_index.cache_clear()
+    records = out / RECORDS
+    size = records.stat().st_size if records.exists() else 0
+    (job,) = find_jobs([str(scene)], out, options)
+    return job, Run(out, size, 1, options.overwrite)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import csv
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -99,3 +101,10 @@ def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
     *_, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
     assert nearest.endswith("the result has 25")
     assert "result" not in few + many
+
+
+def test_text_in_tables_is_no_formula() -> None:
+    text = ["=cmd|' x'!A1/s.ply", "+1.ply", "-1.ply", "@a.ply", "plain-1.ply"]
+    rows = csv.DictReader(io.StringIO(report.csv_text(["name", "count"], [{"name": x, "count": -1} for x in text])))
+    actual = [(row["name"], row["count"]) for row in rows]
+    assert actual == [(f"'{x}" if x != "plain-1.ply" else x, "-1") for x in text]

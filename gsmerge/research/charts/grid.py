@@ -11,7 +11,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from gsmerge.batch.find import Job, find_scenes, main_file, scene_plys
+from gsmerge.batch.find import find_scenes, main_file, scene_plys
+from gsmerge.batch.jobs import Job
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_table
 from gsmerge.io.cameras.colmap import is_colmap
@@ -21,8 +22,10 @@ from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
+from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import Settings, setting, settings_of
 
 ALL = "all"  # word for all views
@@ -202,11 +205,14 @@ def make_jobs(
     seed: int = 0,
     proxy_views: int = 0,
     command: str = "",
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints = AUTO,
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 
     ``proxy_views``: photos of each scene on which superpixels alone are measured; 0: none. ``command``: the command
-    line, for the records. A UsageError if the library does not take a setting.
+    line, for the records. ``opacity`` and ``hints``: how to read all scenes. A UsageError if the library does not take
+    a setting.
     """
     combinations, notes = list_settings(grid)
     counts = [None if count == ALL else int(count) for count in grid.views]
@@ -230,7 +236,7 @@ def make_jobs(
             name = name if name == label else f"{name} {digest({'label': label})[:6]}"
             output = f"{source.name}/{name}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
-            run = ChartRun(record, options, measured, source.targets, source.target_images)
+            run = ChartRun(record, options, measured, source.targets, source.target_images, opacity, hints)
             share = min(1.0, (views or most) / most) if source.num_views else 1.0
-            jobs.append(Job(len(jobs), str(source.path), output, round(share * num_gaussians), num_rest, run))
+            jobs.append(Job(str(source.path), (output,), run, round(share * num_gaussians), num_rest))
     return jobs, notes

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.batch import BatchOptions
-from gsmerge.batch.records import FAILED, newest_records
+from gsmerge.batch.records import DONE, FAILED, RECORDS
 from gsmerge.compaction.compact import compact
 from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.jsonl import each_line
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
 from gsmerge.measure.sizes import shrink_cameras
@@ -32,10 +32,9 @@ from gsmerge.measure.speed import time_render
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 from gsmerge.report import document_head
-from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.threads import available_threads, parallel_map, use_threads
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.scene.content_hash import digest
-from gsmerge.scene.exporters import ReadHints
+from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
@@ -131,8 +130,12 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
 
     Skip records of other versions, and of scenes whose files have changed since.
     """
-    newest = newest_records(folder, _read_record).items()
-    records = [record for _, record in newest if record is not None]
+    newest: dict[str, RunRecord | None] = {}
+    for _, line in each_line(folder / RECORDS):
+        if line is not None and isinstance(output := line.get("output"), str):
+            newest.pop(output, None)  # a repeated run moves to the end
+            newest[output] = _read_record(line)
+    records = [record for record in newest.values() if record is not None]
     foreign = len(newest) - len(records)
     content = {record.scene: record.scene_sha256 for record in records if record.error is None}
     kept = [record for record in records if record.error is not None or record.scene_sha256 == content[record.scene]]
@@ -145,9 +148,10 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[str]]:
 def _read_record(record: Mapping[str, Any]) -> RunRecord | None:
     """Read a run from the record of a batch; None if it is of another version or kind."""
     scene, _, label = record["output"].rpartition("/")
-    if record["status"] == FAILED:
-        return RunRecord(scene, label, error=record["error"] or "unknown")
-    run, names = (record["report"] or {}).get("run"), [f.name for f in fields(RunRecord)]
+    if record.get("status") == FAILED:
+        return RunRecord(scene, label, error=str(record.get("error") or "unknown"))
+    report, names = record.get("report"), [f.name for f in fields(RunRecord)]
+    run = report.get("run") if isinstance(report, dict) and record.get("status") == DONE else None
     if not isinstance(run, dict) or not all(name in run and _is_sound(name, run[name]) for name in names):
         return None
     if run["record_version"] != RECORD_VERSION or run["error"] is not None:
@@ -169,50 +173,37 @@ def describe(method: str, settings: Mapping[str, Any], views: int | None) -> str
 
 @dataclass(frozen=True)
 class ChartRun:
-    """Run and measurement of one grid point on one scene; see :class:`gsmerge.batch.find.Work`."""
+    """Run and measurement of one grid point on one scene; see :class:`gsmerge.batch.jobs.SceneCall`."""
 
     record: RunRecord  # what is known beforehand
     settings: CompactOptions  # all settings
     measured: EvaluateOptions  # what is measured
     targets: Path | None = None  # cameras of held-out views
     target_images: Path | None = None  # folder of their photos; None: found by their cameras
+    opacity: OpacityChoice = "auto"  # how the scene's files store it
+    hints: ReadHints = AUTO  # for reading them
 
-    def key(self, options: BatchOptions) -> str:
-        """Return a digest of everything that the measurements depend on."""
+    def key(self, files: SceneFiles) -> str:
+        """Return a digest of everything that the measurements depend on; the record has the hash of the files."""
         run = asdict(replace(self.record, command=""))
         how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
-        return digest({"run": run, **how, "opacity": options.opacity, "reading": vars(options.hints)})
+        return digest({"run": run, **how, "opacity": self.opacity, "reading": vars(self.hints)})
 
-    def run(self, files: SceneFiles, options: BatchOptions, out: Path) -> tuple[dict[str, Any], list[Path]]:
+    def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Merge, score and time a scene, and save pictures; return a batch record's report and the picture files."""
-        threads = options.settings.threads
         with use_threads(threads):
             source = files, self.targets, self.target_images, self.record.scene_sha256
-            scene, held_out, notes = _load(*source, options.opacity, options.hints)
+            scene, held_out, notes = _load(*source, self.opacity, self.hints)
             if self.record.method == SUPERPIXELS:
                 facts, pictures = self._measure_superpixels(scene, out)
             else:
                 facts, pictures = self._measure(scene, held_out, out, threads)
         facts["notes"] = (*notes, *facts.get("notes", ()))
         record = replace(self.record, environment=environment(threads), **facts)
-        size = sum(path.stat().st_size for path in files.plys)
-        report = {
-            **document_head(),
-            "input": {"path": os.fspath(files.ply), "bytes": size, "num_gaussians": record.num_input or 0},
-            "output": {"bytes": record.bytes or 0, "num_gaussians": record.count or 0},
-            "levels": [],
-            "ratio": record.ratio,
-            "psnr_input_views": {"before": None, "after": record.value("psnr_context")},
-            "total_seconds": record.seconds or 0.0,
-            "peak_memory_bytes": peak_memory(),
-            "unmet": None,
-            "notes": list(record.notes),
-            "run": asdict(record),
-        }
-        return report, pictures
+        return {**document_head(), "notes": list(record.notes), "run": asdict(record)}, pictures
 
     def _measure(
-        self, scene: Scene, held_out: HeldOutViews | None, out: Path, threads: int | None
+        self, scene: Scene, held_out: HeldOutViews | None, out: Path, threads: int
     ) -> tuple[dict[str, Any], list[Path]]:
         method, views = self.record.method, self.record.views_asked
         if views is not None and views > len(scene):
@@ -346,7 +337,7 @@ def _write(path: Path, picture: Picture) -> None:
     save_picture(path, picture, *((cv2.IMWRITE_JPEG_QUALITY, QUALITY) if path.suffix == ".jpg" else ()))
 
 
-def environment(threads: int | None) -> dict[str, str]:
+def environment(threads: int) -> dict[str, str]:
     """Return processor, threads and versions, on which results and times depend."""
     processor = platform.processor() or platform.machine()
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
@@ -356,7 +347,7 @@ def environment(threads: int | None) -> dict[str, str]:
     return {
         "gsmerge": __version__,
         "processor": f"{processor}, {os.cpu_count() or 1} processors",
-        "threads": str(threads or available_threads()),
+        "threads": str(threads),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **versions,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.batch_command import check_failures, pending_jobs, print_plan, run_jobs
+from gsmerge.cli.batch_command import check_failures, damage_notes, print_plan, run_jobs
 from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes
 from gsmerge.cli.paths import write_texts
@@ -83,23 +83,25 @@ def chart(args: opt.Args) -> None:
     if args.draw_only:
         _draw(args, [], 0)
         return
-    from gsmerge.batch.records import RecordIndex, Totals
-    from gsmerge.batch.schedule import make_schedule
+    from gsmerge.batch.records import RecordIndex
+    from gsmerge.batch.schedule import pending_jobs
 
     jobs, options, notes = _make_jobs(args, scenes)
-    index, schedule = RecordIndex(out), make_schedule(jobs, options)
-    index.read_on()
-    notes += [f"{index.damaged} damaged line(s) of the records were ignored"] if index.damaged else []
+    notes += damage_notes(RecordIndex(out).read_on())
     if args.dry_run:
-        print_plan(args, jobs, options, index, schedule, notes, "runs")
+        print_plan(args, jobs, options, notes, "runs")
         return
     say_notes(notes, quiet=args.silent)
-    pending = pending_jobs(jobs, out, options, index)
-    totals = Totals(len(pending), "output")
+    pending, failed = pending_jobs(jobs, out, options), list[tuple[str, str]]()
+
+    def add(record: dict[str, Any]) -> None:
+        if record["error"] is not None:
+            failed.append((record["output"], record["error"]))
+
     if pending:
-        run_jobs(args, totals, pending, options, index, schedule)
+        run_jobs(args, pending, options, add, "output")
     _draw(args, notes, len(pending))
-    check_failures(totals, "runs")
+    check_failures(failed, len(pending), "runs")
 
 
 def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchOptions, list[str]]:
@@ -116,8 +118,7 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     with opt.usage_errors():
         measured = EvaluateOptions(nets, args.lpips_views, **args.given(("photo_side",)))
         settings = CompactOptions().with_settings(args.given(("seed", "threads")))
-        # one at a time, so that none slows another
-        options = BatchOptions(settings, args.opacity, args.hints(), jobs=1, rerun=args.rerun, overwrite=True)
+        options = BatchOptions(settings, jobs=1, overwrite=args.rerun)  # so that no run slows another
     sources = find_sources(scenes, args.output, args.targets, args.target_images)
     # the command line that does the same, without options at their defaults
     words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
@@ -127,6 +128,7 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name.replace('_', '-')}", str(element)]
     more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": shlex.join(words)}
+    more |= {"opacity": args.opacity, "hints": args.hints()}
     jobs, left_out = make_jobs(sources, grid, measured, **more)
     return jobs, options, [*notes, *left_out]
 

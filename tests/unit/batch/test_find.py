@@ -1,9 +1,8 @@
-"""Scenes are found in any layout, each once, and no two are written to one file."""
+"""Scenes are found in any layout."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,8 @@ import pytest
 from messages import refuses
 from tiny_scene import Tiny, write_npz
 
-from gsmerge.batch import BatchOptions, find_jobs
-from gsmerge.batch.find import find_scenes, output_name
+from gsmerge.batch.find import find_scenes
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.compact import CompactOptions
 
 OUT = Path("out")
 
@@ -32,10 +29,6 @@ def touch(*names: str) -> None:
 
 def actual(*given: str, out: Path = OUT) -> list[str]:
     return [str(scene) for scene in find_scenes(given, out)]
-
-
-def outputs(*arguments: str, options: BatchOptions | None = None, results: set[str] | None = None) -> dict[str, str]:
-    return {job.output: job.scene for job in find_jobs(arguments, OUT, options or BatchOptions(), results or set())}
 
 
 def test_folders_are_searched() -> None:
@@ -74,11 +67,6 @@ def test_the_output_folder_is_not_searched() -> None:
         actual("all", out=Path("all"))
 
 
-def test_results_of_former_runs_are_no_scenes() -> None:
-    touch("a.ply", "b.ply")
-    assert outputs("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
-
-
 def test_patterns_and_lists() -> None:
     touch("s/one/scene.ply", "s/two/scene.ply", "s/notes.ply.txt", "s/x.ply")
     assert actual("s/*") == ["s/one", "s/two", "s/x.ply"]
@@ -96,7 +84,7 @@ def test_links_in_a_circle_end() -> None:
     touch("all/a.ply")
     Path("all/again").symlink_to("..", target_is_directory=True)
     assert actual("all")[0] == "all/a.ply"
-    assert len(outputs("all")) == 1
+    assert len({os.path.realpath(scene) for scene in actual("all")}) == 1
 
 
 def link(path: str, target: str) -> None:
@@ -165,8 +153,8 @@ def locked(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_folder_that_cannot_be_read_is_passed_by() -> None:
     touch("all/a.ply", "all/locked/b.ply", "all/z/c.ply")
     errors: list[SceneError] = []
-    jobs = find_jobs(["all", "all/*"], OUT, BatchOptions(), unreadable=errors)
-    assert [job.scene for job in jobs] == ["all/a.ply", "all/z/c.ply"]
+    found = find_scenes(["all", "all/*"], OUT, errors)
+    assert list(dict.fromkeys(map(str, found))) == ["all/a.ply", "all/z/c.ply"]
     assert {error.path for error in errors} == {"all/locked"}
     for given in (["all/locked"], ["all"], ["all/locked/**/*.ply"]):
         with refuses(SceneError, "all/locked", "Permission denied"):
@@ -186,54 +174,3 @@ def test_places_without_a_scene_are_refused(given: str, found: str) -> None:
     Path("binary.bin").write_bytes(b"a\0b")
     with refuses(SceneError, given, found):
         actual(given)
-
-
-def test_each_scene_comes_once() -> None:
-    touch("s/a/scene.ply", "s/b.ply")
-    assert outputs("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
-
-
-def test_two_scenes_are_not_written_to_one_file() -> None:
-    touch("s/a/scene.ply", "t/a/scene.ply")
-    with refuses(UsageError, "out/a.ply", "s/a", "t/a", "--name"):
-        outputs("s", "t")
-    apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
-    assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
-
-
-def test_levels_need_files_of_their_own_too() -> None:
-    touch("a.ply", "a.level1.ply")
-    levels = BatchOptions(CompactOptions().with_settings({"levels": 2}))
-    assert len(outputs("*.ply")) == 2
-    with pytest.raises(UsageError, match=r"a\.level1\.ply"):
-        outputs("*.ply", options=levels)
-
-
-def test_a_result_does_not_replace_a_scene() -> None:
-    touch("out/a.ply", "b/a.ply")
-    with refuses(UsageError, "out/a.ply", "--output"):
-        outputs("out/a.ply")
-
-
-def test_counts_come_from_the_header() -> None:
-    touch("a.ply")
-    Path("b.ply").write_text("no header")
-    assert [job.num_gaussians for job in find_jobs(["a.ply", "b.ply"], OUT, BatchOptions())] == [7, 0]
-
-
-def test_names_are_filled_in(tmp_path: Path) -> None:
-    options = BatchOptions(CompactOptions().with_settings({"k": 2}))
-
-    def name(template: str, scene: str) -> str:
-        return output_name(replace(options, output=template), Path(scene), 12)
-
-    touch("set/room.v2/scene.ply")
-    assert name("{stem}.ply", "set/room.v2") == "room.v2.ply"
-    assert name("{stem}.ply", "set/room.v2/scene.ply") == "scene.ply"
-    assert name("{parent}-{stem}.k{k}.ply", "set/a.ply") == "set-a.k2.ply"
-    assert name("{index:04d}.ply", "a.ply") == "0012.ply"
-    assert name("{stem}.ply", "a.compressed.ply") == "a.ply"
-    assert name("{stem}.compressed.ply", "a.ply") == "a.compressed.ply"
-    assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
-    with refuses(UsageError, "--name", "{stem:d}.ply"):
-        name("{stem:d}.ply", "a.ply")

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from messages import noted, refuses
 
-from gsmerge.batch import BatchOptions
 from gsmerge.batch.schedule import Schedule, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.measure.evaluate import EvaluateOptions
@@ -21,7 +20,6 @@ from gsmerge.research.charts.grid import (
     read_grid,
     scene_names,
 )
-from gsmerge.research.charts.measure_run import ChartRun
 from gsmerge.scene.exporters import ReadHints
 
 
@@ -228,27 +226,25 @@ def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -
     assert noted(notes, made_scene.name, "3 run(s)")
     assert all(job.output.startswith(f"{made_scene.name}/") and job.output.count("/") == 1 for job in jobs)
     assert jobs[1].num_gaussians == pytest.approx(0.4 * jobs[-2].num_gaussians)
-    runs = [job.work for job in jobs]
-    assert len({run.key(BatchOptions()) for run in runs if run is not None}) == len(runs)
+    assert len({job.call.key(job.find_files()) for job in jobs}) == len(jobs)
 
 
 def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
-    def key(options: BatchOptions | None = None, **more: Any) -> str:
+    def key(**more: Any) -> str:
         given = sources(made_scene), more.pop("grid", Grid()), more.pop("measured", EvaluateOptions(()))
         (_, job), _ = make_jobs(*given, **more)
-        assert isinstance(job.work, ChartRun)
-        return job.work.key(options or BatchOptions())
+        return job.call.key(job.find_files())
 
-    assert key() == key(BatchOptions(jobs=2), command="another")
-    others = [key(measured=EvaluateOptions(("vgg",))), key(BatchOptions(opacity="raw")), key(seed=1)]
-    others += [key(BatchOptions(hints=ReadHints(order="none"))), key(grid=Grid(budgets=("1%",)))]
+    assert key() == key(command="another")
+    others = [key(measured=EvaluateOptions(("vgg",))), key(opacity="raw"), key(seed=1)]
+    others += [key(hints=ReadHints(order="none")), key(grid=Grid(budgets=("1%",)))]
     others += [key(measured=EvaluateOptions((), photo_side=476))]
     assert len({key(), *others}) == 7
 
 
 def estimate(scene: Path, grid: Grid | None = None) -> float:
     jobs, _ = make_jobs(sources(scene), grid or Grid(), EvaluateOptions(()))
-    return estimate_seconds(jobs[1:], BatchOptions(), Schedule(1, 2, 0))
+    return estimate_seconds(jobs[1:], Schedule(1, 2))
 
 
 def test_estimates_grow_with_the_work(made_scene: Path) -> None:

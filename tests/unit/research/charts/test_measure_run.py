@@ -14,8 +14,7 @@ import scenes
 from experiments import make_record
 
 import gsmerge
-from gsmerge.batch import BatchOptions
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, record
 from gsmerge.io.jsonl import append_line
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.measure_run import (
@@ -33,11 +32,7 @@ from gsmerge.settings.compact import CompactOptions
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:
     """The record of a batch that a run ends as."""
-    report = {
-        "input": {"num_gaussians": 1, "bytes": 1}, "output": {"num_gaussians": 1, "bytes": 1}, "levels": [],
-        "ratio": run.ratio, "psnr_input_views": {"before": None, "after": None}, "total_seconds": 1.0,
-        "peak_memory_bytes": 1, "unmet": None, "notes": [], "run": asdict(run),
-    }  # fmt: skip
+    report = {"notes": [], "run": asdict(run)}
     return record(DONE, run.scene, run.output, key="k", files=[], report=report) | changes
 
 
@@ -65,7 +60,7 @@ def test_a_run_that_failed_stays_until_it_is_done(tmp_path: Path) -> None:
     append_line(tmp_path / RECORDS, record(FAILED, "fern", FERN.output, error="out of memory"))
     (failed,), _ = read_runs(tmp_path)
     assert (failed.scene, failed.label, failed.error) == ("fern", FERN.label, "out of memory")
-    append_line(tmp_path / RECORDS, record(SKIPPED, "fern", FERN.output))
+    store(tmp_path, FERN)
     assert read_runs(tmp_path)[0] == [FERN]
 
 
@@ -130,7 +125,7 @@ def test_superpixels_alone_are_measured_on_photos(made_scene: Path, tmp_path: Pa
     run = ChartRun(
         RunRecord("room", "superpixels", method="superpixels", views_asked=1), CompactOptions(), EvaluateOptions()
     )
-    report, pictures = run.run(find_scene_files(made_scene), BatchOptions(), tmp_path / "superpixels")
+    report, pictures = run.run(find_scene_files(made_scene), tmp_path / "superpixels", 1)
     scores = report["run"]["scores"]
     assert len(scores) == len(SEGMENTATIONS) * len(SHARES)
     assert scores["rdseg 0.01"] > scores["slic 0.01"]

@@ -6,7 +6,6 @@ import errno
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,40 +13,42 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from batches import QUICK, one_task, records, results, statuses
+from batches import QUICK, InlinePool, one_job, records, results, statuses
 from messages import names, refuses, says
 
-from gsmerge.batch import task as tasks
-from gsmerge.batch.records import BUSY, DONE, FAILED, SKIPPED, STUCK
-from gsmerge.batch.task import (
-    PREFIX,
-    BusyError,
-    clean_up,
-    record_failure,
-    run_lock,
-    run_task,
-    scene_lock,
-)
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.batch import jobs as calls
+from gsmerge.batch import run as runs
+from gsmerge.batch import run_batch
+from gsmerge.batch.records import DONE, FAILED, SKIPPED
+from gsmerge.batch.run import lock_result, make_result, record_loss, remove_unfinished
+from gsmerge.errors import SceneError
 from gsmerge.io import atomic
 
 
 def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
-    with scene_lock(tmp_path, "a.ply") as begun:
-        assert not begun.exists()
-        with pytest.raises(BusyError), scene_lock(tmp_path, "a.ply"):
-            pass
-        with scene_lock(tmp_path, "b.ply") as other:
-            assert other != begun
+    with lock_result(tmp_path, "a.ply", wait=False) as lock:
+        assert lock is not None
+        assert not lock.is_left
+        with lock_result(tmp_path, "a.ply", wait=False) as second:
+            assert second is None
+        with lock_result(tmp_path, "b.ply", wait=False) as other:
+            assert other is not None
     assert list(tmp_path.iterdir()) == []
-    with scene_lock(tmp_path, "a.ply") as again:
-        assert again == begun
+
+
+def test_a_lock_that_is_left_says_that_a_process_has_begun(tmp_path: Path) -> None:
+    path = leave_lock(tmp_path)
+    with lock_result(tmp_path, "room.ply", wait=True) as lock:
+        assert lock is not None
+        assert lock.is_left
+        lock.is_left = False
+    assert not path.exists()
 
 
 def test_a_full_disk_is_named(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is written first; an error of the system in the middle of writing names no file."""
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    for name in ("pathlib.Path.write_text", "gsmerge.batch.task.compact_files"):
+    for name in ("gsmerge.batch.run.ResultLock.leave_if_killed", "gsmerge.batch.jobs.compact_files"):
         out = tmp_path / name
 
         def fail(*_: object, **__: object) -> None:
@@ -55,23 +56,22 @@ def test_a_full_disk_is_named(small_scene: Path, tmp_path: Path, monkeypatch: py
 
         with monkeypatch.context() as patch:
             patch.setattr(name, fail)
-            outcome = run_task(*one_task(small_scene, out))
+            outcome = run(small_scene, out)
         assert outcome["status"] == FAILED
-        assert says(outcome["error"], out if "write_text" in name else "", "No space")
+        assert says(outcome["error"], "", "No space")
 
 
 TAKE_TURNS = """
 import os, pathlib, sys
-from gsmerge.batch.task import BusyError, scene_lock
+from gsmerge.batch.run import lock_result
 folder, turns = pathlib.Path(sys.argv[1]), 0
 while turns < 300:
-    try:
-        with scene_lock(folder, "a.ply"):
-            os.close(os.open(folder / "taken", os.O_CREAT | os.O_EXCL))  # fails where another has the lock as well
-            os.unlink(folder / "taken")
-            turns += 1
-    except BusyError:
-        pass
+    with lock_result(folder, "a.ply", wait=bool(turns % 2)) as lock:
+        if lock is None:
+            continue
+        os.close(os.open(folder / "taken", os.O_CREAT | os.O_EXCL))  # fails where another has the lock as well
+        os.unlink(folder / "taken")
+        turns += 1
 """
 
 
@@ -83,25 +83,17 @@ def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> No
 
 def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(SceneError, match="File exists"), scene_lock(tmp_path / "file", "a.ply"):
+    with (
+        pytest.raises(SceneError, match="Not a directory"),
+        lock_result(tmp_path / "file", "a.ply", wait=False),
+    ):
         pass
-
-
-def test_runs_share_a_folder_if_they_make_the_same(tmp_path: Path) -> None:
-    (tmp_path / f"{PREFIX}old.0.1.gone.run").touch()  # of a run that was killed
-    with run_lock(tmp_path, "same"), run_lock(tmp_path, "same"):
-        found = f"(process {os.getpid()} on {socket.gethostname()})"
-        with refuses(UsageError, tmp_path, found, "--output"), run_lock(tmp_path, "other"):
-            pass
-        with run_lock(tmp_path, "same"):
-            pass
-    with run_lock(tmp_path, "other"):
-        pass
-    assert list(tmp_path.iterdir()) == []
 
 
 def run(scene: Path, out: Path, options: Any = QUICK) -> dict[str, Any]:
-    return run_task(*one_task(scene, out, options))
+    actual = make_result(*one_job(scene, out, options), wait=False)
+    assert actual is not None
+    return actual
 
 
 @pytest.fixture
@@ -125,14 +117,14 @@ def undisturbed(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> d
 
 def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path) -> None:
     first = run(scene, out)
-    assert (first["status"], first["error"], first["attempt"]) == (DONE, None, 1)
+    assert (first["status"], first["error"]) == (DONE, None)
     assert first["report"]["options"]["effort"] == "draft"
     assert first["report"]["input"]["sha256"]
     assert records(out) == [first]
     again = run(scene, out)
     assert (again["status"], again["key"], again["files"]) == (SKIPPED, first["key"], first["files"])
-    assert run(scene, out, replace(QUICK, retries=5, jobs=3))["status"] == SKIPPED
-    assert run(scene, out, replace(QUICK, rerun=True))["status"] == DONE
+    assert run(scene, out, replace(QUICK, jobs=3))["status"] == SKIPPED
+    assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
     seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
     assert run(scene, out, seed)["status"] == DONE
     assert run(scene, out)["status"] == DONE  # back to the first settings: the file is of the others
@@ -154,7 +146,7 @@ def test_a_scene_that_moved_is_still_the_same(scene: Path, out: Path, tmp_path: 
 
 def test_a_new_version_does_it_again(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(scene, out)
-    monkeypatch.setattr(tasks, "__version__", "99")
+    monkeypatch.setattr(calls, "__version__", "99")
     assert run(scene, out)["status"] == DONE
 
 
@@ -195,13 +187,13 @@ def test_unexpected_errors_are_recorded(scene: Path, out: Path, monkeypatch: pyt
     def broken(*_: Any, **__: Any) -> None:
         raise ZeroDivisionError("odd\nthing")
 
-    monkeypatch.setattr(tasks, "compact_files", broken)
+    monkeypatch.setattr(calls, "compact_files", broken)
     assert run(scene, out)["error"] == "ZeroDivisionError: odd thing"
 
     def greedy(*_: Any, **__: Any) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(tasks, "compact_files", greedy)
+    monkeypatch.setattr(calls, "compact_files", greedy)
     assert run(scene, out)["error"].startswith("out of memory")
 
 
@@ -217,44 +209,70 @@ def test_files_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) -> N
 
 
 def test_what_another_run_has_done_meanwhile_is_skipped(scene: Path, out: Path) -> None:
-    task, context, later = one_task(scene, out)
+    call = one_job(scene, out)
     assert run(scene, out)["status"] == DONE
-    assert run_task(task, context, later)["status"] == SKIPPED
-    task, context, later = one_task(scene, out, replace(QUICK, rerun=True))
-    assert run_task(task, context, later)["status"] == DONE
-    assert run_task(task, context, later)["status"] == SKIPPED  # done again since the run began
+    assert status(call) == SKIPPED
+    call = one_job(scene, out, replace(QUICK, overwrite=True))
+    assert status(call) == DONE
+    assert status(call) == SKIPPED  # done again since the run began
+
+
+def test_what_another_run_has_done_meanwhile_with_other_settings_is_left_to_it(scene: Path, out: Path) -> None:
+    call = one_job(scene, out)
+    other = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
+    assert run(scene, out, other)["status"] == DONE
+    before = results(out)
+    actual = make_result(*call, wait=False)
+    assert actual is not None
+    assert says(actual["error"], out / "room.ply", "settings", "--output")
+    assert results(out) == before
 
 
 def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
-    task, context, later = one_task(scene, out)
-    with scene_lock(out, "room.ply"):
+    job, started = one_job(scene, out)
+    with lock_result(out, "room.ply", wait=False):
         (out / left_by_a_dead_process()).touch()
-        assert run_task(task, context, later)["status"] == BUSY
-        assert record_failure(task, context, "died")["status"] == BUSY
-        clean_up([task], context)
+        assert make_result(job, started, wait=False) is None
+        assert record_loss(job, started, "died") is None
+        remove_unfinished(started, [job])
         assert len(results(out)) == 2  # the lock, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
+
+
+def test_what_another_run_works_on_comes_last(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def watched(job: Any, started: Any, wait: bool) -> Any:
+        seen.append((job.output, wait))
+        return None if len(seen) == 1 else make_result(job, started, wait)
+
+    monkeypatch.setattr(runs, "make_result", watched)
+    monkeypatch.setattr(runs, "ProcessPool", InlinePool)
+    shutil.copytree(scene, scene.parent / "other")
+    jobs = [one_job(scene.parent / name, out)[0] for name in ("room", "other")]
+    assert [line["output"] for line in run_batch(jobs, out, QUICK)] == ["other.ply", "room.ply"]
+    assert seen == [("room.ply", False), ("other.ply", False), ("room.ply", True)]
 
 
 def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import warnings
 
-    compact_files = tasks.compact_files
+    compact_files = calls.compact_files
 
     def odd(*args: Any, **kwargs: Any) -> Any:
         warnings.warn("odd thing", stacklevel=1)
         return compact_files(*args, **kwargs)
 
-    monkeypatch.setattr(tasks, "compact_files", odd)
+    monkeypatch.setattr(calls, "compact_files", odd)
     assert run(scene, out)["report"]["notes"][-1] == "odd thing"
 
 
 KILLS = {
-    "while it reads": ("gsmerge.batch.task.scene_key", True),
+    "while it reads": ("gsmerge.batch.jobs.content_hash", True),
     "while it writes": ("gsmerge.compaction.files.write_gaussians", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
-    "before the record": ("gsmerge.batch.task.append_line", True),
-    "before the lock is gone": ("gsmerge.batch.task.Path.unlink", True),
+    "before the record": ("gsmerge.batch.run.append_line", True),
+    "before the lock is gone": ("gsmerge.batch.run.Path.unlink", True),
 }
 
 
@@ -269,8 +287,8 @@ def test_a_kill_at_any_moment_loses_nothing(
 import os, signal, sys
 sys.path.insert(0, {str(root / "tests" / "helpers")!r})
 from pathlib import Path
-from batches import one_task
-from gsmerge.batch.task import run_task
+from batches import one_job
+from gsmerge.batch.run import make_result
 target, name = {where!r}.rsplit(".", 1)
 owner = __import__("pkgutil").resolve_name(target)
 kept = getattr(owner, name)
@@ -279,7 +297,7 @@ def killed(*args, **kwargs):
         kept(*args, **kwargs)
     os.kill(os.getpid(), signal.SIGKILL)
 setattr(owner, name, killed)
-run_task(*one_task(Path({str(scene)!r}), Path({str(out)!r})))
+make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
 """
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -294,8 +312,7 @@ run_task(*one_task(Path({str(scene)!r}), Path({str(out)!r})))
 def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undisturbed: dict[str, str]) -> None:
     run(scene, out)
     path = out / "batch.jsonl"
-    with scene_lock(out, "room.ply") as begun:
-        begun.touch()
+    kill(out)
     path.write_bytes(path.read_bytes()[:100])
     assert run(scene, out)["status"] == DONE
     assert results(out) == undisturbed
@@ -327,13 +344,13 @@ def test_where_nothing_can_be_recorded_nothing_is_forgotten(
     def refuse(path: Path, _: Any) -> None:
         raise SceneError(path, "cannot be written (No space left on device)")
 
-    monkeypatch.setattr(tasks, "append_line", refuse)
-    actual = run(scene, out)
-    assert actual["status"] == STUCK
-    assert says(actual["error"], "batch.jsonl", "No space")
-    task, context, _ = one_task(scene, out)
-    assert record_failure(task, context, "died")["status"] == STUCK
-    clean_up([task], context)
+    monkeypatch.setattr(runs, "append_line", refuse)
+    with refuses(SceneError, "batch.jsonl", "No space"):
+        run(scene, out)
+    job, started = one_job(scene, out)
+    with refuses(SceneError, "batch.jsonl", "No space"):
+        record_loss(job, started, "died")
+    remove_unfinished(started, [job])
     monkeypatch.undo()
     assert run(scene, out)["status"] == DONE  # the result is there without a record, and known as ours
     assert results(out) == undisturbed
@@ -360,36 +377,50 @@ def left_by_a_dead_process() -> str:
     return atomic.temporary_path(Path("room.ply")).name.replace(f"-{os.getpid()}-", f"-{process.pid}-")
 
 
-def killed(out: Path) -> Path:
-    """What a process leaves that was killed while it worked on the scene; the mark that it had begun."""
+def status(call: Any) -> str:
+    actual = make_result(*call, wait=False)
+    assert actual is not None
+    return str(actual["status"])
+
+
+def leave_lock(out: Path) -> Path:
+    """Leave the lock of a process that was killed while it worked on the scene."""
+    with lock_result(out, "room.ply", wait=False) as lock:
+        assert lock is not None
+        lock.leave_if_killed()
+    (path,) = out.glob(".batch-*")
+    return path
+
+
+def kill(out: Path) -> Path:
+    """Leave all that such a process leaves; return the lock."""
     (out / left_by_a_dead_process()).touch()
-    with scene_lock(out, "room.ply") as begun:
-        begun.touch()
-    return begun
+    return leave_lock(out)
 
 
 def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
-    task, context, _ = one_task(scene, out)
-    killed(out)
+    job, started = one_job(scene, out)
+    kill(out)
     (out / ".room-mine.ply").touch()
-    actual = record_failure(replace(task, attempt=2), context, "killed")
-    assert (actual["status"], actual["error"], actual["attempt"]) == (FAILED, "killed", 2)
+    actual = record_loss(job, started, "killed")
+    assert actual is not None
+    assert (actual["status"], actual["error"]) == (FAILED, "killed")
     assert records(out) == [actual]
     assert list(results(out)) == [".room-mine.ply"]
 
 
 def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
-    task, context, _ = one_task(scene, out)
-    killed(out)
-    clean_up([task], context)
+    job, started = one_job(scene, out)
+    kill(out)
+    remove_unfinished(started, [job])
     assert list(out.iterdir()) == []
 
 
-def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whose_it_is(scene: Path, out: Path) -> None:
-    task, context, _ = one_task(scene, out)
-    begun = killed(out)
+def test_who_is_stopped_between_result_and_record_leaves_the_lock_that_says_whose_it_is(scene: Path, out: Path) -> None:
+    job, started = one_job(scene, out)
+    lock = kill(out)
     (out / "room.ply").write_bytes(b"ours")
-    clean_up([task], context)
-    assert sorted(out.iterdir()) == sorted([begun, out / "room.ply"])
+    remove_unfinished(started, [job])
+    assert sorted(out.iterdir()) == sorted([lock, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
     assert list(results(out)) == ["room.ply"]

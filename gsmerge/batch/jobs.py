@@ -1,0 +1,192 @@
+"""Make the jobs of a batch: each scene with the call that makes its result."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from string import Formatter
+from typing import Any, Protocol
+
+from gsmerge import __version__
+from gsmerge.batch.find import find_scenes, main_file, scene_plys
+from gsmerge.compaction.files import Outputs, compact_files, level_output
+from gsmerge.errors import SceneError, UsageError
+from gsmerge.io import OUTPUT_FORMATS
+from gsmerge.io.formats.table import estimate_counts
+from gsmerge.report import SCHEMA_VERSION, file_sha256
+from gsmerge.runtime.estimate import memory_bytes
+from gsmerge.scene.content_hash import content_hash, digest, filled, read_files, stem_of
+from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.settings.reading import OpacityChoice, ReadHints
+from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.stages import Engine
+
+FIELDS = ("stem", "parent", "index", "k")
+
+
+@dataclass(frozen=True)
+class BatchOptions(Settings):
+    """Settings of :func:`gsmerge.batch.find_jobs` and :func:`gsmerge.batch.run_batch`."""
+
+    settings: CompactOptions = setting(CompactOptions(), "Of each scene; no threads, which are processors by jobs.")
+    opacity: OpacityChoice = setting("auto", "How all files store opacity.")
+    hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
+    cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
+        "each in it.",
+        "By default those beside each scene.")  # fmt: skip
+    images: str | None = setting(None, "Folder of the photos, in the same way.")
+    output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
+        "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
+        "format.")  # fmt: skip
+    jobs: int | None = setting(None, "Scenes at once.", "By default as many as processors and free memory allow.",
+        least=1)  # fmt: skip
+    overwrite: bool = setting(False, "Compact scenes again that are done, and replace files that no batch wrote.")
+    engine: str = setting("local", "Where scenes are compacted, see `Engine`.")
+    address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        Engine(self.engine, self.address)
+        try:
+            names = [name for _, name, _, _ in Formatter().parse(self.output) if name is not None]
+            example = self.output.format(**dict.fromkeys(FIELDS, 1))
+        except (ValueError, LookupError, AttributeError, TypeError):
+            names, example = [""], ""
+        placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS
+        is_outside = example.startswith(("/", "~", ".")) or ".." in example.split("/")
+        for is_possible, expected in (
+            (all(name in FIELDS for name in names), f"{placeholders} in braces"),
+            (example.lower().endswith(endings), f"a name that ends in {', '.join(endings)}"),
+            (
+                not is_outside and "\\" not in example and "\0" not in example,
+                "a name inside the output folder, not hidden",
+            ),
+        ):
+            if not is_possible:
+                raise ValueError(f"output: expected {expected}, got {self.output!r}")
+
+
+class SceneCall(Protocol):
+    """Call that makes the result of a scene."""
+
+    @property
+    def settings(self) -> CompactOptions:
+        """Settings from which the time is estimated."""
+
+    def key(self, files: SceneFiles) -> str:
+        """Return a digest of everything that the result depends on."""
+
+    def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
+        """Make the result; return its report and the files written."""
+
+
+@dataclass(frozen=True)
+class CompactCall:
+    """The call that ``gsmerge compact`` makes."""
+
+    settings: CompactOptions
+    opacity: OpacityChoice
+    hints: ReadHints
+
+    def key(self, files: SceneFiles) -> str:
+        """Return a digest of the input's files, all settings and the version."""
+        settings = self.settings.to_dict()
+        del settings["threads"]
+        checkpoint = Path(self.settings.checkpoint)
+        if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
+            settings["checkpoint"] = file_sha256(checkpoint)
+        reading = {"opacity": self.opacity, **vars(self.hints)}
+        version = {"tool_version": __version__, "schema_version": SCHEMA_VERSION}
+        return digest({"scene": content_hash(read_files(files)), "settings": settings, "reading": reading, **version})
+
+    def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
+        """Compact the scene; return the report, and the result with its coarser levels."""
+        document = compact_files(
+            files, replace(self.settings, threads=threads), Outputs(out, overwrite=True), opacity=self.opacity,
+            hints=self.hints, hashed=True,
+        )  # fmt: skip
+        return document, [out, *(Path(level["path"]) for level in document["levels"])]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A scene of a batch, and the call that makes its result."""
+
+    scene: str  # a ``.ply``, or the folder of one
+    outputs: tuple[str, ...]  # names of the result and of its coarser levels in the output folder
+    call: SceneCall
+    num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
+    num_rest: int = 0  # columns of higher harmonics, likewise
+    cameras: Path | None = None  # None: beside the scene
+    images: Path | None = None  # likewise
+
+    @property
+    def output(self) -> str:
+        """Name of the result in the output folder."""
+        return self.outputs[0]
+
+    @property
+    def memory(self) -> int:
+        """Estimated memory of the call in bytes, within a factor of about two."""
+        return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
+
+    def find_files(self) -> SceneFiles:
+        """Find the files of the scene; SceneError if there are none."""
+        return find_scene_files(Path(self.scene), cameras=self.cameras, images=self.images)
+
+
+def find_jobs(
+    arguments: Sequence[str],
+    out: Path,
+    options: BatchOptions,
+    results: Collection[str] = (),
+    unreadable: list[SceneError] | None = None,
+) -> list[Job]:
+    """Find all scenes, each once, and name their results in the output folder.
+
+    ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
+    line. ``results`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
+    sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
+    UsageError if two scenes would be written to one file, or one over another.
+    """
+    call = CompactCall(options.settings, options.opacity, options.hints)
+    jobs: list[Job] = []
+    owners: dict[str, str] = {}
+    inputs: set[str] = set()
+    for scene in find_scenes(arguments, out, unreadable):
+        real = os.path.realpath(main_file(scene))
+        if real in inputs or real in results:
+            continue
+        inputs.add(real)
+        first = output_name(options, scene, len(jobs))
+        outputs = (first, *(str(level_output(Path(first), i)) for i in range(1, options.settings.budget.levels)))
+        for name in outputs:
+            if name in owners:
+                raise UsageError(
+                    f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
+                    f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
+                )
+            owners[name] = str(scene)
+        cameras, images = (filled(template, scene) for template in (options.cameras, options.images))
+        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images))
+    for name in owners:
+        if os.path.realpath(out / name) in inputs:
+            raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")
+    return jobs
+
+
+def output_name(options: BatchOptions, scene: Path, index: int) -> str:
+    """Return the name of a scene's result in the output folder."""
+    whole = Path(os.path.abspath(scene))
+    stem = stem_of(whole).removesuffix(".compressed")  # which is the scene's format, not its result's
+    decode = options.settings.decode
+    k = decode.k if decode.k != AUTO else decode.max_k
+    values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": k}
+    try:
+        return os.path.normpath(options.output.format(**values))
+    except ValueError as error:  # a format that fits numbers only
+        raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error

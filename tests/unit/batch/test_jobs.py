@@ -1,0 +1,120 @@
+"""Settings of a batch, and its jobs: each scene once, and no two written to one file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from messages import refuses
+
+from gsmerge.batch import BatchOptions, find_jobs
+from gsmerge.batch.jobs import output_name
+from gsmerge.errors import UsageError
+from gsmerge.settings.compact import CompactOptions
+
+OUT = Path("out")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"jobs": 0}, ("jobs", 1, 0)), ({"engine": "slurm"}, ("engine", "'slurm'")),
+        ({"address": "auto"}, ("address", "ray", "local")),
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[object, ...]) -> None:
+    with refuses(ValueError, *named):
+        BatchOptions(**wrong)
+
+
+@pytest.mark.parametrize(
+    "template",
+    ["{name}.ply", "{stem.real}.ply", "{0}.ply", "{}.ply", "{stem", "{stem}.txt", "/x/{stem}.ply", "../{stem}.ply"],
+)
+def test_templates_that_make_no_sense_are_refused(template: str) -> None:
+    with refuses(ValueError, "output"):
+        BatchOptions(output=template)
+
+
+@pytest.fixture(autouse=True)
+def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def touch(*names: str) -> None:
+    for name in names:
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
+
+
+def outputs(*arguments: str, options: BatchOptions | None = None, results: Collection[str] = ()) -> dict[str, str]:
+    return {job.output: job.scene for job in find_jobs(arguments, OUT, options or BatchOptions(), results)}
+
+
+def test_results_of_former_runs_are_no_scenes() -> None:
+    touch("a.ply", "b.ply")
+    assert outputs("*.ply", results={os.path.realpath("b.ply")}) == {"a.ply": "a.ply"}
+
+
+def test_each_scene_comes_once() -> None:
+    touch("s/a/scene.ply", "s/b.ply")
+    assert outputs("s", "s/a/scene.ply", "s/*", "s/b.ply") == {"b.ply": "s/b.ply", "a.ply": "s/a"}
+
+
+def test_two_scenes_are_not_written_to_one_file() -> None:
+    touch("s/a/scene.ply", "t/a/scene.ply")
+    with refuses(UsageError, "out/a.ply", "s/a", "t/a", "--name"):
+        outputs("s", "t")
+    apart = outputs("s", "t", options=BatchOptions(output="{parent}/{stem}.ply"))
+    assert apart == {"s/a.ply": "s/a", "t/a.ply": "t/a"}
+
+
+def test_levels_need_files_of_their_own_too() -> None:
+    touch("a.ply", "a.level1.ply")
+    levels = BatchOptions(CompactOptions().with_settings({"levels": 2}))
+    assert len(outputs("*.ply")) == 2
+    with pytest.raises(UsageError, match=r"a\.level1\.ply"):
+        outputs("*.ply", options=levels)
+
+
+def test_a_result_does_not_replace_a_scene() -> None:
+    touch("out/a.ply", "b/a.ply")
+    with refuses(UsageError, "out/a.ply", "--output"):
+        outputs("out/a.ply")
+
+
+def test_counts_come_from_the_header() -> None:
+    touch("a.ply")
+    Path("b.ply").write_text("no header")
+    assert [job.num_gaussians for job in find_jobs(["a.ply", "b.ply"], OUT, BatchOptions())] == [7, 0]
+
+
+def test_names_are_filled_in(tmp_path: Path) -> None:
+    options = BatchOptions(CompactOptions().with_settings({"k": 2}))
+
+    def name(template: str, scene: str) -> str:
+        return output_name(replace(options, output=template), Path(scene), 12)
+
+    touch("set/room.v2/scene.ply")
+    assert name("{stem}.ply", "set/room.v2") == "room.v2.ply"
+    assert name("{stem}.ply", "set/room.v2/scene.ply") == "scene.ply"
+    assert name("{parent}-{stem}.k{k}.ply", "set/a.ply") == "set-a.k2.ply"
+    assert name("{index:04d}.ply", "a.ply") == "0012.ply"
+    assert name("{stem}.ply", "a.compressed.ply") == "a.ply"
+    assert name("{stem}.compressed.ply", "a.ply") == "a.compressed.ply"
+    assert name("{stem}.ply", ".") == f"{tmp_path.name}.ply"
+    with refuses(UsageError, "--name", "{stem:d}.ply"):
+        name("{stem:d}.ply", "a.ply")
+
+
+def test_cameras_and_photos_of_each_scene_are_filled_in() -> None:
+    touch("s/a/scene.ply", "s/b.ply")
+    jobs = find_jobs(["s"], OUT, BatchOptions(cameras="{parent}/{stem}.json", images="photos"))
+    assert [job.cameras for job in jobs] == [Path("s/b.json"), Path("s/a/a.json")]
+    assert [job.images for job in jobs] == [Path("photos")] * 2
+    with refuses(UsageError, "", "{scene}", "{name}"):
+        find_jobs(["s"], OUT, BatchOptions(cameras="{name}"))
