@@ -12,12 +12,12 @@ from pathlib import Path
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import RecordIndex
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.plan import plan_whole
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.content_hash import cameras_of
-from gsmerge.stages.segment import SceneSize
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that scenes at once may take, where their number is not given
 

@@ -160,7 +160,7 @@ class Candidate:
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
     """Move canonical Gaussians into the world, add Gaussians that no view sees, and measure the PSNR on the photos."""
-    gaussians, moved = fitted.gaussians, move_views(prepared, fitted.cameras)
+    gaussians, moved = fitted.gaussians, _move_views(prepared, fitted.cameras)
     if len(plan.unseen):
         gaussians = Gaussians.concat([gaussians, plan.unseen])
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
@@ -173,7 +173,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
     """Replace a candidate's Gaussians by some of them, and measure it again."""
     with record_part() as record:
-        psnr = _measure_candidate(gaussians, move_views(prepared, candidate.fitted.cameras), plan)
+        psnr = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
     return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
 
@@ -197,7 +197,7 @@ def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
     return score_photos(gaussians, scene_photos(judges), plan.scored_views).psnr
 
 
-def move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
+def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     """Move the input views to the canonical ``cameras`` of a fit; themselves where it moved none."""
     prepared = prepared.with_cameras(cameras)
     final = prepared.final_cameras()
@@ -279,7 +279,7 @@ def make_result(
     before = None if input_score is None else input_score.psnr
     comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
-        measure_covered(input_score, candidate.gaussians, move_views(prepared, candidate.fitted.cameras), plan)
+        measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
     ]
 

@@ -261,8 +261,8 @@ class _StoredArray(StandIn):
 class _StoredDtype(StandIn):
     """Stands for a numpy dtype in a pickle; only little-endian float32 passes."""
 
-    def __init__(self, arguments: tuple[object, ...]) -> None:
-        self.code = arguments[0]
+    def __init__(self, code: object, *_: object) -> None:
+        self.code = code
 
     def set_state(self, state: object) -> None:
         """Check the type and the order of its bytes."""
@@ -275,6 +275,6 @@ class _StoredDtype(StandIn):
 _NAMES: Names = {
     ("numpy", "ndarray"): None,
     ("numpy", "dtype"): _StoredDtype,
-    ("numpy.core.multiarray", "_reconstruct"): lambda _: _StoredArray(),  # numpy 1
-    ("numpy._core.multiarray", "_reconstruct"): lambda _: _StoredArray(),  # numpy 2
+    ("numpy.core.multiarray", "_reconstruct"): lambda *_: _StoredArray(),  # numpy 1
+    ("numpy._core.multiarray", "_reconstruct"): lambda *_: _StoredArray(),  # numpy 2
 }

@@ -210,15 +210,13 @@ def _names(budget: ReadBudget) -> Names:
     file = _TorchFile(budget)
     return {
         ("collections", "OrderedDict"): _make_dictionary,
-        ("torch._utils", "_rebuild_tensor_v2"): lambda arguments: _make_tensor(file, arguments),
-        ("torch._utils", "_rebuild_parameter"): lambda arguments: arguments[0],
+        ("torch._utils", "_rebuild_tensor_v2"): lambda *arguments: _make_tensor(file, arguments),
+        ("torch._utils", "_rebuild_parameter"): lambda data, *_: data,
         **{("torch", name): dtype and np.dtype(dtype) for name, dtype in _DTYPES.items()},
     }
 
 
-def _make_dictionary(arguments: tuple[object, ...]) -> dict[str, object]:
-    if arguments:
-        raise ValueError("expected an empty dictionary, found one with arguments")
+def _make_dictionary() -> dict[str, object]:
     return {}
 
 

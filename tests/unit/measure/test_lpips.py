@@ -279,7 +279,7 @@ def test_numpy_itself_is_not_called(package: Path) -> None:
     """Even names that are let through stand for something harmless: no array is made but from float32 bytes."""
     reconstruct = np.empty(0).__reduce__()[0]
     unset = {"kernel": _Calls(reconstruct, np.ndarray, (1 << 50,), b"b"), "bias": 0}
-    for layer, found in ((_Calls(np.ndarray, (1 << 50,)), "function"), (unset, "shape")):
+    for layer, found in ((_Calls(np.ndarray, (1 << 50,)), "callable"), (unset, "shape")):
         path = write_package(package, "alex", {"AlexNet_0": {"Conv_0": layer}})
         with refuses(SceneError, path, "(alex)", found):
             lpips(FIRST, SECOND, "alex")
