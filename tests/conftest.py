@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser import NO_BROWSER
@@ -25,11 +27,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Processes beside one another share processors."""
-    if hasattr(config, "workerinput"):
-        import torch
-
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Processes beside one another share processors, torch's threads too where a test has imported it."""
+    config = session.config
+    if hasattr(config, "workerinput") and "torch" in sys.modules:
+        torch = sys.modules["torch"]
         torch.set_num_threads(max(1, torch.get_num_threads() // config.workerinput["workercount"]))
 
 
@@ -51,6 +53,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Genera
         terminalreporter.line(
             f"{len(skipped)} tests were skipped, {NO_BROWSER}: run .ci/chromium, then {files}", red=True
         )
+
+
+@pytest.fixture(scope="session")
+def torch() -> Any:
+    """The library; tests that take it are skipped where it is not installed."""
+    return pytest.importorskip("torch", reason="torch is not installed")
 
 
 @pytest.fixture(scope="session")

@@ -10,11 +10,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tomllib
-import torch
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
@@ -80,7 +80,7 @@ def test_commands_that_need_no_torch(name: str, call: Call, tmp_path: Path) -> N
     assert bool(written) == (name != "inspect")
 
 
-def test_chunks_need_no_torch(call: Call, tmp_path: Path) -> None:
+def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
     scene = tmp_path / "work" / "scene"
     data = json.loads((scene / "transforms.json").read_text())
     w2c = np.linalg.inv([frame["transform_matrix"] for frame in data["frames"]])

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
@@ -21,6 +20,8 @@ from gsmerge.raster.gradient import (
     plan_gradients,
 )
 from gsmerge.runtime.threads import use_threads
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 

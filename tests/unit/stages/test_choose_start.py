@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
-from network_fixtures import Made, made, noisy
+from network_fixtures import Made, made, noisy, untrained
 
 from gsmerge import Gaussians, Scene
 from gsmerge.networks.apply import encode_features
+from gsmerge.networks.weights import NetworkWeights
 from gsmerge.raster.photos import render_photos, scene_photos, scene_pictures
-from gsmerge.research.training.modules import Networks
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.choose_start import choose_start, views_psnr
@@ -74,7 +74,7 @@ def some() -> Made:
     return made()
 
 
-def starts_of(some: Made, networks: Networks) -> list[MergedViews]:
+def starts_of(some: Made, networks: NetworkWeights) -> list[MergedViews]:
     """The start with these networks, then the analytic one."""
     labels = np.zeros(some.scene.valid.shape, np.int32)
     segmentation = Segmentation(Groups(labels, (1,) * len(some.scene)), len(some.features), exact=False)
@@ -108,6 +108,6 @@ def test_the_better_start_is_kept(some: Made, better: str) -> None:
 def test_of_equal_starts_the_analytic_one_is_kept(some: Made) -> None:
     """Untrained networks correct nothing."""
     with record_run() as record:
-        chosen = choose_start(starts_of(some, Networks()), some.scene, DecodeOptions(), None)
+        chosen = choose_start(starts_of(some, untrained()), some.scene, DecodeOptions(), None)
     assert chosen.networks is None
     assert len(set(record.choices["start_scores"].values())) == 1
