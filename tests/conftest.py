@@ -14,6 +14,7 @@ import pytest
 from browser import NO_BROWSER
 from floors import NUDGE, at_least_the_floor, nudged
 from scripts import load_script
+from shared import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
@@ -68,14 +69,22 @@ def root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def make_scene() -> Callable[..., Path]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all processes of a run share; :func:`make_once` fills it."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+
+
+@pytest.fixture(scope="session")
+def make_scene(shared: Path) -> Callable[..., Path]:
     """``make_scene(out, num_views=, width=, height=, seed=)`` of the first example, as other programs write files.
 
-    That is without the comment by which the project's own files name the encoding of their opacities.
+    That is without the comment by which the project's own files name the encoding of their opacities. Each scene is
+    made once in a run.
     """
     example = load_script(ROOT / "examples" / "01_make_scene.py").make_scene
 
-    def make(out: Path, **sizes: int) -> Path:
+    def write(out: Path, **sizes: int) -> None:
         ply = example(out, **sizes) / "scene.ply"
         if NUDGE in os.environ:
             import gsmerge
@@ -83,7 +92,10 @@ def make_scene() -> Callable[..., Path]:
             gsmerge.write_ply(ply, nudged(gsmerge.read_ply(ply).gaussians), overwrite=True)
         head, rows = ply.read_bytes().split(b"end_header\n", 1)
         ply.write_bytes(head.replace(b"comment opacity: logit\n", b"") + b"end_header\n" + rows)
-        return out
+
+    def make(out: Path, **sizes: int) -> Path:
+        name = "-".join(f"{key}-{value}" for key, value in sorted(sizes.items()))
+        return Path(shutil.copytree(make_once(shared / name, lambda place: write(place, **sizes)), out))
 
     return make
 

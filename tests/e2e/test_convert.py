@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
 from gsmerge.io.cameras.colmap_model import model_files
+from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
@@ -27,18 +29,22 @@ from .conftest import Run, assert_refused
 FORMATS = ("out.ply", "out.compressed.ply", "out.spz", "out.sog", "out.splat", "out.glb", "lod-meta.json")
 
 
-@pytest.fixture
-def result(made_scene: Path, tmp_path: Path) -> Path:
-    """A result with harmonics, its cameras inside and beside it."""
-    scene = gsmerge.read_scene(made_scene)
+@pytest.fixture(scope="module")
+def made_result(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a result with harmonics, its cameras inside and beside it. Read only."""
+    scene, folder = gsmerge.read_scene(made_scene), tmp_path_factory.mktemp("result")
     gaussians = gsmerge.compact(scene, effort="draft", budget=400, fit="none").gaussians
     random = np.random.default_rng(0)
     gaussians = replace(gaussians, shN=random.normal(0, 0.1, (400, 15, 3)).astype(np.float32))
-    gsmerge.write_ply(tmp_path / "in.ply", gaussians, comments=["gsmerge result"])
-    from gsmerge.io.cameras.json_files import viewer_cameras
+    gsmerge.write_ply(folder / "in.ply", gaussians, comments=["gsmerge result"])
+    (folder / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
+    return folder
 
-    (tmp_path / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
-    return tmp_path / "in.ply"
+
+@pytest.fixture
+def result(made_result: Path, tmp_path: Path) -> Path:
+    """A copy of them in a folder of its own."""
+    return Path(shutil.copytree(made_result, tmp_path, dirs_exist_ok=True)) / "in.ply"
 
 
 def read(path: Path) -> Gaussians:

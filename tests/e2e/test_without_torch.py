@@ -38,6 +38,7 @@ COMMANDS = {
     "chart": ("chart", "scene", "--budgets", "5%", "--fit", "none", "--proxy-views", "1", "-o", "new"),
     "generate": ("generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
 }
+OFTEN = ("compact with networks", "extend")  # the others are in the sweep
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,9 @@ def call(work: Path, tmp_path: Path) -> Call:
     return run
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in COMMANDS]
+)
 def test_commands_that_need_no_torch(name: str, call: Call, tmp_path: Path) -> None:
     done = call("-m", "gsmerge", *COMMANDS[name])
     assert done.returncode == 0, done.stderr
@@ -122,6 +125,7 @@ def test_training_says_how_to_install_it(call: Call) -> None:
     assert TORCH_INSTALL in done.stderr
 
 
+@pytest.mark.slow
 def test_tensors_say_how_to_install_it(call: Call) -> None:
     """The error is the library's own, so a caller that catches these reads one line."""
     code = """import gsmerge

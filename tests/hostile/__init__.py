@@ -1,7 +1,7 @@
-"""The table of hostile inputs: what careless or malicious files may hold, and what has to come of it.
+"""The table of hostile inputs: files that ask for much memory or time, would run code, or name odd places.
 
-Read by ``tests/e2e/test_hostile_input.py`` and ``benchmarks/hostile.py``. ``changes`` makes further ones at random of
-sound files; ``gsm_files`` damages encoded scenes and states.
+Read by ``tests/e2e/test_hostile_input.py``. What a reader refuses, and in which words, is in its unit test;
+``tests/fuzz`` changes sound files at random. ``gsm_files`` damages encoded scenes and states.
 """
 
 from __future__ import annotations
