@@ -28,12 +28,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)
 
 
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Processes beside one another share processors, torch's threads too where a test has imported it."""
-    config = session.config
-    if hasattr(config, "workerinput") and "torch" in sys.modules:
-        torch = sys.modules["torch"]
-        torch.set_num_threads(max(1, torch.get_num_threads() // config.workerinput["workercount"]))
+def pytest_collection_finish() -> None:
+    """Torch has one thread: its own cost more than the sizes of these tests take."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

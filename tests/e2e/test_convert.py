@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted, refuses
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, find_placement, join_gaussians, turn_to
@@ -112,14 +113,13 @@ def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
     assert not (tmp_path / "colmap").exists()
 
 
-@pytest.mark.parametrize(
+@sweep(
     "options",
     [
         PlacementOptions(up="y"), PlacementOptions(up="-z"), PlacementOptions(scale=3.0),
         PlacementOptions(rotate="20,-50,110"), PlacementOptions(translate="1,2,-3"),
         PlacementOptions(up="z", scale=0.5, rotate="0,0,90", translate="5,0,0"),
-    ],
-)  # fmt: skip
+    ], often=2)  # fmt: skip
 def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
     result: Path, tmp_path: Path, options: PlacementOptions
 ) -> None:

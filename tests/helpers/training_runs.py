@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from network_fixtures import noisy
+from network_fixtures import LAST
 
 pytest.importorskip("torch", reason="torch is not installed")
 
@@ -39,9 +38,15 @@ def modules_of(weights: NetworkWeights) -> Networks:
     return modules
 
 
-def noisy_networks(*arguments: Any, **options: Any) -> Networks:
-    """:func:`noisy` networks that can be trained; they collect no gradients yet."""
-    return modules_of(noisy(*arguments, **options)).eval().requires_grad_(False)
+def noisy_networks(options: NetworkOptions, scale: float = 0.3, seed: int = 0) -> Networks:
+    """Networks as they are before training, with random last layers; they collect no gradients yet."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        networks = Networks(options)
+        for name, parameter in networks.named_parameters():
+            if name.split(".")[-2] in LAST and not bool(parameter.any()):
+                torch.nn.init.normal_(parameter, std=scale)
+    return networks.eval().requires_grad_(False)
 
 
 def written(example: Example, folder: Path) -> Shard:

@@ -10,6 +10,7 @@ import pytest
 from network_fixtures import noisy, scaled, untrained, written
 from safetensors.numpy import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
+from sweeps import sweep
 from unaligned_scenes import shuffled
 
 import gsmerge
@@ -19,7 +20,7 @@ from gsmerge.types import SH_C0
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
 
 
-@pytest.mark.parametrize(
+@sweep(
     "settings",
     [
         {},

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from network_fixtures import noisy
+from sweeps import sweep
 
 from gsmerge.kernels.networks.layers import (
     GELU,
@@ -173,7 +174,7 @@ def names_of(options: NetworkOptions) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("which", [*IN_PACKAGE, *range(len(OTHERS))])
+@sweep("which", [*IN_PACKAGE, *range(len(OTHERS))])
 def test_networks_are_those_of_training(which: str | int, each_target: Callable[..., list[np.ndarray]]) -> None:
     """Of what ships and of random ones, to rounding."""
     modules_of = training_helpers().modules_of
