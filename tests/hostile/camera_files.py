@@ -32,6 +32,8 @@ def _transforms() -> dict[str, Case]:
     cases = {f"path {w}, no images": Case(without_images(all_places(v)), EITHER) for w, v in places.items()}
     for key, value in (("w", 10**400), ("fl_x", 1e300), ("cx", float("nan")), ("k1", 1e9)):
         cases[f"{key} of {str(value)[:9]}"] = Case(edit_json(name, set_key(key, value)), EITHER)
+    fisheye = {"camera_model": "OPENCV_FISHEYE", "k1": 1e5}
+    cases["fisheye k1 of 1e5"] = Case(edit_json(name, lambda data: data.update(fisheye)))
     cases["a pose of 1e200"] = Case(edit_json(name, set_first("transform_matrix", [[1e200] * 4] * 4)))
     cases["path with line breaks and no pose"] = Case(edit_json(name, no_pose("a\nb\r\n\x1b[2Jc")))
     return {
