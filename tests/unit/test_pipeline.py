@@ -8,6 +8,7 @@ import pytest
 import scenes
 import unaligned_scenes
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
@@ -147,7 +148,7 @@ def test_every_segmentation(scene: Scene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@sweep("degree", [1, 2, 3, 4])
 def test_harmonics_keep_their_degree(degree: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
