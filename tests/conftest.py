@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser import NO_BROWSER
 from floors import NUDGE, at_least_the_floor, nudged
 from scripts import load_script
+from shared import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
@@ -25,12 +28,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Processes beside one another share processors."""
-    if hasattr(config, "workerinput"):
-        import torch
-
-        torch.set_num_threads(max(1, torch.get_num_threads() // config.workerinput["workercount"]))
+def pytest_collection_finish() -> None:
+    """Torch has one thread: its own cost more than the sizes of these tests take."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -54,20 +55,34 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> Genera
 
 
 @pytest.fixture(scope="session")
+def torch() -> Any:
+    """The library; tests that take it are skipped where it is not installed."""
+    return pytest.importorskip("torch", reason="torch is not installed")
+
+
+@pytest.fixture(scope="session")
 def root() -> Path:
     """The repository's root."""
     return ROOT
 
 
 @pytest.fixture(scope="session")
-def make_scene() -> Callable[..., Path]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that all processes of a run share; :func:`make_once` fills it."""
+    base = tmp_path_factory.getbasetemp()
+    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+
+
+@pytest.fixture(scope="session")
+def make_scene(shared: Path) -> Callable[..., Path]:
     """``make_scene(out, num_views=, width=, height=, seed=)`` of the first example, as other programs write files.
 
-    That is without the comment by which the project's own files name the encoding of their opacities.
+    That is without the comment by which the project's own files name the encoding of their opacities. Each scene is
+    made once in a run.
     """
     example = load_script(ROOT / "examples" / "01_make_scene.py").make_scene
 
-    def make(out: Path, **sizes: int) -> Path:
+    def write(out: Path, **sizes: int) -> None:
         ply = example(out, **sizes) / "scene.ply"
         if NUDGE in os.environ:
             import gsmerge
@@ -75,7 +90,10 @@ def make_scene() -> Callable[..., Path]:
             gsmerge.write_ply(ply, nudged(gsmerge.read_ply(ply).gaussians), overwrite=True)
         head, rows = ply.read_bytes().split(b"end_header\n", 1)
         ply.write_bytes(head.replace(b"comment opacity: logit\n", b"") + b"end_header\n" + rows)
-        return out
+
+    def make(out: Path, **sizes: int) -> Path:
+        name = "-".join(f"{key}-{value}" for key, value in sorted(sizes.items()))
+        return Path(shutil.copytree(make_once(shared / name, lambda place: write(place, **sizes)), out))
 
     return make
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scripts import load_script
 
 
 def run_example(root: Path, name: str, *arguments: object) -> str:
@@ -74,7 +75,8 @@ def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
     assert all(text in value for text, value in zip(texts, shown, strict=True)), shown
 
 
-def test_the_same_seed_makes_the_same_scene(make_scene, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_the_same_seed_makes_the_same_scene(root: Path, tmp_path: Path) -> None:
+    make_scene = load_script(root / "examples" / "01_make_scene.py").make_scene
     sizes = {"num_views": 2, "width": 24, "height": 16}
     first, again, other = (
         (make_scene(tmp_path / name, seed=seed, **sizes) / "scene.ply").read_bytes()

@@ -15,7 +15,6 @@ from gsmerge.cli import main
 from gsmerge.cli.app import app
 from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
-from gsmerge.research.training import preset_options
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -36,6 +35,12 @@ def test_defaults_of_single_commands_are_the_library_s() -> None:
     assert [shown("generate", name) for name in ("style", "path", "noise")] == [made.style, made.path, made.noise]
     assert (shown("generate", "views"), shown("generate", "size")) == ("6", "320x240")
     assert (made.views, made.width, made.height) == ((6, 6), 320, 240)
+
+
+def test_default_of_training_is_the_preset_s() -> None:
+    pytest.importorskip("torch", reason="the package's training imports it")
+    from gsmerge.research.training import preset_options
+
     assert shown("train", "steps") == str(preset_options("default").steps)
 
 

@@ -12,6 +12,7 @@ import pytest
 from batches import FAST, NAMES, finish, results
 from forked_commands import CommandServer
 from messages import ERROR, says
+from shared import make_once
 
 from gsmerge.cli import main
 
@@ -28,12 +29,24 @@ class Outcome:
 Run = Callable[..., Outcome]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def smallest_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three views of 24 x 16 with cameras and images. Read only."""
     folder = make_scene(tmp_path_factory.mktemp("smallest") / "scene", num_views=3, width=24, height=16)
     shutil.rmtree(folder / "targets")
     return folder
+
+
+@pytest.fixture(scope="session")
+def compacted_scene(made_scene: Path, shared: Path) -> Path:
+    """``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
+
+    def make(place: Path) -> None:
+        place.mkdir()
+        words = ("compact", made_scene, "-o", place / "small.ply", "--report", place / "run.json", "-q")
+        assert main([str(word) for word in words]) == 0
+
+    return make_once(shared / "compacted", make)
 
 
 @pytest.fixture(scope="module")

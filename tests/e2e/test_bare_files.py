@@ -36,7 +36,7 @@ def make_object(count: int) -> Gaussians:
     return Gaussians(*(column.astype(np.float32) for column in columns))
 
 
-@pytest.fixture(scope="module", params=["voxels", "object"])
+@pytest.fixture(scope="module", params=["voxels", pytest.param("object", marks=pytest.mark.slow)])
 def bare(request: pytest.FixtureRequest, small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file alone in its folder. Read only."""
     path = tmp_path_factory.mktemp(request.param) / "scene.ply"

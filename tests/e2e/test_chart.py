@@ -125,6 +125,7 @@ def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: R
     assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     path = copied / "out" / "batch.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
@@ -139,6 +140,7 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
     assert budgets(merges)[-1] == "1%"
 
 
+@pytest.mark.slow
 def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     assert again(run, copied, "--rerun").code == 0
     assert budgets(merges)[-2:] == ["1%", "2%"]
@@ -153,6 +155,7 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
     assert plan["num_pending"] == 3
 
 
+@pytest.mark.slow
 def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> None:
     before = runs(copied / "out")["input"]
     assert again(run, copied, "--budgets", "2%", "--photo-side", 48).code == 0
@@ -166,6 +169,7 @@ def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> Non
     assert after.value("psnr_target_visible") == expected
 
 
+@pytest.mark.slow
 def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
     (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
     shutil.rmtree(copied / "room" / "images")
@@ -211,6 +215,7 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
     assert outcome.err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) -> None:
     outcome = again(run, copied, "--views", "2,9", "--json")
     assert outcome.code == 0
@@ -245,6 +250,7 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     assert Path(document["page"]).is_file()
 
 
+@pytest.mark.slow
 def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     grid = copied / "grid.json"
     grid.write_text('{"budgets": ["1%"], "superpixels": ["2%"], "fit": "none"}')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted, refuses
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
@@ -18,6 +20,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
 from gsmerge.io.cameras.colmap_model import model_files
+from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
@@ -28,18 +31,22 @@ from .conftest import Run, assert_refused
 FORMATS = ("out.ply", "out.compressed.ply", "out.spz", "out.sog", "out.splat", "out.glb", "lod-meta.json")
 
 
-@pytest.fixture
-def result(made_scene: Path, tmp_path: Path) -> Path:
-    """A result with harmonics, its cameras inside and beside it."""
-    scene = gsmerge.read_scene(made_scene)
+@pytest.fixture(scope="module")
+def made_result(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a result with harmonics, its cameras inside and beside it. Read only."""
+    scene, folder = gsmerge.read_scene(made_scene), tmp_path_factory.mktemp("result")
     gaussians = gsmerge.compact(scene, effort="draft", budget=400, fit="none").gaussians
     random = np.random.default_rng(0)
     gaussians = replace(gaussians, shN=random.normal(0, 0.1, (400, 15, 3)).astype(np.float32))
-    gsmerge.write_ply(tmp_path / "in.ply", gaussians, comments=["gsmerge result"])
-    from gsmerge.io.cameras.json_files import viewer_cameras
+    gsmerge.write_ply(folder / "in.ply", gaussians, comments=["gsmerge result"])
+    (folder / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
+    return folder
 
-    (tmp_path / "in.cameras.json").write_text(viewer_cameras(scene.cameras, scene.names))
-    return tmp_path / "in.ply"
+
+@pytest.fixture
+def result(made_result: Path, tmp_path: Path) -> Path:
+    """A copy of them in a folder of its own."""
+    return Path(shutil.copytree(made_result, tmp_path, dirs_exist_ok=True)) / "in.ply"
 
 
 def read(path: Path) -> Gaussians:
@@ -107,14 +114,13 @@ def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
     assert not (tmp_path / "colmap").exists()
 
 
-@pytest.mark.parametrize(
+@sweep(
     "options",
     [
         PlacementOptions(up="y"), PlacementOptions(up="-z"), PlacementOptions(scale=3.0),
         PlacementOptions(rotate="20,-50,110"), PlacementOptions(translate="1,2,-3"),
         PlacementOptions(up="z", scale=0.5, rotate="0,0,90", translate="5,0,0"),
-    ],
-)  # fmt: skip
+    ], often=2)  # fmt: skip
 def test_a_moved_scene_looks_the_same_from_its_moved_cameras(
     result: Path, tmp_path: Path, options: PlacementOptions
 ) -> None:

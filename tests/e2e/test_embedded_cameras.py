@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bare_files import write_without_grid
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.io import read_cameras
@@ -49,7 +50,7 @@ def test_the_rows_are_the_same_with_and_without(alone: Path, small_scene: Path, 
     assert b"gsmerge cameras" not in one
 
 
-@pytest.mark.parametrize("command", ["compact", "evaluate", "view", "extend", "inspect", "render"])
+@sweep("command", ["compact", "evaluate", "view", "extend", "inspect", "render"], often=2)
 def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str) -> None:
     small, state = alone / "small.ply", tmp_path / "room.gsm"
     calls = {

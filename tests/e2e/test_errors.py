@@ -160,7 +160,10 @@ def test_several_outputs_are_all_there_or_none(
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [("SIGTERM", 143), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("SIGHUP", 129), ("SIGINT", 130)))],
+)
 def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
     """Whenever it comes: no file is left, and one line says why."""
     before = listing(scene_copy)
@@ -251,10 +254,13 @@ ODD_PLACES = {
     "no working directory": ("mkdir gone && cd gone && rmdir ../gone && $G compact ..", 3, "working directory"),
     "little memory": (f"ulimit -v 400000; $G compact . -o a.ply {QUICK}", 3, "out of memory"),
 }
+OFTEN = ("output is full", "output ends early", "little memory")  # the others are in the sweep
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="devices and limits as Linux has them")
-@pytest.mark.parametrize("case", ODD_PLACES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in OFTEN)) for case in ODD_PLACES]
+)
 def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Path) -> None:
     command, code, line = ODD_PLACES[case]
     done = in_shell(command, scene_copy, root)
@@ -276,6 +282,7 @@ def test_a_working_directory_that_vanishes_meanwhile(
     assert says(outcome.err.splitlines()[-1], f"{ERROR}.", "working directory"), outcome.err
 
 
+@pytest.mark.slow
 def test_names_that_the_terminal_cannot_show(scene_copy: Path, root: Path) -> None:
     done = in_shell(
         f"$G compact . -o '\N{SNOWMAN}.ply' {QUICK}; $G inspect '\N{SNOWMAN}.ply'",

@@ -72,6 +72,7 @@ def test_preview_and_render_agree_with_photos_that_are_broken(
     assert run("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
 
 
+@pytest.mark.slow
 def test_cameras_that_do_not_fit_are_said(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     with edited_json(scene_copy / "transforms.json") as data:
         turn = np.eye(4)

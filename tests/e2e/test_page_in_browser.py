@@ -34,6 +34,7 @@ def test_nothing_is_fetched_and_nothing_complains(shown: Browser) -> None:
     assert shown.complaints() == []
 
 
+@pytest.mark.slow
 def test_pictures_and_drawings_have_a_size(shown: Browser) -> None:
     assert shown.run("[...document.images].every(image => image.complete && image.naturalWidth > 0)")
     assert shown.run(
@@ -57,6 +58,7 @@ def test_keys_move_the_slider(shown: Browser) -> None:
     assert at(shown) == "0%"
 
 
+@pytest.mark.slow
 def test_the_mouse_moves_the_slider(shown: Browser) -> None:
     shown.run(f"{FIRST}.scrollIntoView()")
     box = shown.run(f"JSON.parse(JSON.stringify({FIRST}.querySelector('.frame').getBoundingClientRect()))")
@@ -66,6 +68,7 @@ def test_the_mouse_moves_the_slider(shown: Browser) -> None:
     assert abs(float(at(shown).rstrip("%")) - 25) <= 1
 
 
+@pytest.mark.slow
 def test_the_sides_can_be_chosen(shown: Browser) -> None:
     choose = "(select => { select.value = '0'; select.dispatchEvent(new Event('input')); })"
     shown.run(f"{choose}({FIRST}.querySelector('select'))")

@@ -20,6 +20,7 @@ from exact_results import hash_rows, take_rows
 from gsmerge.kernels.library import _able_targets
 
 TARGETS = [target.name for target in _able_targets()]
+NEWEST_ALONE = [*TARGETS[-1:], *(pytest.param(name, marks=pytest.mark.slow) for name in TARGETS[:-1])]
 SETTINGS = {
     "default": (),
     "no fit": ("--fit", "none"),
@@ -81,6 +82,7 @@ def here(scenes: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> d
     return compact(scenes, tmp_path_factory.mktemp("here") / "out", 2, {})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", TARGETS)
 def test_every_processor_gives_the_same_bytes(
     target: str, here: dict[str, str], scenes: dict[str, Path], tmp_path: Path
@@ -88,7 +90,7 @@ def test_every_processor_gives_the_same_bytes(
     assert compact(scenes, tmp_path / "out", 1, plain() | {"GSMERGE_TARGET": target}) == here
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", NEWEST_ALONE)
 def test_every_machine_gives_the_same_bytes(target: str) -> None:
     env = {key: value for key, value in os.environ.items() if key not in plain()} | plain() | {"GSMERGE_TARGET": target}
     command = [sys.executable, str(SCRIPT)]

@@ -33,6 +33,7 @@ def sharp(make_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_one_file_with_its_photo(run: Run, sharp: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
     done = run(

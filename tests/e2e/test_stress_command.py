@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from messages import names
 
 from .conftest import Run
@@ -12,6 +13,7 @@ from .conftest import Run
 FAST = ("--set", "fit=none", "--cases", "order, threads,w2c-opengl")
 
 
+@pytest.mark.slow
 def test_table(scene_copy: Path, run: Run) -> None:
     outcome = run("stress", scene_copy, *FAST, "--report", scene_copy / "stress.json")
     assert (outcome.code, outcome.err) == (0, "")

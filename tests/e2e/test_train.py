@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, noisy, written
 
+pytest.importorskip("torch", reason="torch is not installed")
+
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.research.commands.train_command import find_training_scenes
 from gsmerge.research.training import Example, TrainOptions

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import unaligned_scenes
 from plyfile import PlyData
+from sweeps import sweep
 
 import gsmerge
 from gsmerge import read_scene
@@ -26,7 +27,7 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("settings", [{}, {"budget": "2%"}, {"k": 2}], ids=str)
+@sweep("settings", [{}, {"budget": "2%"}, {"k": 2}], ids=str)
 def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure, floor: Callable[..., None]) -> None:
     scene = read_scene(made, order="none")
     result = gsmerge.compact(scene, fit_steps=300, **settings)

@@ -125,6 +125,7 @@ def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -
     assert tab.run("state.atCamera") is True
 
 
+@pytest.mark.slow
 def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None:
     tab, (scene, small, wide) = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); set('solid', '1'); set('other', false)")
@@ -139,6 +140,7 @@ def test_a_gaussian_reaches_in_from_outside(opened: tuple[Browser, Any]) -> None
     assert psnr(picture(tab), drawn[1]) > 30
 
 
+@pytest.mark.slow
 def test_leaving_a_camera_and_coming_back(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('solid', '1'); jump(0)")
@@ -150,6 +152,7 @@ def test_leaving_a_camera_and_coming_back(opened: tuple[Browser, Any]) -> None:
     assert psnr(picture(tab), there) > 45
 
 
+@pytest.mark.slow
 def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) -> None:
     tab, (scene, small, _) = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo'); jump(0); id('outside').click()")
@@ -186,6 +189,7 @@ def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
         assert psnr(both[:, cut + 2 :], left[:, cut + 2 :]) < 30
 
 
+@pytest.mark.slow
 def test_a_difference_of_a_scene_with_itself_is_black(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.run(f"{BARE} jump(0); set('mode', 'difference'); set('pixels', 'photo')")
@@ -206,6 +210,7 @@ def test_keys(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...id('strip').children].filter(one => one.ariaCurrent === 'true').length") == 1
 
 
+@pytest.mark.slow
 def test_outlines_of_superpixels(opened: tuple[Browser, Any]) -> None:
     """Lines that are a little off the photo's colours, on stills and in 3D, from the cameras of input photos."""
     tab, _ = opened
@@ -244,6 +249,7 @@ def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
     assert tab.run("[...document.querySelectorAll('button:enabled')].every(one => one.title === '')")
 
 
+@pytest.mark.slow
 def test_full_screen(opened: tuple[Browser, Any]) -> None:
     """Where the buttons take two lines as well."""
     tab, _ = opened
@@ -261,6 +267,7 @@ def resize(tab: Browser, width: int, height: int) -> None:
     wait(tab, f"innerWidth === {width}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1280, 800), (1000, 700), (390, 844)])
 def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browser, Any]) -> None:
     """Its lower edge is seen without scrolling, upright or not, and the figures above stay in rows of equal length."""
@@ -279,6 +286,7 @@ def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browse
     assert tab.run("document.documentElement.scrollWidth") == size[0]
 
 
+@pytest.mark.slow
 def test_buttons_of_a_phone_are_large(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     resize(tab, 390, 844)
@@ -290,6 +298,7 @@ def test_buttons_of_a_phone_are_large(opened: tuple[Browser, Any]) -> None:
     assert tab.run("id('strip').scrollWidth > id('strip').clientWidth")
 
 
+@pytest.mark.slow
 def test_the_colours_follow_the_system_and_the_switch(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     grounds = []
@@ -318,6 +327,7 @@ def double_click(tab: Browser, x: float, y: float) -> None:
 LEFT_AND_RIGHT = "['left', 'right'].map(side => getComputedStyle(id(side)).transform)"
 
 
+@pytest.mark.slow
 def test_stills_zoom_in_step(opened: tuple[Browser, Any]) -> None:
     """By double click, wheel, drag and keys: what is below the pointer stays, and both sides show the same part."""
     tab, _ = opened
@@ -344,6 +354,7 @@ def test_stills_zoom_in_step(opened: tuple[Browser, Any]) -> None:
         assert tab.run("state.zoom") == pytest.approx(zoom)
 
 
+@pytest.mark.slow
 def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     resize(tab, 390, 844)
@@ -359,6 +370,7 @@ def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
     assert tab.run("state.at") == 0.5
 
 
+@pytest.mark.slow
 def test_an_enlarged_still_is_a_part_of_it(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.run(f"{BARE} set('mode', 'blink')")
@@ -368,6 +380,7 @@ def test_an_enlarged_still_is_a_part_of_it(opened: tuple[Browser, Any]) -> None:
     assert psnr(picture(tab), part) > 30
 
 
+@pytest.mark.slow
 def test_moving_framing_and_turning_about_a_point(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.run("set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
@@ -404,6 +417,7 @@ def test_moving_framing_and_turning_about_a_point(opened: tuple[Browser, Any]) -
     assert within > 0.8 * total
 
 
+@pytest.mark.slow
 def test_another_result_brings_its_figures(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     shown = "[id('headline').textContent, id('figures').textContent, id('right-tag').textContent]"

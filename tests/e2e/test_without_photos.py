@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from batches import InlinePool, records
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
@@ -28,7 +29,7 @@ def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
+@sweep(
     "options",
     [
         ("--effort", "draft"), ("--effort", "fast", "--k", 2), ("--fit", "none"), ("--budget", "5%"),
@@ -36,8 +37,7 @@ def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("--recipe", "paper"), ("--drop", "sky"), ("--exposure", "per-photo"), ("--set", "poses=free"),
         ("--method", "unmerged-fit"), ("--levels", 2),
     ],
-    ids=lambda options: " ".join(map(str, options)),
-)  # fmt: skip
+    ids=lambda options: " ".join(map(str, options)), often=4)  # fmt: skip
 def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: Path, run: Run) -> None:
     sizes = QUICK if options[0] not in ("--effort", "--budget") else QUICK[2:]
     said = run("compact", bare, "-o", tmp_path / "small.ply", *sizes, *options, "--json", code=0)

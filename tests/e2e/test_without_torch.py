@@ -10,11 +10,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import tomllib
-import torch
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
@@ -37,6 +37,7 @@ COMMANDS = {
     "chart": ("chart", "scene", "--budgets", "5%", "--fit", "none", "--proxy-views", "1", "-o", "new"),
     "generate": ("generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
 }
+OFTEN = ("compact with networks", "extend")  # the others are in the sweep
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,9 @@ def call(work: Path, tmp_path: Path) -> Call:
     return run
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in COMMANDS]
+)
 def test_commands_that_need_no_torch(name: str, call: Call, tmp_path: Path) -> None:
     done = call("-m", "gsmerge", *COMMANDS[name])
     assert done.returncode == 0, done.stderr
@@ -79,7 +82,7 @@ def test_commands_that_need_no_torch(name: str, call: Call, tmp_path: Path) -> N
     assert bool(written) == (name != "inspect")
 
 
-def test_chunks_need_no_torch(call: Call, tmp_path: Path) -> None:
+def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
     scene = tmp_path / "work" / "scene"
     data = json.loads((scene / "transforms.json").read_text())
     w2c = np.linalg.inv([frame["transform_matrix"] for frame in data["frames"]])
@@ -121,6 +124,7 @@ def test_training_says_how_to_install_it(call: Call) -> None:
     assert TORCH_INSTALL in done.stderr
 
 
+@pytest.mark.slow
 def test_tensors_say_how_to_install_it(call: Call) -> None:
     """The error is the library's own, so a caller that catches these reads one line."""
     code = """import gsmerge

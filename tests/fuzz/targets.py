@@ -16,6 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from made_gaussians import random_gaussians
 from model_files import long_lrm
 from tiny_scene import (
@@ -169,6 +170,7 @@ def check_pairs(path: Path) -> None:
 
 def check_settings(path: Path) -> None:
     """Read settings of a training and of a chart."""
+    pytest.importorskip("torch", reason="the package's training imports it")
     from gsmerge.research.charts.grid import read_grid
     from gsmerge.research.training.train_options import read_config
 
@@ -289,7 +291,7 @@ def arrays(folder: Path) -> Iterable[bytes]:
 
 def chunk(folder: Path) -> Iterable[bytes]:
     """Make a ``.torch`` chunk of one scene."""
-    import torch
+    torch = pytest.importorskip("torch", reason="torch is not installed")
 
     rows = torch.cat([torch.tensor([[0.9, 0.9, 0.5, 0.5, 0, 0]]), torch.eye(4)[:3].reshape(1, 12)], 1)
     photo = torch.from_numpy(np.frombuffer(next(photos(folder, (".jpg",))), np.uint8).copy())

@@ -2,45 +2,54 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from scenes import arc, make_scene, room
 
 from gsmerge.moments import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.options import NetworkOptions
-from gsmerge.research.training.modules import Networks
+from gsmerge.networks.options import NetworkOptions, weight_shapes
+from gsmerge.networks.weights import NetworkWeights
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
+LAST = ("out", "shift")  # layers that begin as zeros; that of latents does not
 
 
-def noisy(options: NetworkOptions = SMALL, scale: float = 0.3, seed: int = 0) -> Networks:
-    """Networks with random last layers too."""
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        networks = Networks(options)
-        for name, parameter in networks.named_parameters():
-            if name.split(".")[-2] in ("out", "shift") and not bool(parameter.any()):
-                torch.nn.init.normal_(parameter, std=scale)
-    return networks.eval().requires_grad_(False)
+def noisy(options: NetworkOptions = SMALL, scale: float = 0.3, seed: int = 0) -> NetworkWeights:
+    """Networks of random weights, with last layers of that deviation: before training they are zero."""
+    rng, arrays, inputs = np.random.default_rng(seed), dict[str, np.ndarray](), 1.0
+    for name, shape in weight_shapes(options).items():
+        layer, kind = name.split(".")[-2:]
+        if kind == "weight":
+            inputs = shape[1] if len(shape) == 2 else np.inf  # of a norm, which begins with ones and zeros
+        if layer in LAST and "attention" not in name:
+            array = scale * rng.normal(size=shape)
+        elif kind == "seed":
+            array = rng.normal(size=shape) / shape[-1] ** 0.5
+        else:
+            array = np.ones(shape) if (kind, inputs) == ("weight", np.inf) else rng.uniform(-1, 1, shape) / inputs**0.5
+        arrays[name] = array.astype(np.float32)
+    return NetworkWeights(options, arrays)
 
 
-def scaled(networks: Networks, factor: float) -> Networks:
-    """The networks with every weight times a factor, in place."""
-    for parameter in networks.parameters():
-        parameter.data.mul_(factor)
-    return networks
+def untrained(options: NetworkOptions | None = None) -> NetworkWeights:
+    """Networks that correct nothing, as before training."""
+    return noisy(options or NetworkOptions(), 0.0)
 
 
-def written(path: Path, networks: Networks) -> Path:
+def scaled(networks: NetworkWeights, factor: float) -> NetworkWeights:
+    """The networks with every weight times a factor."""
+    return replace(networks, arrays={name: array * np.float32(factor) for name, array in networks.arrays.items()})
+
+
+def written(path: Path, networks: NetworkWeights) -> Path:
     """A checkpoint of the networks."""
-    save_checkpoint(path, networks.weights(), {"steps": 0})
+    save_checkpoint(path, networks, {"steps": 0})
     return path
 
 
@@ -52,9 +61,9 @@ class Made:
     members: Members
     features: FeatureGaussians
 
-    def networks(self, networks: Networks, seed: int = 0) -> NetworkContext:
-        """The networks for this scene, as they are applied: without torch."""
-        return NetworkContext(networks.weights(), self.members, self.scene.cameras, seed)
+    def networks(self, networks: NetworkWeights, seed: int = 0) -> NetworkContext:
+        """The networks for this scene."""
+        return NetworkContext(networks, self.members, self.scene.cameras, seed)
 
 
 def made(num_views: int = 2) -> Made:

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
+import pytest
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.types import Array
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+Tensor = torch.Tensor
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Networks, examples and runs that take a second."""
+"""Networks, examples and runs that take a second; tests that import this are skipped where torch is missing."""
 
 from __future__ import annotations
 
@@ -6,8 +6,17 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+from network_fixtures import LAST
+
+pytest.importorskip("torch", reason="torch is not installed")
+
+import torch
+
 from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.weights import NetworkWeights
 from gsmerge.research.training import Example, Shard, TrainOptions, write_shard
+from gsmerge.research.training.modules import Networks
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(
@@ -20,6 +29,24 @@ PAPER = replace(
     geometry="decoded", photo_start=0.0, photo_loss="mse", photo_weight=1.0, ssim_weight=0.05, regression_weight=0.0,
     teacher_weight=0.25, diversity_weight=1.0, window=16, validation_windows=1,
 )  # fmt: skip
+
+
+def modules_of(weights: NetworkWeights) -> Networks:
+    """Networks that can be trained, with these weights."""
+    modules = Networks(weights.options)
+    modules.load_state_dict({name: torch.from_numpy(array) for name, array in weights.arrays.items()})
+    return modules
+
+
+def noisy_networks(options: NetworkOptions, scale: float = 0.3, seed: int = 0) -> Networks:
+    """Networks as they are before training, with random last layers; they collect no gradients yet."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        networks = Networks(options)
+        for name, parameter in networks.named_parameters():
+            if name.split(".")[-2] in LAST and not bool(parameter.any()):
+                torch.nn.init.normal_(parameter, std=scale)
+    return networks.eval().requires_grad_(False)
 
 
 def written(example: Example, folder: Path) -> Shard:

@@ -1,12 +1,14 @@
-"""The table of hostile inputs: what careless or malicious files may hold, and what has to come of it.
+"""The table of hostile inputs: files that ask for much memory or time, would run code, or name odd places.
 
-Read by ``tests/e2e/test_hostile_input.py`` and ``benchmarks/hostile.py``. ``changes`` makes further ones at random of
-sound files; ``gsm_files`` damages encoded scenes and states.
+Read by ``tests/e2e/test_hostile_input.py``. What a reader refuses, and in which words, is in its unit test;
+``tests/fuzz`` changes sound files at random. ``gsm_files`` damages encoded scenes and states.
 """
 
 from __future__ import annotations
 
-from . import array_files, camera_files, camera_models, chunks, glb_files, packed_files, pictures, places, ply_files
+from importlib.util import find_spec
+
+from . import array_files, camera_files, camera_models, glb_files, packed_files, pictures, places, ply_files
 from .array_files import MARKER
 from .case import Case
 
@@ -17,9 +19,12 @@ CASES: dict[str, Case] = {
     **camera_files.CASES,
     **camera_models.CASES,
     **array_files.CASES,
-    **chunks.CASES,
     **pictures.CASES,
     **places.CASES,
 }
+if find_spec("torch"):  # which writes them
+    from . import chunks
+
+    CASES |= chunks.CASES
 
 __all__ = ["CASES", "MARKER", "Case"]

@@ -67,13 +67,13 @@ def member(value: Any, dtype: str | None = None, shape: tuple[int, ...] | None =
     return stream.getvalue() + array.tobytes()
 
 
-def zipped(kind: str, name: str, make: Callable[[Any], bytes], method: int = zipfile.ZIP_DEFLATED) -> Spoil:
+def zipped(kind: str, name: str, make: Callable[[Any], bytes]) -> Spoil:
     """A good file with one member replaced by other bytes."""
 
     def spoil(folder: Path) -> None:
         arrays = arrays_of(folder, kind)
         (folder / "transforms.json").unlink()
-        with zipfile.ZipFile(folder / kind, "w", method) as file:
+        with zipfile.ZipFile(folder / kind, "w", zipfile.ZIP_DEFLATED) as file:
             for key, value in arrays.items():
                 file.writestr(f"{key}.npy", make(value) if key == name else member(value))
 
@@ -110,51 +110,25 @@ def member_pickle(folder: Path) -> None:
             file.writestr(name, pickle.dumps(Payload(folder / MARKER)))
 
 
-def scaled(name: str, factor: float) -> Callable[[Arrays, Path], None]:
-    def change(arrays: Arrays, _: Path) -> None:
-        with np.errstate(all="ignore"):
-            arrays[name] = arrays[name] * factor
-
-    return change
-
-
-def replaced(name: str, value: Any) -> Callable[[Arrays, Path], None]:
-    return lambda arrays, _: arrays.update({name: value})
-
-
-def as_type(name: str, dtype: str) -> Callable[[Arrays, Path], None]:
-    return lambda arrays, _: arrays.update({name: arrays[name].astype(dtype)})
-
-
 def _of_kind(kind: str, poses: str, Ks: str, images: str) -> dict[str, Case]:
-    cases = {"as it is": Case(saved(kind, lambda arrays, folder: None), READ)}
-    for name in (poses, Ks, images) if kind == "views.npz" else (poses,):
-        cases[f"{name} missing"] = Case(saved(kind, replaced(name, None)), EITHER)
-        cases[f"{name} as an object"] = Case(saved(kind, lambda a, folder, name=name: pickled(a, folder, name)))
-        for dtype in ("complex64", "U8", "datetime64[s]", "bool"):
-            change = replaced(name, np.zeros((VIEWS, 3, 3), dtype))
-            cases[f"{name} as {dtype}"] = Case(saved(kind, change))
-        cases[f"{name} empty"] = Case(saved(kind, replaced(name, np.zeros((0, 3, 3)))))
-        cases[f"{name} as one number"] = Case(saved(kind, replaced(name, np.array(1.0))))
-        for shape in ((2**40, 2**40), (VIEWS, 2**31, 2**31), (2**62,), (-1, 3), (0,)):
-            cases[f"{name} said to be {shape}"] = Case(zipped(kind, name, lambda v, s=shape: member(v, shape=s)))
-        for dtype in ("|O", "<U1000000000", "|V1000000000", "<f16", "garbage"):
-            cases[f"{name} said to be of {dtype}"] = Case(zipped(kind, name, lambda v, d=dtype: member(v, d)), EITHER)
-        cases[f"{name} of nested brackets"] = Case(zipped(kind, name, lambda _: brackets(9000)))
-        cases[f"{name} of half a header"] = Case(zipped(kind, name, lambda v: member(v)[:20]))
-        cases[f"{name} of half its bytes"] = Case(zipped(kind, name, lambda v: member(v)[: len(member(v)) // 2]))
-        for factor in (np.nan, np.inf, 1e300, 0.0):
-            cases[f"{name} times {factor}"] = Case(saved(kind, scaled(name, factor)), EITHER)
-    cases["images of no pixels"] = Case(saved(kind, replaced(images, np.zeros((VIEWS, 0, 0, 3), np.uint8))))
-    cases["a bomb of images"] = Case(zipped(kind, images, bomb(2**27, (VIEWS, 3800, 3800, 3))))
-    cases["a bomb of floats"] = Case(zipped(kind, images, lambda _: member(np.zeros((VIEWS, 1400, 1400, 3), "<f4"))))
-    cases["a header of 60 MB"] = Case(zipped(kind, images, lambda _: long_header(60 << 20)))
-    cases["20,000 poses"] = Case(
-        saved(kind, lambda a, _: a.update({poses: np.tile(np.eye(4), (20_000, 1, 1)), Ks: None}))
-    )
-    cases["a bomb of poses"] = Case(zipped(kind, poses, bomb(2**27, (2**27,))))
-    for method in ("ZIP_BZIP2", "ZIP_LZMA"):
-        cases[method] = Case(zipped(kind, images, member, getattr(zipfile, method)), EITHER)
+    cases = {
+        "as it is": Case(saved(kind, lambda arrays, folder: None), READ),
+        "poses as an object": Case(saved(kind, lambda arrays, folder: pickled(arrays, folder, poses))),
+        "poses of nested brackets": Case(zipped(kind, poses, lambda _: brackets(9000))),
+        "20,000 poses": Case(saved(kind, lambda a, _: a.update({poses: np.tile(np.eye(4), (20_000, 1, 1)), Ks: None}))),
+        "a bomb of poses": Case(zipped(kind, poses, bomb(2**27, (2**27,)))),
+        "a bomb of images": Case(zipped(kind, images, bomb(2**27, (VIEWS, 3800, 3800, 3)))),
+        "a bomb of floats": Case(zipped(kind, images, lambda _: member(np.zeros((VIEWS, 1400, 1400, 3), "<f4")))),
+        "a header of 60 MB": Case(zipped(kind, images, lambda _: long_header(60 << 20))),
+        "encrypted": Case(bytes_of(kind, lambda data: patched(data, 6, 8, lambda flags: flags | 1)), EITHER),
+        "an unknown compression": Case(bytes_of(kind, lambda data: patched(data, 8, 10, lambda _: 99)), EITHER),
+        "the directory alone": Case(bytes_of(kind, lambda data: data[data.index(b"PK\x01\x02") :])),
+        "8 GB of zeros": Case(lambda folder: _zeros(folder, kind)),
+    }
+    for shape in ((2**40, 2**40), (VIEWS, 2**31, 2**31), (2**62,), (-1, 3)):
+        cases[f"poses said to be {shape}"] = Case(zipped(kind, poses, lambda v, s=shape: member(v, shape=s)))
+    for dtype in ("|O", "<U1000000000", "|V1000000000"):
+        cases[f"poses said to be of {dtype}"] = Case(zipped(kind, poses, lambda v, d=dtype: member(v, d)), EITHER)
     return {f"{kind}: {word}": replace(case, named=kind) for word, case in cases.items()}
 
 
@@ -165,28 +139,6 @@ def long_header(size: int) -> bytes:
 def brackets(depth: int) -> bytes:
     head = b"{'descr': " + b"(" * depth + b"'<f8'" + b")" * depth + b"}\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head
-
-
-def _archives(kind: str) -> dict[str, Case]:
-    def damage(data: bytes) -> bytes:
-        middle = len(data) // 2
-        return data[:middle] + bytes(255 - byte for byte in data[middle : middle + 64]) + data[middle + 64 :]
-
-    def method(number: int) -> Callable[[bytes], bytes]:
-        """Another method of compression in the directory."""
-        return lambda data: patched(data, 8, 10, lambda _: number)
-
-    cases = {
-        "nothing": lambda _: b"", "text": lambda _: b"text", "half": lambda data: data[: len(data) // 2],
-        "all but the last byte": lambda data: data[:-1], "damaged in the middle": damage,
-        "an unknown compression": method(99), "deflate that is none": method(8),
-        "encrypted": lambda data: patched(data, 6, 8, lambda flags: flags | 1),
-        "the directory alone": lambda data: data[data.index(b"PK\x01\x02") :],
-        "a single array": lambda _: member(np.zeros(3)),
-    }  # fmt: skip
-    out = {f"{kind}: {word}": Case(bytes_of(kind, change), EITHER, kind) for word, change in cases.items()}
-    out[f"{kind}: 8 GB of zeros"] = Case(lambda folder: _zeros(folder, kind), (3,), kind)
-    return out
 
 
 def _zeros(folder: Path, kind: str) -> None:
@@ -208,15 +160,7 @@ def patched(data: bytes, in_member: int, in_directory: int, change: Callable[[in
 CASES = {
     **_of_kind("views.npz", "c2w", "K", "images"),
     **_of_kind("results.npz", "extrinsics", "intrinsics", "image"),
-    **_archives("views.npz"),
-    **_archives("results.npz"),
     "pickle named views.npz": Case(raw_pickle),
     "pickles in an archive": Case(member_pickle),
+    "views.npz: an order of objects": Case(saved("views.npz", lambda a, folder: pickled(a, folder, "order"))),
 }
-for value in (np.nan, np.inf, -1.0, 0.0):
-    CASES[f"results.npz: depth {value}, no images"] = Case(
-        saved("results.npz", lambda a, _, v=value: a.update(image=None, depth=np.full_like(a["depth"], v))), EITHER
-    )
-CASES["results.npz: depth of text"] = Case(saved("results.npz", as_type("depth", "U3")), EITHER)
-CASES["views.npz: an order that is none"] = Case(saved("views.npz", replaced("order", np.array("a\nb" * 100))))
-CASES["views.npz: an order of objects"] = Case(saved("views.npz", lambda a, folder: pickled(a, folder, "order")))

@@ -36,11 +36,6 @@ class Case:
 
 READ, USAGE, REFUSED, EITHER = (0,), (2,), (3,), (0, 3)
 
-NUMBERS: dict[str, Any] = {
-    "NaN": float("nan"), "inf": float("inf"), "-inf": float("-inf"), "1e300": 1e300, "-1": -1, "zero": 0,
-    "a huge integer": 10**400, "a word": "wide", "null": None, "true": True, "a list": [1, 2], "an object": {"a": 1},
-}  # fmt: skip
-
 
 def cameras_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world poses ``[v,4,4]`` with OpenCV axes and intrinsics ``[3,3]`` of the unspoiled scene."""
@@ -91,15 +86,5 @@ def remove(name: str) -> Spoil:
     def spoil(folder: Path) -> None:
         path = folder / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    return spoil
-
-
-def both(*spoils: Spoil) -> Spoil:
-    """Several changes, one after the other."""
-
-    def spoil(folder: Path) -> None:
-        for one in spoils:
-            one(folder)
 
     return spoil

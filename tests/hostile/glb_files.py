@@ -1,4 +1,4 @@
-"""Binary glTF of Gaussians that is cut, that lies, or that is absurd."""
+"""Binary glTF of Gaussians that promises much, or goes round in circles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .case import EITHER, NUMBERS, READ, Case, Spoil
+from .case import EITHER, READ, Case, Spoil
 
 NAME = "KHR_gaussian_splatting"
 DEEP = 100_000  # brackets, or nodes in one another
@@ -87,47 +87,26 @@ def shared(parsed: dict[str, Any]) -> None:
 
 
 def _cases() -> dict[str, Case]:
-    sizes = (0, 1, 11, 12, 19, 20, 100, 2000, -1, -4, -20_000)
-    cases = {f"cut to {size} bytes": Case(bytes_of(lambda data, size=size: data[:size])) for size in sizes}
-    cases |= {f"{name} cut": Case(bytes_of(lambda data, at=at: data[:at]), says=("scene.glb",)) for name, at in (
-        ("header", 10), ("JSON", 60), ("numbers", -8),
-    )}  # fmt: skip
-    for value in (0, 1, 19, 2**31, 2**32 - 1):
+    contents = {"brackets": b"[" * DEEP, "objects": b'{"a":' * DEEP, "a number": b"1e999"}
+    cases = {f"JSON with {name}": Case(text(lambda _, data=data: data)) for name, data in contents.items()}
+    for value in (0, 2**31, 2**32 - 1):
         cases[f"JSON of {value} bytes"] = Case(head(12, "<I", value))
-        cases[f"version {value}"] = Case(head(4, "<I", value))
-    cases["another length in the header"] = Case(head(8, "<I", 2**32 - 1), says=("scene.glb", "4294967295"))
-    cases["the same bytes"] = Case(text(lambda data: data), READ)
-    contents = {
-        "nothing": b"", "a list": b"[]", "a number": b"1e999", "brackets": b"[" * DEEP, "objects": b'{"a":' * DEEP,
-        "no UTF-8": b"\xff\xfe{}", "another text": b"notes", "an empty object": b"{}",
-    }  # fmt: skip
-    cases |= {f"JSON with {name}": Case(text(lambda _, data=data: data)) for name, data in contents.items()}
-    primitive = ("meshes", 0, "primitives", 0)
-    places: dict[str, tuple[str | int, ...]] = {
-        "count": ("accessors", 0, "count"), "type of numbers": ("accessors", 1, "componentType"),
-        "type": ("accessors", 2, "type"), "view": ("accessors", 3, "bufferView"), "accessors": ("accessors",),
-        "buffer": ("bufferViews", 0, "buffer"), "start": ("bufferViews", 1, "byteOffset"),
-        "length": ("bufferViews", 0, "byteLength"), "stride": ("bufferViews", 0, "byteStride"),
-        "scene": ("scene",), "roots": ("scenes", 0, "nodes"), "nodes": ("nodes",), "mesh": ("nodes", 0, "mesh"),
-        "children": ("nodes", 0, "children"), "rotation": ("nodes", 0, "rotation"), "matrix": ("nodes", 0, "matrix"),
-        "scale": ("nodes", 0, "scale"), "translation": ("nodes", 0, "translation"), "meshes": ("meshes",),
-        "primitives": primitive[:3], "attributes": (*primitive, "attributes"),
-        "accessor": (*primitive, "attributes", "POSITION"), "extension": (*primitive, "extensions"),
-        "used": ("extensionsUsed",), "needed": ("extensionsRequired",),
-    }  # fmt: skip
-    for name, path in places.items():
-        cases |= {f"{name} {word}": Case(placed(*path, value=value), EITHER) for word, value in NUMBERS.items()}
-    for value in (float("nan"), float("inf"), 1e300, 0.0):
+    for value in (float("nan"), 1e300):
         for part in ("translation", "scale"):
             cases[f"{part} of {value}"] = Case(placed("nodes", 0, part, value=[value] * 3), EITHER)
-    cases["nodes in one another"] = Case(document(chain))
-    cases["a node in itself"] = Case(placed("nodes", 0, "children", value=[0]), says=("scene.glb", "node 0"))
-    cases["copies without end"] = Case(document(copies), says=("scene.glb", "same values"))
-    cases["200,000 empty nodes"] = Case(document(empty), says=("scene.glb", "nodes"))
-    cases["values for many attributes"] = Case(document(shared), says=("scene.glb", "same values"))
-    cases["a count of true"] = Case(placed("accessors", 0, "count", value=True), says=("scene.glb", "True"))
-    cases["a promise"] = Case(placed("accessors", 0, "count", value=10**9), says=("scene.glb", "1000000000"))
-    return cases
+    return cases | {
+        "another length in the header": Case(head(8, "<I", 2**32 - 1)),
+        "the same bytes": Case(text(lambda data: data), READ),
+        "nodes in one another": Case(document(chain)),
+        "a node in itself": Case(placed("nodes", 0, "children", value=[0])),
+        "copies without end": Case(document(copies)),
+        "200,000 empty nodes": Case(document(empty)),
+        "values for many attributes": Case(document(shared)),
+        "a count of 400 digits": Case(placed("accessors", 0, "count", value=10**400)),
+        "a promise": Case(placed("accessors", 0, "count", value=10**9)),
+        "a length of 2^62": Case(placed("bufferViews", 0, "byteLength", value=2**62), EITHER),
+        "a stride of 2^62": Case(placed("bufferViews", 0, "byteStride", value=2**62), EITHER),
+    }
 
 
 CASES = {f"glb: {name}": case for name, case in _cases().items()}

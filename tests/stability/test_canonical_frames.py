@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Scene
 from gsmerge.facts.prepare import scene_frame
@@ -23,7 +24,7 @@ def room() -> Scene:
 # 13: flyaways
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "match": "aabb"}], ids=str)
+@sweep("settings", [{}, {"fit": "none"}, {"fit": "none", "match": "aabb"}], ids=str)
 def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
     means = room.gaussians.means.copy()
     rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
@@ -88,7 +89,7 @@ def test_similarity_of_equal_opacities(room: Scene) -> None:
     assert max(counts) - min(counts) <= 2  # pairs whose overlap lies at the threshold to the last bits
 
 
-@pytest.mark.parametrize("factor", [1e-4, 1.0, 1e4])
+@sweep("factor", [1e-4, 1.0, 1e4])
 def test_similarity_with_everything_on(room: Scene, factor: float) -> None:
     moved = scenes.move(room, scenes.random_rotation(2), factor, np.zeros(3))
     for settings, most in (({"fit": "none"}, 0.1), ({}, 0.7)):

@@ -7,20 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from network_fixtures import noisy, scaled, written
+from network_fixtures import noisy, scaled, untrained, written
 from safetensors.numpy import load_file, save_file
 from scenes import arc, assert_invariants, identical, make_scene, room
+from sweeps import sweep
 from unaligned_scenes import shuffled
 
 import gsmerge
 from gsmerge.networks.options import Bounds
-from gsmerge.research.training.modules import Networks
 from gsmerge.types import SH_C0
 
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
 
 
-@pytest.mark.parametrize(
+@sweep(
     "settings",
     [
         {},
@@ -34,7 +34,7 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
 )
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(3))
-    path = written(tmp_path / "a.safetensors", Networks())
+    path = written(tmp_path / "a.safetensors", untrained())
     chosen = {"superpixels": 80, "fit": "none", **settings}
     plain, networks = (
         gsmerge.compact(scene, **chosen, checkpoint="none"),
@@ -49,7 +49,7 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     scene = make_scene(room(), arc(3))
     chosen = {"fit": "none", "superpixels": "10%"}
-    path = written(tmp_path / "a.safetensors", Networks())
+    path = written(tmp_path / "a.safetensors", untrained())
     unaligned = shuffled(scene)
     plain = gsmerge.compact(unaligned, **chosen, checkpoint=str(path))  # which assigns rows by their centres
     written(path, noisy())

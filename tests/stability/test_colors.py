@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.fit import FitOptions
@@ -63,8 +64,8 @@ def test_exposure_of_photos_and_gaussians(room: Scene) -> None:
 # 30, 31: nothing to see, and too much
 
 
-@pytest.mark.parametrize("grey", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
+@sweep("grey", [0.0, 0.5, 1.0])
+@sweep("segmentation", ["rdseg", "bass-st"])
 def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
     flat = painted(room, np.full_like(room.images, grey))
     result = scenes.compacted(flat, segmentation=segmentation, superpixels=60)
@@ -91,7 +92,7 @@ def shiny(scene: Scene, strength: float) -> Scene:
     return replace(made, images=images.astype(np.float32))
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
+@sweep("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
 def test_harmonics_survive(room: Scene, settings: dict) -> None:
     scene = shiny(room, 0.3)
     actual = scenes.compacted(scene, **settings).gaussians

@@ -11,19 +11,20 @@ import scenes
 from gsmerge import Gaussians, Scene, compact
 
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
+EACH = [*(pytest.param(name, marks=pytest.mark.slow) for name in ("wall", "planes")), "room"]
 
 
 def build(name: str, noise: float) -> Scene:
     return scenes.make_scene(SCENES[name](), scenes.arc(3, 96, 72), noise=noise)
 
 
-@pytest.fixture(scope="module", params=list(SCENES))
+@pytest.fixture(scope="module", params=EACH)
 def scene(request: pytest.FixtureRequest) -> Scene:
     """With the depth noise of a network."""
     return build(request.param, 0.02)
 
 
-@pytest.fixture(scope="module", params=list(SCENES))
+@pytest.fixture(scope="module", params=EACH)
 def clean(request: pytest.FixtureRequest) -> Scene:
     """With hardly any, so that groups are thin."""
     return build(request.param, 0.005)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances, project, quat_to_rotmat
@@ -37,7 +38,7 @@ def one_group_per_view(scene: Scene) -> FeatureGaussians:
 # 1: coincident Gaussians
 
 
-@pytest.mark.parametrize("settings", [{}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
@@ -115,7 +116,7 @@ def test_needles_hardly_show(room: Scene) -> None:
     assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_scales_at_the_ends_of_the_range(room: Scene, settings: dict) -> None:
     scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
@@ -198,8 +199,8 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
     assert abs(scenes.psnr_of(actual, others) - scenes.psnr_of(clean, others)) < 0.1
 
 
-@pytest.mark.parametrize("where", ["at", "behind"])
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("where", ["at", "behind"])
+@sweep("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
@@ -213,7 +214,7 @@ def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: d
 # 15, 16: depth edges
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
+@sweep("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
@@ -247,7 +248,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
 # 17: thin things
 
 
-@pytest.mark.parametrize("settings", [{}, {"k": 2}, {"fit": "none"}], ids=str)
+@sweep("settings", [{}, {"k": 2}, {"fit": "none"}], ids=str)
 def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
     """Two pixels wide; contrast against the wall beside it."""
     scene = scenes.make_scene(scenes.pole(), scenes.arc(3))

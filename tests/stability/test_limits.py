@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
@@ -25,7 +26,7 @@ def unaligned(scene: Scene) -> Scene:
     return Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
 
 
-@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}, {"k": 4, **PLAIN}], ids=str)
 def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
     """One Gaussian for each view: met, visible, in the colours of the scene; and one fewer is refused."""
     result = scenes.compacted(room, superpixels="auto", budget=VIEWS, **settings)
@@ -38,7 +39,7 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
         compact(room, budget=VIEWS - 1, **settings)
 
 
-@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
 def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
     result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
@@ -52,9 +53,9 @@ def test_a_budget_of_every_unaligned_gaussian_changes_none(room: Scene) -> None:
     np.testing.assert_array_equal(result.gaussians.sh0, room.gaussians.sh0)
 
 
-@pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
-@pytest.mark.parametrize("budget", [5, 97, 500, 1501])
-@pytest.mark.parametrize("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], ids=str)
+@sweep("aligned", [True, False], ids=["aligned", "unaligned"], often=2)
+@sweep("budget", [5, 97, 500, 1501], often=2)
+@sweep("settings", [{}, PLAIN, {"k": 2}, {"k": 8, **PLAIN}, {"segmentation": "grid"}], ids=str, often=2)
 def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[str, Any], aligned: bool) -> None:
     scene = room if aligned else unaligned(room)
     result = compact(scene, budget=budget, **{"fit": "none", **settings})
@@ -62,7 +63,7 @@ def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[
     scenes.assert_invariants(result.gaussians, room)
 
 
-@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
 def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
     result = scenes.compacted(scene, **settings)
@@ -71,8 +72,8 @@ def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
     assert scenes.psnr_of(result.gaussians, few) > scenes.psnr_of(scene.gaussians, few) - 1
 
 
-@pytest.mark.parametrize("size", [(4096, 16), (16, 4096), (4096, 1)])
-@pytest.mark.parametrize("settings", [PLAIN, {"fit_steps": 10}], ids=str)
+@sweep("size", [(4096, 16), (16, 4096), (4096, 1)])
+@sweep("settings", [PLAIN, {"fit_steps": 10}], ids=str)
 def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
     width, height = size
     cameras = scenes.arc(2, *size)
@@ -89,7 +90,7 @@ def test_long_views(size: tuple[int, int], settings: dict[str, Any]) -> None:
     assert along[-(len(along) // 16) :].mean() > 0.5
 
 
-@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
 def test_eight_of_a_single_pixel(settings: dict[str, Any]) -> None:
     """A group of one member gives one Gaussian, however many are asked for."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 16))

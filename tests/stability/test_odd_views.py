@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Cameras, Scene
 from gsmerge.facts.views import concat_cameras
@@ -97,6 +98,7 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
     scenes.assert_same_set(one.gaussians, other.gaussians, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
     """Means of five seeds: which blocks are held out depends on the order, and a run of one seed scatters by 0.5 dB."""
     one, other = (
@@ -130,6 +132,7 @@ def misplaced(scene: Scene, degrees: float) -> Scene:
 DEGREES = (0.0, 0.2, 1.0, 5.0, 20.0)
 
 
+@pytest.mark.slow
 def test_wrong_poses_degrade_step_by_step(room: Scene) -> None:
     wrong = [misplaced(room, degrees) for degrees in DEGREES[:4]]
     fixed, auto = (
@@ -141,7 +144,7 @@ def test_wrong_poses_degrade_step_by_step(room: Scene) -> None:
     assert auto[-1] > fixed[-1] + 2
 
 
-@pytest.mark.parametrize("degrees", DEGREES)
+@sweep("degrees", DEGREES)
 def test_fit_never_hurts_under_wrong_poses(room: Scene, degrees: float) -> None:
     scene = misplaced(room, degrees)
     fitted, unfitted = (scenes.compacted(scene, fit=fit) for fit in ("full", "none"))

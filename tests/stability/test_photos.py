@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import names, noted
+from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.prepare import PrepareOptions, prepare
@@ -95,7 +96,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None))
+@sweep(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None), often=3)
 def test_photos_are_mended(
     room: Scene, sound: CompactResult, change: Change, loss: float, note: tuple[str, ...]
 ) -> None:
@@ -105,7 +106,7 @@ def test_photos_are_mended(
     assert result.report.choices["photos_changed"]
 
 
-@pytest.mark.parametrize("change", [bgr, half, linear])
+@sweep("change", [bgr, half, linear])
 def test_photos_of_gaussians_without_pixels_are_mended(room: Scene, change: Change) -> None:
     unaligned = Scene(room.gaussians, room.cameras, room.images, None, room.names)
     right, mended = (compact(replace(unaligned, images=images), **FIT) for images in (room.images, change(room.images)))

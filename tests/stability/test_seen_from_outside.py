@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.facts.views import concat_cameras
@@ -79,7 +79,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
-@pytest.mark.parametrize("name", SCENES)
+@sweep("name", SCENES, often=2)
 def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     """After the default fit; the floor is of the share of emptiness that is left, far from the outline."""
     scene = SCENES[name]()
@@ -93,7 +93,7 @@ def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     assert (result.gaussians.opacities >= 1 / 255).all()
 
 
-@pytest.mark.parametrize("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}], ids=str)
+@sweep("settings", [{"effort": "draft"}, {"effort": "fast"}, {"k": 4}, {"budget": "20%"}], ids=str)
 def test_every_effort_and_size(settings: dict[str, object]) -> None:
     scene = room()
     result = scenes.compacted(scene, **settings)

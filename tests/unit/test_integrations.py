@@ -8,13 +8,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from messages import noted, refuses
 from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.geometry import covariances, multiply_quats, rotmat_to_quat
 from gsmerge.types import as_array
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
 SIZES = np.array([48, 36, 1.0])[:, None]

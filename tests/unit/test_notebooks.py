@@ -6,11 +6,11 @@ import base64
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
 import gsmerge
 
@@ -77,7 +77,7 @@ def test_evaluations_are_tables(scene: gsmerge.Scene, result: gsmerge.CompactRes
     assert "lpips" not in text
 
 
-def test_renderings_show_their_first_views(scene: gsmerge.Scene) -> None:
+def test_renderings_show_their_first_views(scene: gsmerge.Scene, torch: Any) -> None:
     drawn = gsmerge.render(scene.gaussians, scene.cameras[[0, 1]])
     for rendering in (drawn, replace(drawn, images=torch.from_numpy(drawn.images))):
         packed = rendering._repr_png_()

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import scenes
-import torch
 import unaligned_scenes
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
@@ -147,13 +148,13 @@ def test_every_segmentation(scene: Scene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+@sweep("degree", [1, 2, 3, 4])
 def test_harmonics_keep_their_degree(degree: int) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
 
 
-def test_result_can_be_used_like_any_array_or_tensor(scene: Scene) -> None:
+def test_result_can_be_used_like_any_array_or_tensor(scene: Scene, torch: Any) -> None:
     """Changed in place, and as tensors differentiated through."""
     actual = compact(scene).gaussians
     for name in scenes.FIELDS:
@@ -166,7 +167,7 @@ def test_result_can_be_used_like_any_array_or_tensor(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("photos", [True, False])
-def test_tensors_give_tensors_of_the_same_values(scene: Scene, photos: bool) -> None:
+def test_tensors_give_tensors_of_the_same_values(scene: Scene, photos: bool, torch: Any) -> None:
     """Of Gaussians that autograd follows, too; the input stays as it is."""
     given = scene if photos else replace(scene, images=None)
     tensors = replace(given, gaussians=given.gaussians.to("cpu"), cameras=given.cameras.to("cpu"))

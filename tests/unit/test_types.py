@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 
 from gsmerge.types import (
@@ -48,7 +48,7 @@ def test_concat_keeps_the_order() -> None:
         assert np.array_equal(getattr(both, f.name), getattr(gaussians(5, 3), f.name))
 
 
-def test_to_keeps_everything() -> None:
+def test_to_keeps_everything(torch: Any) -> None:
     """Arrays become tensors that share their memory, and tensors arrays; of either kind the same stays as it is."""
     g, c = gaussians(2, 3), cameras()
     tensors, moved = g.to("cpu"), c.to(torch.device("cpu"))
@@ -66,13 +66,13 @@ def test_to_keeps_everything() -> None:
     assert all(getattr(g.to("meta"), f.name).is_meta for f in fields(Gaussians))
 
 
-def test_device_is_that_of_tensors() -> None:
+def test_device_is_that_of_tensors(torch: Any) -> None:
     assert gaussians(2).device is None
     assert gaussians(2).to("cpu").device == torch.device("cpu")
     assert gaussians(2).to("meta").device == torch.device("meta")
 
 
-def test_gradients_pass_to_a_device_and_end_in_arrays() -> None:
+def test_gradients_pass_to_a_device_and_end_in_arrays(torch: Any) -> None:
     means = torch.ones(2, 3, dtype=torch.float64, requires_grad=True)
     tensors = replace(gaussians(2).to("cpu"), means=means)
     tensors.to("cpu").means.sum().backward()
@@ -82,7 +82,7 @@ def test_gradients_pass_to_a_device_and_end_in_arrays() -> None:
     assert tensors.numpy().means.dtype == np.float64
 
 
-def test_concat_of_tensors_is_of_tensors() -> None:
+def test_concat_of_tensors_is_of_tensors(torch: Any) -> None:
     """With their gradients; arrays among them become tensors."""
     opacities = torch.ones(2, requires_grad=True)
     first = replace(gaussians(2, 3).to("cpu"), opacities=opacities)
@@ -95,7 +95,7 @@ def test_concat_of_tensors_is_of_tensors() -> None:
             assert np.array_equal(getattr(both.numpy(), name), getattr(gaussians(5, 3), name))
 
 
-def test_tensors_are_indexed_like_arrays() -> None:
+def test_tensors_are_indexed_like_arrays(torch: Any) -> None:
     g = gaussians(5, 3)
     for index in (slice(1, 3), np.array([4, 0]), g.opacities > 2, [3]):
         actual, expected = g.to("cpu")[index], g[index]
@@ -104,7 +104,7 @@ def test_tensors_are_indexed_like_arrays() -> None:
             assert np.array_equal(getattr(actual.numpy(), f.name), getattr(expected, f.name))
 
 
-def test_single_arrays() -> None:
+def test_single_arrays(torch: Any) -> None:
     array, tensor = np.arange(3.0), torch.arange(3.0, requires_grad=True)
     assert as_array(array) is array
     assert np.shares_memory(as_array(as_tensor(array)), array)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from made_gaussians import random_gaussians
 from slow_renderer import Reference, render_arrays
+from sweeps import sweep
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
@@ -36,7 +36,7 @@ def assert_alike(image: object, expected: object, most: float = 0.02) -> None:
     assert np.quantile(error, 0.99) < 2e-5
 
 
-@pytest.mark.parametrize("degree", range(5))
+@sweep("degree", range(5), often=2)
 def test_images_match(degree: int) -> None:
     gaussians, cameras = random_gaussians(300, degree, degree=degree), turned_camera()
     rendering = render(gaussians, cameras, (0.2, 0.5, 0.9), with_depths=True)
@@ -59,7 +59,7 @@ def test_depth_range_matches() -> None:
     assert_alike(rendering.images[0], reference(gaussians, cameras, near=2.5, far=3.5).image)
 
 
-@pytest.mark.parametrize("scale", [1e-6, 0.3, 3.0])
+@sweep("scale", [1e-6, 0.3, 3.0], often=2)
 def test_tiny_and_large_gaussians_match(scale: float) -> None:
     gaussians, cameras = random_gaussians(200, 9), turned_camera()
     scales = np.exp(0.5 * np.log(gaussians.scales / 0.05)) * scale
@@ -75,7 +75,7 @@ def test_needles_match() -> None:
     assert_alike(render(needles, cameras).images[0], reference(needles, cameras).image, 0.05)
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4, 5, 8])
+@sweep("channels", [1, 3, 4, 5, 8], often=2)
 def test_adjoint_matches_the_weights(channels: int) -> None:
     gaussians, cameras = random_gaussians(200, 11), turned_camera()
     plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)

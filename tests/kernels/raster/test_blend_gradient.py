@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
+from sweeps import sweep
 
 from gsmerge import Gaussians
 from gsmerge.raster import ViewPlan, composite, plan_view, prepare
@@ -21,6 +21,8 @@ from gsmerge.raster.gradient import (
     plan_gradients,
 )
 from gsmerge.runtime.threads import use_threads
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -33,8 +35,8 @@ def gradients_of_plan(plan: ViewPlan, colors: np.ndarray, grad_left: np.ndarray 
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("eps2d", [0.075, 0.3, 1.0])
-@pytest.mark.parametrize("with_left", [False, True])
+@sweep("eps2d", [0.075, 0.3, 1.0])
+@sweep("with_left", [False, True])
 def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
     gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
     grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None

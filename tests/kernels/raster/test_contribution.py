@@ -9,6 +9,7 @@ import pytest
 from made_gaussians import random_gaussians
 from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
+from sweeps import sweep
 
 from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, settle_row
 from gsmerge.raster import plan_view, prepare
@@ -37,7 +38,7 @@ CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 4
          (1, 4, 0.5, -1.0, 7), (100, 5, 0.5, -2.0, 1)]  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
+@sweep("case", CASES, often=2)
 def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)

@@ -6,12 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
-from torch.nn.functional import avg_pool2d
 
 from gsmerge.fit.loss import image_gradient
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.image_loss import C1, C2
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+avg_pool2d = torch.nn.functional.avg_pool2d
 
 SIZES = [(20, 17), (7, 7), (3, 5), (1, 9)]
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
+import pytest
 from slow_renderer import footprints
 
 from gsmerge import Gaussians
 from gsmerge.raster import plan_view, prepare
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 
 def random_gaussians(n: int, seed: int, *, spread: float, depth: float, sizes: float) -> Gaussians:

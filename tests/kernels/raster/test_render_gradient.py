@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-import torch
 from slow_renderer import (
     BACKGROUND,
     NAMES,
@@ -19,9 +18,11 @@ from slow_renderer import (
     reference_gradients,
     turned_cameras,
 )
-from torch import Tensor
 
 from gsmerge import Cameras, Gaussians, render
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+Tensor = torch.Tensor
 
 
 def gradients(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import (
@@ -17,6 +16,8 @@ from gsmerge.kernels.raster import sh
 from gsmerge.raster.gradient import (
     color_gradients,
 )
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 RNG = np.random.default_rng(0)
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from exports import smooth_scene
 from messages import noted, refuses
+from sweeps import sweep
 from tiny_scene import Tiny, edited_json, make_tiny
 
 from gsmerge.alignment import choose_poses, other_conventions
@@ -33,7 +34,7 @@ def some_rows(tiny: Tiny) -> Tiny:
     return replace(tiny, gaussians=tiny.gaussians[order[: len(order) * 2 // 3]])
 
 
-@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+@sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
 def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, true: tuple[str, str]) -> None:
     rewrite_poses(tiny_folder, tiny, true)
     loaded = load_scene(tiny_folder)
@@ -47,7 +48,7 @@ def test_the_reading_that_fits_is_taken_and_said(tiny_folder: Path, tiny: Tiny, 
     )
 
 
-@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+@sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
 def test_without_pixels_the_photos_tell(tmp_path: Path, true: tuple[str, str]) -> None:
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     rewrite_poses(folder, SMOOTH, true)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from exports import Smooth, da3_rows, export_rows, save_export, smooth_scene, turned
 from messages import noted
+from sweeps import sweep
 from tiny_scene import Tiny, make_tiny, rotation
 
 from gsmerge.alignment.incomplete import read_unordered
@@ -214,9 +215,9 @@ def test_rows_in_no_order_stay_unaligned(tmp_path: Path, smooth: Smooth) -> None
     assert not load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene.aligned
 
 
-@pytest.mark.parametrize("size", [(96, 72), (64, 48)])
+@sweep("size", [(96, 72), (64, 48)])
 @pytest.mark.parametrize("dropped", [0.1, 0.3, 0.4, "faint", "far"])
-@pytest.mark.parametrize("nested", [0.4, 1.0, 1.3])
+@sweep("nested", [0.4, 1.0, 1.3])
 def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, size: tuple[int, int]) -> None:
     """At random, or by a rule; in the frame of the cameras, or in another scale, which can put rows near to others."""
     tiny = smooth_scene(*size)

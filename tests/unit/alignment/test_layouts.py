@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, turned
 from messages import names, noted, refuses
+from sweeps import sweep
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
 
 from gsmerge.alignment.layouts import grids_of_count, patch_grids
@@ -96,8 +97,8 @@ def test_cameras_of_uncropped_pictures(tmp_path: Path) -> None:
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
-@pytest.mark.parametrize("shape", [pytest.param("larger", marks=pytest.mark.slow), "cropped"])
-@pytest.mark.parametrize("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+@sweep("shape", [pytest.param("larger", marks=pytest.mark.slow), "cropped"])
+@sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
 def test_photos_of_another_size_and_poses_read_in_another_way(
     tmp_path: Path, true: tuple[str, str], shape: str
 ) -> None:
@@ -137,7 +138,7 @@ def trimmed(tiny: Smooth, trim: int) -> np.ndarray:
     return index[:, trim : tiny.height - trim, trim : tiny.width - trim].reshape(-1)
 
 
-@pytest.mark.parametrize("trim", [2, 4, 7, 11])
+@sweep("trim", [2, 4, 7, 11])
 def test_borders_of_any_width(tmp_path: Path, trim: int) -> None:
     """A resize with another scale and a shift would fit as well, to a fraction of a pixel."""
     tiny = smooth_scene(96, 72)

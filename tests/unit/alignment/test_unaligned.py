@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene, turned
 from messages import noted, refuses
+from sweeps import sweep
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.alignment import readings, unaligned
@@ -54,7 +55,7 @@ def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
     assert np.allclose(viewmats[:, :3, 3], SMOOTH.w2c[:, :3, 3], atol=1e-6)
 
 
-@pytest.mark.parametrize("scale", [0.2, 1.0, 3.0])
+@sweep("scale", [0.2, 1.0, 3.0])
 def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -> None:
     first = SMOOTH.w2c[0]
     rows = turned(voxels(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])

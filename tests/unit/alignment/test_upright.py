@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, turned
 from messages import noted, refuses
+from sweeps import sweep
 
 from gsmerge.alignment.score import UPRIGHT
 from gsmerge.errors import SceneError
@@ -74,7 +75,7 @@ def check_centres(loaded: Loaded, centres: np.ndarray, scale: float) -> None:
     assert any("rotated upright" in note for note in loaded.notes)
 
 
-@pytest.mark.parametrize("first", [0, 2])
+@sweep("first", [0, 2])
 def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured: Smooth, first: int) -> None:
     kept = far_cut(textured)
     rows, scale, centres = upright(textured, export_rows(textured, kept), first)
@@ -109,7 +110,7 @@ def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -
     check_centres(loaded, centres, scale)
 
 
-@pytest.mark.parametrize("photos", ["none", "of another scene"])
+@sweep("photos", ["none", "of another scene"])
 def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
     strange = np.random.default_rng(5).integers(0, 256, textured.images.shape, np.uint8)

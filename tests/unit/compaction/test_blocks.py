@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge import CompactOptions, compact
 from gsmerge.compaction.blocks import join_views
@@ -59,7 +60,7 @@ def test_blocks_are_as_good_as_one_piece() -> None:
     assert parts.report.num_output == len(parts.gaussians)
 
 
-@pytest.mark.parametrize(("reach", "looks"), [(0.15, 4), (1.0, 2)])
+@sweep(("reach", "looks"), [(0.15, 4), (1.0, 2)])
 def test_rooms_that_all_views_see_take_more_steps_at_seams(reach: float, looks: int) -> None:
     """Where most Gaussians are seen from several blocks, each was fitted by a part of the photos alone."""
     seams = compact(along(np.linspace(0, reach, 60)), blocks=2, **SETTINGS).report.choices["seams"]

@@ -9,7 +9,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
@@ -52,7 +51,7 @@ def test_arrays_give_what_compact_gives(scene: Scene) -> None:
     assert len(small.gaussians) == small.report.num_output < 0.2 * len(scene.gaussians)
 
 
-def test_tensors_give_tensors(scene: Scene) -> None:
+def test_tensors_give_tensors(scene: Scene, torch: Any) -> None:
     """With further axes in front, gradients, 3 x 4 poses and another type."""
     given: dict[str, Any] = {name: torch.tensor(value) for name, value in tensors_of(scene).items()}
     given["means"] = given["means"].reshape(*SHAPE, 3).requires_grad_()
@@ -65,7 +64,7 @@ def test_tensors_give_tensors(scene: Scene) -> None:
     assert same(small, compact(scene, **FAST).gaussians)
 
 
-def test_bfloat16_is_read(scene: Scene) -> None:
+def test_bfloat16_is_read(scene: Scene, torch: Any) -> None:
     opacities = torch.tensor(scene.gaussians.opacities).bfloat16()
     small = compact_tensors(**tensors_of(scene, opacities=opacities), **FAST)
     assert small.gaussians.opacities.dtype == np.float32
@@ -188,7 +187,7 @@ def test_centres_at_corners_get_a_note(scene: Scene) -> None:
     assert not any("0.5" in note for note in compact_tensors(**tensors_of(scene), **FAST).report.notes)
 
 
-def test_levels_are_tensors_as_well(scene: Scene) -> None:
+def test_levels_are_tensors_as_well(scene: Scene, torch: Any) -> None:
     given = {name: torch.tensor(value) for name, value in tensors_of(scene).items()}
     small = compact_tensors(**given, **FAST, levels=2)
     assert [isinstance(one.gaussians.means, torch.Tensor) for one in small.coarser] == [True]

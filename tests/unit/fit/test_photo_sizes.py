@@ -18,7 +18,7 @@ from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
 from gsmerge.fit.schedule import affordable_steps, plan_run
 from gsmerge.geometry import project
-from gsmerge.raster.photos import EPS2D, score_photos
+from gsmerge.raster.photos import EPS2D, MASKED, score_photos
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import LargePhotos
@@ -118,6 +118,15 @@ def test_photos_are_read_once_at_their_scale(scene: Scene) -> None:
     small = cv2.resize(large.large_photos.read(1), (photos.width, photos.height), interpolation=cv2.INTER_AREA)
     assert photos.image(1).dtype == np.float32
     np.testing.assert_allclose(photos.image(1), small / 255, atol=1e-6)
+
+
+def test_masks_weigh_larger_photos(scene: Scene) -> None:
+    masks = np.ones(scene.valid.shape, bool)
+    half = masks.shape[2] // 2
+    masks[:, :, half:] = False
+    weights = large_photos(replace(with_large(scene, 2), masks=masks), 2).weights
+    assert (weights[:, :, : 2 * half] == 1).all()
+    assert (weights[:, :, 2 * half :] == MASKED).all()
 
 
 def test_a_point_has_the_same_place_in_every_size(scene: Scene) -> None:

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 import scenes
-import torch
 from messages import names, refuse_all, refuses
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
@@ -410,7 +409,7 @@ def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:
     assert [done for _, done, _ in outside] == list(range(outside[0][2]))
 
 
-def test_tensors_give_the_same(scene: Scene, half: Gaussians) -> None:
+def test_tensors_give_the_same(scene: Scene, half: Gaussians, torch: Any) -> None:
     views = held_out()
     tensors = Views(views.cameras.to("cpu"), torch.from_numpy(views.images), views.names)
     actual, expected = (

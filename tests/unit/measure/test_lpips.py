@@ -9,16 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 from numpy.typing import NDArray
-from torch.nn.functional import max_pool2d, pad, relu, unfold
 
 from gsmerge.errors import GsmergeError, SceneError
 from gsmerge.io.bounds import read_budget
 from gsmerge.io.pickles import read_pickle
 from gsmerge.measure import lpips as perceptual
 from gsmerge.measure.lpips import lpips, lpips_available
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
+max_pool2d = torch.nn.functional.max_pool2d
+pad = torch.nn.functional.pad
+relu = torch.nn.functional.relu
+unfold = torch.nn.functional.unfold
 
 Array = NDArray[Any]
 NETS = ("vgg", "alex")

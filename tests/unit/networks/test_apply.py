@@ -5,8 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
-from network_fixtures import SMALL, Made, made, noisy
+from network_fixtures import SMALL, Made, made, noisy, untrained
 
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians
@@ -21,7 +20,7 @@ from gsmerge.networks.apply import (
 )
 from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import NetworkOptions
-from gsmerge.research.training.modules import Networks
+from gsmerge.networks.weights import NetworkWeights
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match
@@ -52,7 +51,7 @@ def pairs(features: FeatureGaussians) -> Matches:
 
 
 def test_untrained_networks_change_no_bit(scene: Made) -> None:
-    context = scene.networks(Networks(SMALL))
+    context = scene.networks(untrained(SMALL))
     encoded = encode_features(scene.features, context)
     assert encoded.latents.shape == (len(scene.features), SMALL.latent)
     bare = replace(encoded, latents=np.zeros((len(encoded), 0), np.float32))
@@ -225,7 +224,10 @@ def test_scale_of_the_world_drops_out(scene: Made, factor: float) -> None:
 
 
 def test_gradients_reach_every_parameter(scene: Made) -> None:
-    networks = noisy().requires_grad_(True)
+    torch = pytest.importorskip("torch")
+    from training_runs import modules_of
+
+    networks = modules_of(noisy())
     context = NetworkContext(networks, scene.members, scene.scene.cameras)
     features = encode_features(scene.features, context)
     group_features = context.describe(features)
@@ -251,16 +253,16 @@ def test_sizes_are_checked() -> None:
     for wrong in ({"width": 50}, {"heads": 0}, {"members": 10**9}, {"latent": 1.5}, {"blocks": True}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             NetworkOptions(**wrong)
-    assert 150_000 <= Networks().weights().num_parameters <= 300_000
+    assert 150_000 <= untrained().num_parameters <= 300_000
 
 
 def test_absolute_heads_know_no_children(scene: Made) -> None:
     """Whatever the children are, what is decoded is the same; untrained, a round Gaussian in the group's place."""
     absolute = replace(SMALL, outputs="absolute")
-    plain, untrained = DecodeOptions(k=2, min_opacity=0.0), scene.networks(Networks(absolute).requires_grad_(False))
-    encoded = encode_features(scene.features, untrained)
+    plain, start = DecodeOptions(k=2, min_opacity=0.0), scene.networks(untrained(absolute))
+    encoded = encode_features(scene.features, start)
     analytic = decode(encoded, scene.members, plain)
-    actual = decode(encoded, scene.members, plain, networks=untrained)
+    actual = decode(encoded, scene.members, plain, networks=start)
     parents = np.linalg.norm(actual.means[:, None] - encoded.means, axis=2).argmin(1)
     np.testing.assert_allclose(actual.means, feature_to_gaussians(encoded).means[parents], rtol=1.3e-6, atol=1e-5)
     assert (actual.scales == actual.scales[:, :1]).all()
@@ -301,13 +303,12 @@ def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["encoder", "merger", "refiner"])
 def test_a_network_that_is_left_out_has_no_weights_and_corrects_nothing(scene: Made, name: str) -> None:
     """As the whole with this network silent: its stage is the analytic one."""
-    whole, without = noisy(), noisy(replace(SMALL, **{name: False}))
-    assert getattr(without, name) is None
-    assert without.weights().num_parameters < whole.weights().num_parameters
-    without.load_state_dict({key: value for key, value in whole.state_dict().items() if not key.startswith(name)})
-    silent = [whole.encoder.latent, whole.encoder.shift] if name == "encoder" else [getattr(whole, name).out]
-    for parameter in (p for layer in silent for p in layer.parameters()):
-        torch.nn.init.zeros_(parameter)
+    whole, options = noisy(), replace(SMALL, **{name: False})
+    left = {key: array for key, array in whole.arrays.items() if not key.startswith(name)}
+    assert left.keys() == noisy(options).arrays.keys() < whole.arrays.keys()
+    last = tuple(f"{name}.{layer}." for layer in ("latent", "shift", "out"))
+    silent = {key: array * (not key.startswith(last)) for key, array in whole.arrays.items()}
+    whole, without = replace(whole, arrays=silent), NetworkWeights(options, left)
     results = []
     for networks in (whole, without):
         context = scene.networks(networks)

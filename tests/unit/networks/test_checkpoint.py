@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hostile.gsm_files import (
     UNREADABLE,
     Spoil,
@@ -26,9 +27,17 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import SHIPPED, find_checkpoint, load_checkpoint
 
 NAME = "encoder.latent.weight"
+
+
+def write_archive(path: Path) -> None:
+    """As torch saves its files."""
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("archive/data.pkl", pickle.dumps({"a": 1}))
+
+
 DAMAGED: dict[str, Spoil] = {
     **UNREADABLE,
-    "a torch file": lambda path: torch.save({"a": torch.ones(2)}, path),
+    "a torch file": write_archive,
     "another program's": with_text("{}", "networks"),
     "another schema": with_header(schema=1),
     "no version": with_header(gsmerge=None),
@@ -55,7 +64,7 @@ def metadata(path: Path) -> dict[str, str]:
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    networks = noisy().weights()
+    networks = noisy()
     checkpoint = load_checkpoint(written(tmp_path / "a.safetensors", noisy()))
     assert checkpoint.networks.options == SMALL
     assert checkpoint.version == gsmerge.__version__

@@ -2,16 +2,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scenes import make_features
 
 from gsmerge import geometry
 from gsmerge.geometry import covariances, quat_to_rotmat
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.networks import tensors
 from gsmerge.networks.corrections import (
     COLOR,
     LOGIT,
@@ -102,8 +101,10 @@ def test_gaussians_move_as_told() -> None:
     np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6)
 
 
-def test_tensors_move_in_the_same_way() -> None:
+def test_tensors_move_in_the_same_way(torch: Any) -> None:
     """Training's Gaussians, through which gradients flow, are those of use."""
+    from gsmerge.networks import tensors
+
     base, own = base_of(some()), np.random.default_rng(2).integers(0, 20, 20)
     actual = move(base, noise(), own, frames())
     expected = tensors.move_tensors(base.to("cpu"), torch.from_numpy(noise()), torch.from_numpy(frames()[own])).numpy()
@@ -122,8 +123,10 @@ def test_opacities_at_the_ends_stay_within_them(opacity: float) -> None:
         assert ((moved >= 0) & (moved <= 1)).all()
 
 
-def test_rotations_agree_with_each_other() -> None:
+def test_rotations_agree_with_each_other(torch: Any) -> None:
     """A quaternion and a covariance turn alike, also by more than a whole turn."""
+    from gsmerge.networks import tensors
+
     features, residuals = some(), zeros()
     residuals[:, ROTATION] = 3 * np.random.default_rng(3).normal(size=(20, 3))
     base = base_of(features)

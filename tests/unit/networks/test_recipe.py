@@ -8,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-import torch
 from messages import refuses
+from network_fixtures import noisy, untrained, written
 
 from gsmerge import Scene
 from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
-from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.online.extend import extend
 from gsmerge.online.options import OnlineOptions
-from gsmerge.research.training.modules import Networks
 from gsmerge.settings.compact import CompactOptions
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
@@ -32,13 +30,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Networks that moved away from their start at random."""
-    torch.manual_seed(0)
-    networks = Networks(SMALL)
-    for parameter in networks.parameters():
-        parameter.data += 0.05 * torch.randn_like(parameter)
-    path = tmp_path_factory.mktemp("networks") / "absolute.safetensors"
-    save_checkpoint(path, networks.weights(), {})
-    return path
+    return written(tmp_path_factory.mktemp("networks") / "absolute.safetensors", noisy(SMALL, 0.05))
 
 
 def test_recipe_is_its_settings(scene: Scene, absolute: Path) -> None:
@@ -78,7 +70,7 @@ def test_it_needs_networks(checkpoint: str) -> None:
 
 def test_other_networks_are_refused(scene: Scene, tmp_path: Path) -> None:
     path = tmp_path / "residual.safetensors"
-    save_checkpoint(path, Networks(replace(SMALL, outputs="residual")).weights(), {})
+    written(path, untrained(replace(SMALL, outputs="residual")))
     for checkpoint in (str(path), "shipped"):
         with refuses(UsageError, "recipe paper", "absolute", "residual"):
             scenes.compacted(scene, recipe="paper", checkpoint=checkpoint)

@@ -215,7 +215,7 @@ def context_of(some: Made, networks: Any, step: int = 1) -> StateContext:
     cameras, num_pixels = some.scene.cameras, some.scene.pixels_per_view
     shape = cameras.height // step, cameras.width // step
     return StateContext(
-        networks=networks.weights(),
+        networks=networks,
         members=some.members,
         cameras=cameras,
         samples=sample_views(some.members, cameras, shape),

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from messages import refuse_all, refuses
 from skimage.metrics import structural_similarity
 
@@ -31,7 +31,7 @@ def test_psnr_counts_only_the_mask() -> None:
     assert psnr(image, np.zeros((2, 2, 3)), mask[..., None]) == pytest.approx(20)
 
 
-def test_tensors_and_arrays_give_the_same() -> None:
+def test_tensors_and_arrays_give_the_same(torch: Any) -> None:
     tensors = torch.from_numpy(PHOTO), torch.from_numpy(NOISY)
     assert psnr(*tensors) == psnr(PHOTO, NOISY)
     assert ssim(*tensors) == ssim(PHOTO, NOISY)

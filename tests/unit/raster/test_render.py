@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from messages import refuse_all
 
 from gsmerge import Cameras, Gaussians
@@ -136,7 +136,7 @@ def test_nothing_is_copied_that_need_not_be() -> None:
 
 @pytest.mark.parametrize("with_depths", [False, True])
 @pytest.mark.parametrize("count", [0, 2])
-def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int) -> None:
+def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int, torch: Any) -> None:
     """Of equal values, also where only the Gaussians or only the cameras are tensors."""
     gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0), (0.01, 0, 1.2, 0.03, 0.5, 0.2)), camera(count=2)[:count]
     options = {"antialiased": True, "near": 0.1, "far": 5.0, "with_depths": with_depths}

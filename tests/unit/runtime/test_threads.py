@@ -6,10 +6,10 @@ import threading
 import time
 import weakref
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import pytest
-import torch
 from messages import refuses
 
 from gsmerge.runtime.threads import in_turn, parallel_map, use_threads
@@ -17,9 +17,15 @@ from gsmerge.runtime.threads import in_turn, parallel_map, use_threads
 
 @pytest.fixture(autouse=True)
 def library_threads() -> Iterator[None]:
-    before = torch.get_num_threads(), cv2.getNumThreads()
+    before = library_thread_counts()
     yield
-    assert (torch.get_num_threads(), cv2.getNumThreads()) == before
+    assert library_thread_counts() == before
+
+
+def library_thread_counts() -> list[int]:
+    """Of OpenCV, and of torch where it is installed."""
+    torch = sys.modules.get("torch")
+    return [cv2.getNumThreads(), *([torch.get_num_threads()] if torch else [])]
 
 
 @pytest.mark.parametrize("count", [1, 2, 8])
@@ -41,12 +47,13 @@ def test_one_thread_is_the_callers() -> None:
         assert parallel_map(lambda _: threading.get_ident(), range(3)) == [threading.get_ident()] * 3
 
 
-def test_other_libraries_are_held_to_one_thread() -> None:
+def test_other_libraries_are_held_to_one_thread(torch: Any) -> None:
     with use_threads(2):
         assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
 
 
 def test_torch_that_is_imported_later_is_held_too() -> None:
+    pytest.importorskip("torch")
     code = """
 from gsmerge.runtime.threads import parallel_map, use_threads
 import sys

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, with_intrinsics
 from messages import noted, refuses
+from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
@@ -49,8 +50,8 @@ ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("size", [(96, 64), (64, 64), (64, 96)])
+@sweep("order", ORDERS, often=4)
+@sweep("size", [(96, 64), (64, 64), (64, 96)], often=4)
 def test_the_views_of_a_grid(tmp_path: Path, order: str, size: tuple[int, int]) -> None:
     width, height = size
     tiny = made(np.array([[110.0, 0, width / 2], [0, 110, height / 2], [0, 0, 1]]), *size)
@@ -69,7 +70,7 @@ def test_the_views_of_a_grid(tmp_path: Path, order: str, size: tuple[int, int]) 
     assert noted(loaded.notes, "no", "cameras", "grid")
 
 
-@pytest.mark.parametrize("axes", [(0, 1, 2, 3), (1, 2, 3, 0), (2, 3, 0, 1)])
+@sweep("axes", [(0, 1, 2, 3), (1, 2, 3, 0), (2, 3, 0, 1)])
 def test_layers_share_a_camera(tmp_path: Path, axes: tuple[int, ...]) -> None:
     tiny = with_layers(made())
     ids = np.arange(len(tiny.gaussians)).reshape(2, 3, HEIGHT, WIDTH)
@@ -143,8 +144,8 @@ def write_photos(folder: Path, tiny: Smooth, larger: int, margin: int, names: st
         cv2.imwrite(str(folder / names.format(i)), whole[..., ::-1])
 
 
-@pytest.mark.parametrize("trim", [0, 8])
-@pytest.mark.parametrize("margin", [0, 10])
+@sweep("trim", [0, 8])
+@sweep("margin", [0, 10])
 def test_photos_of_another_size(tmp_path: Path, trim: int, margin: int) -> None:
     tiny = made()
     ids = np.arange(3 * WIDTH * HEIGHT).reshape(3, HEIGHT, WIDTH)[:, trim : HEIGHT - trim, trim : WIDTH - trim]

@@ -23,6 +23,7 @@ from exports import (
 from PIL import Image
 from plyfile import PlyData
 from sharp_files import write_elements
+from sweeps import sweep
 from tiny_scene import rotation, write_colmap_text, write_inria, write_npz
 
 from gsmerge.io import read_ply
@@ -342,7 +343,7 @@ def test_inria_s_test_cameras_come_first(tmp_path: Path) -> None:
     assert "inria" in [d.name for d in loaded.exporters]
 
 
-@pytest.mark.parametrize("ids", [(0, 1, 2), ("image_0000", "image_0001", "image_0002"), ("0", "1", "2")])
+@sweep("ids", [(0, 1, 2), ("image_0000", "image_0001", "image_0002"), ("0", "1", "2")])
 def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -> None:
     named = replace(SMOOTH, names=tuple(f"image_{i:04d}.png" for i in range(3)))
     some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
@@ -361,7 +362,7 @@ def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -
     assert (scene.cameras.width, scene.cameras.height) == (48, 36)
 
 
-@pytest.mark.parametrize("factor", [0, 1, 2, 3])
+@sweep("factor", [0, 1, 2, 3])
 def test_photos_of_another_size_than_world_mirror_s(tmp_path: Path, factor: int) -> None:
     """Its intrinsics are of the processed size, its principal point in the middle of that; 0: no photos."""
     named = replace(SMOOTH, names=tuple(f"image_{i:04d}.png" for i in range(3)))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from exports import export_rows, home, save_export, smooth_scene, turned
 from messages import noted, refuses
+from sweeps import sweep
 from tiny_scene import frames_of, save_json, write_images, write_npz
 
 from gsmerge.batch.find import find_scenes, main_file
@@ -51,7 +52,7 @@ def test_depthsplat_s_folders(tmp_path: Path) -> None:
         find_scene_files(tmp_path)
 
 
-@pytest.mark.parametrize(
+@sweep(
     ("ply", "beside"),
     [
         ("gaussians.ply", ("images/0.png", "cameras_path.json")),  # AnySplat's demo
@@ -65,6 +66,7 @@ def test_depthsplat_s_folders(tmp_path: Path) -> None:
         ("room/20261120_101500/gaussians.ply", ()),  # WorldMirror 2, from the folder of all its results
         ("exports/splat/splat.ply", ("config.yml",)),  # nerfstudio
     ],
+    often=4,
 )
 def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]) -> None:
     """Files of other kinds and point clouds are beside it, and hidden folders."""

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from messages import refuses
+from sweeps import sweep
 from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
@@ -86,7 +87,7 @@ def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> 
     assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0]), between(tiny), atol=1e-9)
 
 
-@pytest.mark.parametrize("all_views", [False, True])
+@sweep("all_views", [False, True])
 def test_poses_in_the_convention_that_the_scene_s_own_are_in(all_views: bool, tiny: Tiny, tmp_path: Path) -> None:
     folder = tiny.save(tmp_path / "scene")
     flip_poses(folder / "transforms.json")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from model_files import MODELS
 from model_rows import check_cameras, check_pixels
+from sweeps import sweep
 
 from gsmerge.scene.exporters import EXPORTERS
 from gsmerge.scene.read import load_scene
@@ -49,7 +50,7 @@ UNALIGNED = {
 }
 
 
-@pytest.mark.parametrize("name", PER_PIXEL)
+@sweep("name", PER_PIXEL, often=6)
 def test_every_row_is_at_its_pixel(tmp_path: Path, name: str) -> None:
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path, **export.options)
@@ -65,7 +66,7 @@ def test_rotations_in_the_cameras_frames(tmp_path: Path, name: str) -> None:
     check_pixels(load_scene(export.path, **export.options, quats="camera").pixel_scene(), export)
 
 
-@pytest.mark.parametrize("name", UNALIGNED)
+@sweep("name", UNALIGNED, often=2)
 def test_rows_of_no_pixels_have_the_cameras_and_photos_of_their_views(tmp_path: Path, name: str) -> None:
     export = MODELS[name](tmp_path / "out")
     loaded = load_scene(export.path, **export.options)

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scenes import make_features
 
 from gsmerge.moments import feature_to_gaussians
@@ -56,7 +56,7 @@ def test_gains_weigh_and_carry_over() -> None:
     assert float(merged.extinctions[0] * merged.gains[0]) == pytest.approx(float(gained), rel=1e-5)
 
 
-def test_latents_are_averaged_and_gradients_pass() -> None:
+def test_latents_are_averaged_and_gradients_pass(torch: Any) -> None:
     """With the weights of the means; those that are alone keep theirs. Arrays and tensors alike."""
     features = make_features(np.zeros((3, 3)), opacities=[0.6, 0.5, 0.2])
     latents = torch.tensor([[1.0, 2.0], [7.0, 8.0], [5.0, 0.0]], requires_grad=True)

@@ -1,8 +1,9 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
-import torch
 from messages import refuses
 
 from gsmerge.kernels.superpixels.seeds import seed_density, seeds_from_density
@@ -41,7 +42,7 @@ def test_bytes_and_floats_are_the_same_picture() -> None:
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
-def test_tensors_give_tensors(segmentation: str) -> None:
+def test_tensors_give_tensors(segmentation: str, torch: Any) -> None:
     """With the labels and the saliency of arrays; one that collects gradients, too."""
     image = random_image(20, 30)
     bytes_, followed = torch.from_numpy((image * 255).astype(np.uint8)), torch.from_numpy(image).requires_grad_()

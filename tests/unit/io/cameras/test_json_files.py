@@ -107,6 +107,8 @@ def test_a_bare_list_is_opencv_and_may_lack_intrinsics(tmp_path: Path, tiny: Tin
         ({"fl_x": -3}, "images/a b/2.png", -3), ({"fl_x": "wide"}, "", "'wide'"),
         ({"w": 1e999}, "images/a b/2.png", "infinity"), ({"h": -14}, "", "20 x -14"),
         ({"cx": float("nan")}, "images/a b/2.png", "NaN"), ({"frames": []}, "", "camera"),
+        ({"cx": 1e9}, "images/a b/2.png", "principal point"), ({"fl_x": 1e300}, "images/a b/2.png", "1e+300"),
+        ({"k1": float("nan"), "camera_model": "OPENCV"}, "images/a b/2.png", "k1"),
         ({"frames": {"a": 1}}, "", "'frames'"),
         ({"frames": [{"file_path": "a.png"}]}, "a.png", "'transform_matrix'"),
         ({"frames": [{"transform_matrix": [[1, 0], [0, 1]]}]}, "view 0", (2, 2)),

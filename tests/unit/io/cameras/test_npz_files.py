@@ -56,7 +56,10 @@ def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     data = bytearray((tmp_path / "e.npz").read_bytes())
     data[200:240] = bytes(40)  # in the first array: its checksum no longer fits
     (tmp_path / "e.npz").write_bytes(data)
+    write_npz(tmp_path / "f.npz", tiny, extrinsics=np.full((3, 4, 4), "a"))
+    write_npz(tmp_path / "g.npz", tiny, extrinsics=np.full((3, 4, 4), np.nan))
     for name, *found in (
+        ("f.npz", "numbers", "extrinsics", "<U1"), ("g.npz", "finite", "extrinsics"),
         ("a.npz", "missing", "extrinsics, intrinsics", ["image"]), ("b.npz", "[c,3,4]", (3, 3, 4)),
         ("c.npz", "[3,h,w,3]", [2, 14, 20, 3]), ("d.npz", "something"), ("e.npz", "damaged", "extrinsics.npy"),
     ):  # fmt: skip

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 from exports import export_rows, save_export, smooth_scene, turned
 from messages import refuses
 from tiny_scene import Tiny
@@ -21,6 +20,8 @@ from gsmerge.io import read_cameras
 from gsmerge.io.photo_files import resize_and_crop
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
+
+torch = pytest.importorskip("torch", reason="torch is not installed")
 
 SMOOTH = smooth_scene(48, 36)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -116,6 +117,30 @@ def other_intrinsics(path: Path) -> None:
         document["intrinsics"][0]["camera_id"] = "elsewhere"
 
 
+def deep_matrix(path: Path) -> None:
+    with edited_json(path) as document:
+        document["extrinsics"][0]["matrix"] = [[[1, 2]] * 4] * 4
+
+
+def set_key(key: str, value: object) -> Callable[[Path], object]:
+    return lambda path: save_json(path, json.loads(path.read_text()) | {key: value})
+
+
+def beside(name: str, text: str) -> Callable[[Path], object]:
+    return lambda path: path.with_name(name).write_text(text)
+
+
+BESIDE_LONG_LRM = [
+    ("input_frame_idx.txt", "0 7", "0 to 2", 7),
+    ("input_frame_idx.txt", "nan", "NaN"),
+    ("input_frame_idx.txt", "0 " * 10_001, 10000, "more"),
+    ("pos_avg_inv.txt", "0 " * 16, "inverted"),
+    ("pos_avg_inv.txt", "1 " * 15, 16, 15),
+    ("scene_scale.txt", "0", "positive"),
+    ("scene_scale.txt", "inf", "NaN"),
+]
+
+
 def replace_text(old: str, new: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(path.read_text().replace(old, new, 1))
 
@@ -131,11 +156,11 @@ def replace_text(old: str, new: str) -> Callable[[Path], object]:
             ("camera_poses.txt: line 4", "12 or 16", 3),
         ),
         (write_long_lrm, replace_text('"fx"', '"f"'), ("scene.json: view view_000", "'fx'")),
-        (
-            write_long_lrm,
-            lambda path: path.with_name("input_frame_idx.txt").write_text("0 7"),
-            ("input_frame_idx.txt", "0 to 2", 7),
-        ),
+        (write_world_mirror, set_key("extrinsics", None), ("camera_params.json", "'extrinsics'", "list")),
+        (write_world_mirror, deep_matrix, ("camera_params.json: extrinsics of view_000", "4x4")),
+        *((write_long_lrm, beside(name, text), (name, *found)) for name, text, *found in BESIDE_LONG_LRM),
+        (write_trajectory, beside("intrinsic.txt", ""), ("intrinsic.txt", "3 views", 0)),
+        (write_trajectory, beside("intrinsic.txt", "a b c d"), ("intrinsic.txt: line 1", "'a'")),
     ],
 )
 def test_what_is_wrong_is_named(

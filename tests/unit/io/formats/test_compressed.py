@@ -118,6 +118,12 @@ def test_damage_is_refused(tmp_path: Path, made: dict[str, np.ndarray]) -> None:
     PlyData([PlyElement.describe(chunk[:1], "chunk"), PlyElement.describe(vertex, "vertex")]).write(str(path))
     with refuses(SceneError, "a.ply", "2 chunks", 300, 1):
         read_ply(path)
+    sh = np.zeros(len(vertex) - 1, [(f"f_rest_{i}", "u1") for i in range(9)])
+    PlyData(
+        [PlyElement.describe(part, name) for part, name in ((chunk, "chunk"), (vertex, "vertex"), (sh, "sh"))]
+    ).write(str(path))
+    with refuses(SceneError, "a.ply", 300, "'sh'"):
+        read_ply(path)
     few = chunk[["min_x", "max_x"]].astype([("min_x", "f4"), ("max_x", "f4")])
     PlyData([PlyElement.describe(few, "chunk"), PlyElement.describe(vertex, "vertex")]).write(str(path))
     with refuses(SceneError, "a.ply", "min_y", "'chunk'", "f4"):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize
@@ -48,7 +49,7 @@ def some(count: int) -> Gaussians:
     return Gaussians(means, quats, scales, np.full(count, 0.5, np.float32), shN[:, :1], shN)
 
 
-@pytest.mark.parametrize("ending", FILES)
+@sweep("ending", FILES, often=2)
 def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
     small, path = tmp_path / f"small{ending}", tmp_path / f"large{ending}"
     write_gaussians(small, some(300))

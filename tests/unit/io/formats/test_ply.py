@@ -97,6 +97,24 @@ def resident(path: str) -> int:
     return total
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("vertex 5", "vertex 0", ("one Gaussian", 0)),
+        ("element vertex", "element points", ("'vertex'", "'points'")),
+        ("vertex 5", "vertex -5", (-5,)),
+        ("property float rot_3", "property list uchar float rot_3", ("list",)),
+        ("end_header\n", "", ("end of file",)),
+        ("ply\n", "plywood\n", ("'ply'",)),
+    ],
+)
+def test_headers_that_are_refused(tmp_path: Path, old: str, new: str, found: tuple[object, ...]) -> None:
+    path = save(tmp_path / "a.ply", columns(5), text=True)
+    path.write_bytes(path.read_bytes().replace(old.encode(), new.encode(), 1))
+    with refuses(SceneError, path, *found):
+        read_ply(path)
+
+
 def test_what_a_header_promises(tmp_path: Path) -> None:
     assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
     assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)

@@ -7,10 +7,9 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-import torch
-from network_fixtures import SMALL, Made, made, noisy
+from network_fixtures import SMALL, Made, made
 from scenes import arc, make_scene, room
-from training_runs import PAPER, TINY
+from training_runs import PAPER, TINY, noisy_networks, torch
 
 from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import apply, tokens
@@ -60,7 +59,7 @@ def contexts(scene: Made, networks: Networks) -> tuple[NetworkContext, TrainingC
 
 @pytest.mark.parametrize("start", ["pooled", "first"])
 def test_every_stage_has_the_values_of_its_kernels(scene: Made, start: str) -> None:
-    networks = noisy(replace(SMALL, merger_start=start))
+    networks = noisy_networks(replace(SMALL, merger_start=start))
     plain, training = contexts(scene, networks)
     _, order, cuts = cluster_runs(pairs(scene.features))
     expected = encode_features(scene.features, plain)
@@ -153,7 +152,7 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 def test_gradients_are_central_differences(example: Example, outputs: str, start: str, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
     options = replace(TINY, outputs=outputs, merger_start=start)
-    networks = noisy(options, scale=0.15).requires_grad_(True)
+    networks = noisy_networks(options, scale=0.15).requires_grad_(True)
     crop = whole_photo(example, 0, k).crop
     rows = {"encoder.shift": {"shift": slice(0, 3)}, "encoder.latent": {"latent": slice(0, TINY.latent)}}
     rows |= {"merger.out": OF_FEATURES, "refiner.out": OF_FEATURES, f"heads.{k}.out": COLUMNS}

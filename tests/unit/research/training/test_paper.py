@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from network_fixtures import noisy
 from scenes import arc, make_scene, room
-from training_runs import PAPER, TINY, written
+from training_runs import PAPER, TINY, noisy_networks, torch, written
 
 from gsmerge.geometry import rotmat_to_quat
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -97,12 +95,12 @@ def test_the_preset_s_examples_have_clusters(example: Example) -> None:
     assert float(sizes[sizes > 1].sum()) > 0.1 * len(example.features)
     strict = np.bincount(match_crop(crop, example.features, replace(paper, iou=0.7)).clusters)
     assert int(strict[strict > 1].sum()) < 0.5 * int(sizes[sizes > 1].sum())
-    shares = [predict(window.crop, noisy(TINY), PAPER, 0).matched for window in windows(example, 12)]
+    shares = [predict(window.crop, noisy_networks(TINY), PAPER, 0).matched for window in windows(example, 12)]
     assert max(shares) > 0.1
 
 
 def test_every_network_gets_a_gradient(example: Example) -> None:
-    networks = noisy(replace(TINY, outputs="absolute")).requires_grad_(True)
+    networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()
     for window in windows(example, 12):
         loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0)).total

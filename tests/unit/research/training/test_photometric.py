@@ -7,11 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
-from network_fixtures import noisy
 from scenes import arc, make_scene, room
 from scipy.ndimage import uniform_filter
-from training_runs import OPTIONS, TINY, written
+from training_runs import OPTIONS, TINY, noisy_networks, torch, written
 
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.lpips import lpips, lpips_available
@@ -219,7 +217,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
     """
     weights = {"regression_weight": 0.3, "teacher_weight": 0.1, "diversity_weight": 0.2}
     options = replace(PHOTO, photo_loss="mse", diversity_unit="scene", **weights)  # whose weights have a gradient, too
-    networks = noisy(TINY).requires_grad_(True)
+    networks = noisy_networks(TINY).requires_grad_(True)
     scales = target_scales([example.targets])
     generator = torch.Generator().manual_seed(1)
     for window in windows(example, 4):
@@ -256,7 +254,7 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
 @pytest.mark.parametrize("outputs", ["residual", "absolute"])
 @pytest.mark.parametrize("k", [1, 2])
 def test_what_is_rendered_is_what_the_stages_make(example: Example, outputs: str, k: int) -> None:
-    networks = noisy(replace(TINY, outputs=outputs))
+    networks = noisy_networks(replace(TINY, outputs=outputs))
     learned = NetworkContext(networks, example.members, example.cameras, 0)
     merged = merge(encode_features(example.features, learned), example.matches, learned)
     options = DecodeOptions(k=k, min_opacity=0)

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from messages import refuses
-from network_fixtures import noisy
 from scenes import arc, make_scene, room
-from training_runs import OPTIONS, TINY, written
+from training_runs import OPTIONS, TINY, noisy_networks, torch, written
 
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -113,7 +111,7 @@ def test_crops_hold_whole_clusters_and_their_targets(example: Example) -> None:
 
 
 def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
-    networks = noisy(TINY)
+    networks = noisy_networks(TINY)
     small = sample_crop(example, (1,), 90, 0.1, np.random.default_rng(3))
     with torch.no_grad():
         whole = predict(everything(example, 1), networks, OPTIONS, 0)

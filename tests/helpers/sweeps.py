@@ -1,0 +1,18 @@
+"""Tests over many cases: a few in every run, all others in the sweeps (``-m slow``)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import pytest
+
+
+def sweep(names: str | Sequence[str], values: Iterable[Any], *, often: int = 1, **options: Any) -> pytest.MarkDecorator:
+    """``pytest.mark.parametrize``, of whose values the first few are in the default run."""
+    one_name = isinstance(names, str) and "," not in names
+    cases = [
+        value if i < often else pytest.param(*([value] if one_name else value), marks=pytest.mark.slow)
+        for i, value in enumerate(values)
+    ]
+    return pytest.mark.parametrize(names, cases, **options)
