@@ -24,17 +24,19 @@ class Result:
     """A result that a record says is done."""
 
     key: str  # of the scene's files, the settings and the version; "" where making it again failed
-    files: tuple[tuple[str, str], ...]  # name in the output folder and SHA-256 of each
+    files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each
     end: int  # byte after its record
     worse: str | None = None  # that it shows its photos worse than its input
 
     def holds(self, folder: Path, key: str) -> bool:
         """Return whether the key is the same and every file is unchanged."""
-        paths = [folder / name for name, _ in self.files]
+        if self.key != key or not self.files:
+            return False
         try:
-            if self.key != key or not paths or not all(path.is_file() for path in paths):  # a pipe would never end
+            paths = [folder / file["path"] for file in self.files]
+            if not all(path.is_file() for path in paths):  # a pipe would never end
                 return False
-            return all(file_sha256(path) == sha256 for path, (_, sha256) in zip(paths, self.files, strict=True))
+            return [file_sha256(path) for path in paths] == [file["sha256"] for file in self.files]
         except (OSError, ValueError):  # the latter of a name that no file has
             return False
 
@@ -67,13 +69,13 @@ class RecordIndex:
     def paths(self) -> Iterator[str]:
         """Yield the real paths of all files of results."""
         for result in self.results.values():
-            for name, _ in result.files:
+            for file in result.files:
                 with suppress(ValueError):  # a name that no file has
-                    yield os.path.realpath(self.folder / name)
+                    yield os.path.realpath(self.folder / file["path"])
 
 
 def _read_result(line: Mapping[str, Any], end: int) -> Result:
-    files = tuple((_text(file["path"]), _text(file["sha256"])) for file in line["files"])
+    files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     worse = line["report"].get("worse")
     return Result(_text(line["key"]), files, end, None if worse is None else _text(worse))
 

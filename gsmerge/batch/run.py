@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.batch.jobs import BatchOptions, Job
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, Result, check_folder, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, check_folder, record
 from gsmerge.batch.schedule import make_schedule
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
@@ -99,11 +99,11 @@ def _make(job: Job, run: Run, lock: ResultLock) -> dict[str, Any]:
     key, known = job.call.key(files), read_index(run.folder, run.start).read_on().results.get(job.output)
     is_new = known is not None and known.end > run.start  # by another run, or process of this one
     if known is not None and (is_new or not run.overwrite) and known.holds(run.folder, key):
-        return _skipped(job, run, known)
+        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, worse=known.worse)
     if known is not None and is_new and known.key not in (key, ""):
         problem = "another run with other settings has made it meanwhile; wait for that run, or name another --output"
         raise UsageError(f"{run.folder / job.output}: {problem}")
-    names = () if known is None else [name for name, _ in known.files]
+    names = () if known is None else [file["path"] for file in known.files]
     foreign = [name for name in job.outputs if os.path.lexists(run.folder / name) and name not in names]
     if foreign and not lock.is_left and not run.overwrite:
         problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
@@ -115,19 +115,11 @@ def _make(job: Job, run: Run, lock: ResultLock) -> dict[str, Any]:
         warnings.simplefilter("default")
         document, written = job.call.run(files, out, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
-    hashes = [(os.path.relpath(path, run.folder), file_sha256(path)) for path in written]
-    facts = {"key": key, "files": _describe(run.folder, hashes), "report": finite(document)}
-    return record(DONE, job.scene, job.output, **facts)
-
-
-def _skipped(job: Job, run: Run, known: Result) -> dict[str, Any]:
-    files = _describe(run.folder, known.files)
-    return record(SKIPPED, job.scene, job.output, key=known.key, files=files, worse=known.worse)
-
-
-def _describe(folder: Path, hashes: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Return name, hash and size of files, as records have them."""
-    return [{"path": name, "sha256": sha256, "bytes": (folder / name).stat().st_size} for name, sha256 in hashes]
+    made = [
+        {"path": os.path.relpath(path, run.folder), "sha256": file_sha256(path), "bytes": path.stat().st_size}
+        for path in written
+    ]
+    return record(DONE, job.scene, job.output, key=key, files=made, report=finite(document))
 
 
 @lru_cache(maxsize=1)

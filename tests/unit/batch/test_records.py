@@ -16,6 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.jsonl import append_line
 
 SHA = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # of abc
+FILES = [{"path": "a.ply", "sha256": SHA, "bytes": 3}]
 
 
 def done(output: str, key: str = "k") -> dict[str, Any]:
@@ -27,7 +28,7 @@ def test_results_are_known_by_what_they_were_made_of_and_what_they_are(tmp_path:
     append_line(tmp_path / RECORDS, done("a.ply"))
     index = RecordIndex(tmp_path).read_on()
     known = index.results["a.ply"]
-    assert known == Result("k", (("a.ply", SHA),), (tmp_path / RECORDS).stat().st_size)
+    assert known == Result("k", FILES, (tmp_path / RECORDS).stat().st_size)
     assert not known.holds(tmp_path, "k")  # there is no file
     (tmp_path / "a.ply").write_bytes(b"abc")
     assert known.holds(tmp_path, "k")
@@ -100,7 +101,7 @@ def test_a_line_of_odd_types_counts_as_damaged(tmp_path: Path, line: bytes) -> N
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.ply")
-    assert not Result("k", (("a.ply", SHA),), 0).holds(tmp_path, "k")
+    assert not Result("k", FILES, 0).holds(tmp_path, "k")
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
