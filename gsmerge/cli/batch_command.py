@@ -50,7 +50,7 @@ def parse_jobs(text: str) -> int:
                    "it.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
-    "hint k superpixels budget quality effort fit device set",
+    "hint k superpixels budget quality effort fit set",
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
