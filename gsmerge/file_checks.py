@@ -9,8 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsmerge.encoded.encoded import Encoded
-from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
 from gsmerge.io.bounds import check_file
@@ -24,11 +22,13 @@ from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import FileInfo, degree_notes, read_level
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.no_gaussians import check_scene_file
 from gsmerge.scene.read import load_files
+from gsmerge.states.encoded import Encoded
+from gsmerge.states.file import load_stored
+from gsmerge.states.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")

@@ -30,8 +30,8 @@ def decode(args: opt.Args) -> None:
     out = args.output or default_output(args.encoded)
     check_outputs((out,), (args.encoded,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
-    from gsmerge.online.decode_stored import decode_file, decoding_line
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.states.decode_stored import decode_file, decoding_line
 
     wanted, writing = args.make(FitOptions, FileOptions, viewer_cameras=False)  # a .gsm has no names of views
     check_format(out, writing)

@@ -28,7 +28,7 @@ def encode(args: opt.Args) -> None:
 
         print_plan(args, files, settings, out, hints)
         return
-    from gsmerge.encoded.to_encoded import encode_files, encoding_line
+    from gsmerge.states.to_encoded import encode_files, encoding_line
 
     before = {"import": perf_counter() - start}
     with stage_progress(quiet=args.silent) as progress:

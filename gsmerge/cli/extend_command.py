@@ -27,9 +27,9 @@ def extend(args: opt.Args) -> None:
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
-    from gsmerge.online.file import batch_line, extend_file
-    from gsmerge.online.options import OnlineOptions
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.states.file import batch_line, extend_file
+    from gsmerge.states.options import OnlineOptions
 
     settings = args.values(CompactOptions, OnlineOptions)
     batches = [args.files(scene) for scene in args.scenes]

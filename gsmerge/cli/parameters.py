@@ -25,13 +25,13 @@ import typer
 
 from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
-from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
 from gsmerge.settings.stages import CROP_FILES, Engine
+from gsmerge.states.options import OnlineOptions
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles

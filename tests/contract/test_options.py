@@ -13,9 +13,9 @@ import typer.main
 from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
-from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.research.training import preset_options
+from gsmerge.states.options import OnlineOptions
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 

@@ -121,9 +121,9 @@ def test_failures_while_writing_leave_nothing(
     if command == "decode":
         given = scene_copy / "kept.gsm"
         assert run("encode", scene_copy, "-o", given, *quick).code == 0
-    for place in ("gsmerge.compaction.files", "gsmerge.online.decode_stored"):
+    for place in ("gsmerge.compaction.files", "gsmerge.states.decode_stored"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
-    monkeypatch.setattr("gsmerge.encoded.to_encoded.save_encoded", half)
+    monkeypatch.setattr("gsmerge.states.to_encoded.save_encoded", half)
     before = listing(scene_copy)
     more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
     outcome = run(command, given, "--quiet", *more, code=3)

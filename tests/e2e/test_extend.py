@@ -22,8 +22,8 @@ from hostile.gsm_files import Spoil, cut, with_header
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
-from gsmerge.online.file import load_state
 from gsmerge.scene.files import find_scene_files
+from gsmerge.states.file import load_state
 
 from .conftest import Outcome, Run, assert_refused, listing
 
@@ -270,7 +270,7 @@ def test_a_broken_first_batch_makes_no_file(scene_copy: Path, tmp_path: Path, ru
 def test_a_state_that_another_process_changes_meanwhile(
     state: Path, states: list[Path], walks: list[Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsmerge.online.file as files
+    import gsmerge.states.file as files
 
     extended = files.extend
 
@@ -289,7 +289,7 @@ def test_a_state_that_another_process_changes_meanwhile(
 def test_a_state_that_another_process_makes_meanwhile(
     states: list[Path], walks: list[Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsmerge.online.file as files
+    import gsmerge.states.file as files
 
     extended, state = files.extend, tmp_path / "state.gsm"
 
@@ -309,7 +309,7 @@ def test_two_that_end_together_lose_no_batch(
 ) -> None:
     """Both have read the state before either goes on; whoever may rename waits until the other may as well, or not."""
     import gsmerge.io.atomic as atomic
-    import gsmerge.online.file as files
+    import gsmerge.states.file as files
 
     path = state if exists else tmp_path / "new.gsm"
     before = len(load_state(path).about["batches"]) if exists else 0
@@ -376,7 +376,7 @@ def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path]
     assert state.read_bytes() == states[0].read_bytes()
     code = (
         "import os, signal, sys\n"
-        "import gsmerge.online.file as files\n"
+        "import gsmerge.states.file as files\n"
         "from gsmerge.cli import main\n"
         "saved = files.save_state\n"
         "def save(path, state, **named):\n"

@@ -41,10 +41,10 @@ from gsmerge.io.photo_files import decode_alpha, decode_mask
 from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.online.compactor import Compactor
-from gsmerge.online.file import load_stored
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.states.compactor import Compactor
+from gsmerge.states.file import load_stored
 from gsmerge.types import Cameras
 
 PHOTO_ENDINGS = (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")

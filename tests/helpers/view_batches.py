@@ -10,8 +10,8 @@ import numpy as np
 import scenes
 
 from gsmerge import Compactor, Scene
-from gsmerge.online.state import GroupSet, OnlineState
 from gsmerge.stages.merge import take
+from gsmerge.states.state import GroupSet, OnlineState
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 FAST: dict[str, Any] = {"superpixels": "10%", "checkpoint": "none"}

@@ -9,9 +9,9 @@ from messages import refuse_all, refuses
 
 from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
-from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.states.options import OnlineOptions
 
 KNOWN = flat_settings(CompactOptions)
 

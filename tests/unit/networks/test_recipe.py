@@ -12,14 +12,14 @@ import torch
 from messages import refuses
 
 from gsmerge import Scene
-from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.options import NetworkOptions
-from gsmerge.online.extend import extend
-from gsmerge.online.options import OnlineOptions
 from gsmerge.research.training.modules import Networks
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.extend import extend
+from gsmerge.states.options import OnlineOptions
+from gsmerge.states.to_encoded import encode_scene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
 

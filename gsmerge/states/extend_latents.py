@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.encoded.encoded import without_members
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
@@ -19,8 +18,19 @@ from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with
 from gsmerge.networks.checkpoint import IN_PACKAGE, Checkpoint, load_checkpoint
 from gsmerge.networks.tokens import GroupFeatures, choose_views
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.online.batch import REACH, Batch, BatchFeatures, StateKind
-from gsmerge.online.state import (
+from gsmerge.plan import Plan
+from gsmerge.runtime.record import note
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.assign import assign
+from gsmerge.stages.decode import divide
+from gsmerge.stages.encode import correct, encode
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import merge, refine, take
+from gsmerge.stages.segment import segment_scene
+from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.states.encoded import without_members
+from gsmerge.states.state import (
     GroupSet,
     Learned,
     OnlineState,
@@ -32,16 +42,6 @@ from gsmerge.online.state import (
     sample_views,
     select_groups,
 )
-from gsmerge.plan import Plan
-from gsmerge.runtime.record import note
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.stages import MatchOptions
-from gsmerge.stages.assign import assign
-from gsmerge.stages.decode import divide
-from gsmerge.stages.encode import correct, encode
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, refine, take
-from gsmerge.stages.segment import segment_scene
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border

@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from os import PathLike
 from typing import Any
 
-from gsmerge.online.decode_stored import decode_stored
-from gsmerge.online.extend import BatchReport, extend
-from gsmerge.online.file import load_state, save_state
-from gsmerge.online.options import merge_settings
-from gsmerge.online.state import OnlineState
 from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.decode_stored import decode_stored
+from gsmerge.states.extend import BatchReport, extend
+from gsmerge.states.file import load_state, save_state
+from gsmerge.states.options import merge_settings
+from gsmerge.states.state import OnlineState
 from gsmerge.types import Gaussians, Scene
 
 
@@ -22,7 +22,7 @@ class Compactor:
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.online.options.OnlineOptions`: ``Compactor(superpixels="3%", max_k=2)``.
+            :class:`gsmerge.states.options.OnlineOptions`: ``Compactor(superpixels="3%", max_k=2)``.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -63,18 +63,18 @@ class Compactor:
 
     @property
     def batches(self) -> Sequence[Mapping[str, Any]]:
-        """Report of every batch so far; see :class:`gsmerge.online.extend.BatchReport`."""
+        """Report of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
     def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
-        """Add a batch of views, see :func:`gsmerge.online.extend.extend`."""
+        """Add a batch of views, see :func:`gsmerge.states.extend.extend`."""
         self._state, report = extend(self._state, scene, self._options, self._online, progress=progress)
         return report
 
     def decode(
         self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
-        """Decode the current state into Gaussians; see :func:`gsmerge.online.decode_stored.decode_stored`.
+        """Decode the current state into Gaussians; see :func:`gsmerge.states.decode_stored.decode_stored`.
 
         Args:
             k: Gaussians of each group; None: that of the settings.
@@ -94,7 +94,7 @@ class Compactor:
         ).gaussians
 
     def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the state to a file; see :func:`gsmerge.online.file.save_state`.
+        """Write the state to a file; see :func:`gsmerge.states.file.save_state`.
 
         Raises:
             ValueError: If there was no batch yet.

@@ -11,9 +11,6 @@ from typing import Any
 from gsmerge import __version__
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.search import choose_count
-from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredSettings, without_members
-from gsmerge.encoded.gsm_file import save_encoded
-from gsmerge.encoded.to_gaussians import divide_all
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.io import atomic_output
@@ -31,6 +28,9 @@ from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.segment import knee_count
+from gsmerge.states.encoded import Encoded, StoredHeads, StoredSettings, without_members
+from gsmerge.states.gsm_file import save_encoded
+from gsmerge.states.to_gaussians import divide_all
 from gsmerge.types import Scene
 
 DEFAULT_MAX_K = 4  # children that are stored of a group, unless a number of Gaussians is asked for

@@ -20,7 +20,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge import __version__
-from gsmerge.encoded.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
 from gsmerge.errors import SceneError
 from gsmerge.facts.prepare import Frame
 from gsmerge.io.atomic import atomic_output
@@ -28,6 +27,7 @@ from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.states.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 if TYPE_CHECKING:

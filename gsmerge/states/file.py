@@ -14,14 +14,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.compaction.files import read_input
-from gsmerge.encoded.encoded import Encoded, without_members
-from gsmerge.encoded.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output, lock_folder
 from gsmerge.networks.options import CORRECTED
-from gsmerge.online.extend import extend
-from gsmerge.online.options import merge_settings
-from gsmerge.online.state import (
+from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
+from gsmerge.runtime.memory import peak_memory
+from gsmerge.runtime.record import Progress
+from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.files import SceneFiles
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.states.encoded import Encoded, without_members
+from gsmerge.states.extend import extend
+from gsmerge.states.gsm_file import ENCODED, MINOR, STATE, GsmFile, read_encoded, read_gsm, write_gsm
+from gsmerge.states.options import merge_settings
+from gsmerge.states.state import (
     GroupSet,
     Learned,
     OnlineState,
@@ -31,12 +37,6 @@ from gsmerge.online.state import (
     from_encoded,
     with_child_rows,
 )
-from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
-from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import Progress
-from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.files import SceneFiles
-from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, FeatureGaussians
 
 if TYPE_CHECKING:

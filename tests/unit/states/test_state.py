@@ -16,8 +16,10 @@ from gsmerge import Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
-from gsmerge.online.options import merge_settings
-from gsmerge.online.state import (
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.stages.decode import decode
+from gsmerge.states.options import merge_settings
+from gsmerge.states.state import (
     GroupSet,
     bake,
     child_members,
@@ -28,8 +30,6 @@ from gsmerge.online.state import (
     to_encoded,
     with_fitted_colors,
 )
-from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import decode
 from gsmerge.types import SH_C0, FeatureGaussians
 
 ALL = DecodeOptions(min_opacity=0.0)

@@ -15,8 +15,8 @@ from unaligned_scenes import far_behind, shuffled, voxels
 
 import gsmerge
 from gsmerge import Encoded, Gaussians, Scene, compact, decode_scene, encode_scene
-from gsmerge.encoded.to_gaussians import plan_decode
 from gsmerge.errors import UsageError
+from gsmerge.states.to_gaussians import plan_decode
 
 SHARE = "10%"
 

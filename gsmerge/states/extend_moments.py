@@ -8,8 +8,13 @@ import numpy as np
 
 from gsmerge.fit import visible_mask
 from gsmerge.moments import feature_to_gaussians
-from gsmerge.online.batch import REACH, Batch, BatchFeatures, StateKind
-from gsmerge.online.state import (
+from gsmerge.pipeline import merge_views
+from gsmerge.runtime.record import stage
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import merge, take
+from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.states.state import (
     GroupSet,
     OnlineState,
     bake,
@@ -19,11 +24,6 @@ from gsmerge.online.state import (
     select_groups,
     with_fitted_colors,
 )
-from gsmerge.pipeline import merge_views
-from gsmerge.runtime.record import stage
-from gsmerge.settings.stages import MatchOptions
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 

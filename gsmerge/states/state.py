@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge import __version__
-from gsmerge.encoded.encoded import Encoded, StoredHeads, StoredScene, without_members
-from gsmerge.encoded.to_gaussians import children_of, divide_all, divide_by_heads
 from gsmerge.facts.views import resize_cameras
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
+from gsmerge.states.encoded import Encoded, StoredHeads, StoredScene, without_members
+from gsmerge.states.to_gaussians import children_of, divide_all, divide_by_heads
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 if TYPE_CHECKING:

@@ -27,15 +27,15 @@ from gsmerge import Compactor, Scene, compact, encode_scene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.networks.apply import encode_features, refine_features
 from gsmerge.networks.tokens import compute_group_features
-from gsmerge.online import extend_latents
-from gsmerge.online.extend import extend
-from gsmerge.online.extend_latents import StateContext
-from gsmerge.online.file import load_state, save_state
-from gsmerge.online.state import OnlineState, sample_views, select_groups, to_encoded
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
+from gsmerge.states import extend_latents
+from gsmerge.states.extend import extend
+from gsmerge.states.extend_latents import StateContext
+from gsmerge.states.file import load_state, save_state
+from gsmerge.states.state import OnlineState, sample_views, select_groups, to_encoded
 from gsmerge.types import grid_ids
 
 OUTPUTS = ("absolute", "residual")

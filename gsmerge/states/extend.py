@@ -8,23 +8,9 @@ from typing import Any
 
 from gsmerge import __version__
 from gsmerge.compaction.search import choose_count
-from gsmerge.encoded.encoded import StoredSettings
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.views import concat_cameras, in_float64
-from gsmerge.online.batch import (
-    Batch,
-    StateKind,
-    fit_batch_colors,
-    make_batch,
-    novel_rows,
-    rows_in_view,
-    update_replay,
-)
-from gsmerge.online.extend_latents import LATENTS, keeps_latents, own_checkpoint
-from gsmerge.online.extend_moments import MOMENTS
-from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import GroupSet, OnlineState, no_photos, select_groups
 from gsmerge.plan import make_plan, require_children
 from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
@@ -33,6 +19,20 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import USUAL_K
 from gsmerge.stages.decode import keep_all
 from gsmerge.stages.merge import take
+from gsmerge.states.batch import (
+    Batch,
+    StateKind,
+    fit_batch_colors,
+    make_batch,
+    novel_rows,
+    rows_in_view,
+    update_replay,
+)
+from gsmerge.states.encoded import StoredSettings
+from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
+from gsmerge.states.extend_moments import MOMENTS
+from gsmerge.states.options import OnlineOptions
+from gsmerge.states.state import GroupSet, OnlineState, no_photos, select_groups
 from gsmerge.types import Gaussians, Scene
 
 

@@ -16,10 +16,10 @@ from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_st
 from gsmerge import Compactor, Gaussians, Scene, decode_scene, encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.fit import FitOptions, FitReport
-from gsmerge.online.decode_stored import decode_stored
-from gsmerge.online.extend import extend
-from gsmerge.online.state import OnlineState, from_encoded
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.decode_stored import decode_stored
+from gsmerge.states.extend import extend
+from gsmerge.states.state import OnlineState, from_encoded
 from gsmerge.types import grid_ids
 
 Change = Callable[[Scene], Scene]
@@ -233,7 +233,7 @@ def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
     assert len(state) == len(first) + report.num_new - report.num_hidden
     before = replace(state, groups=first.groups)
     select_groups = np.arange(len(first))
-    from gsmerge.online.state import select_groups as picked
+    from gsmerge.states.state import select_groups as picked
 
     same_groups(picked(state.groups, select_groups), picked(before.groups, select_groups))
 
@@ -305,7 +305,7 @@ def test_a_full_fit_shows_more(scene: Scene, pairs: list[Scene]) -> None:
 
 
 def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsmerge.online import decode_stored as decode_module
+    from gsmerge.states import decode_stored as decode_module
 
     def refused(gaussians: Gaussians, *_: object, **__: object) -> tuple[Gaussians, FitReport]:
         return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")

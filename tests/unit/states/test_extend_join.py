@@ -9,9 +9,9 @@ import pytest
 import scenes
 from view_batches import fed, group, parts_of, room, same_group, state_of
 
-from gsmerge.online.extend_moments import find_partners, merge_into
-from gsmerge.online.state import GroupSet, limit_children, select_groups
 from gsmerge.settings.stages import MatchOptions
+from gsmerge.states.extend_moments import find_partners, merge_into
+from gsmerge.states.state import GroupSet, limit_children, select_groups
 
 
 @pytest.fixture(scope="module")

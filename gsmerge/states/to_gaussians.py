@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.budget import exact_count
-from gsmerge.encoded.encoded import Division, Encoded
 from gsmerge.errors import UsageError
 from gsmerge.fit import visible_mask
 from gsmerge.kernels.gaussians.bisect import gather_groups
@@ -17,6 +16,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.stages.decode import deal_order, deal_visible, halve, pool_children
+from gsmerge.states.encoded import Division, Encoded
 from gsmerge.types import FeatureGaussians, Gaussians
 
 

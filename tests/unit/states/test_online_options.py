@@ -6,8 +6,8 @@ import pytest
 from messages import refuses
 
 from gsmerge import Compactor
-from gsmerge.online.compactor import merge_settings
-from gsmerge.online.options import OnlineOptions
+from gsmerge.states.compactor import merge_settings
+from gsmerge.states.options import OnlineOptions
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,6 @@ import numpy as np
 
 from gsmerge.budget import FileSize, file_size
 from gsmerge.compaction.file_size import drop_to_bytes
-from gsmerge.encoded.encoded import Encoded
-from gsmerge.encoded.to_gaussians import decode_scene, plan_decode
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import Frame
 from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_share
@@ -21,15 +19,17 @@ from gsmerge.fit.gpu import choose_backend
 from gsmerge.io import atomic_output, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
 from gsmerge.io.formats.table import PLY, count_for_bytes
-from gsmerge.online.batch import BatchPhotos
-from gsmerge.online.file import load_stored
-from gsmerge.online.state import OnlineState, to_encoded
 from gsmerge.plan import resolve_fit
 from gsmerge.report import document_head, human_bytes, seconds_document, seconds_line
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.batch import BatchPhotos
+from gsmerge.states.encoded import Encoded
+from gsmerge.states.file import load_stored
+from gsmerge.states.state import OnlineState, to_encoded
+from gsmerge.states.to_gaussians import decode_scene, plan_decode
 from gsmerge.types import Gaussians
 
 
@@ -43,7 +43,7 @@ class DecodeResult:
 
 
 def decodable(stored: Encoded | OnlineState, *, fitted_colors: bool = True) -> Encoded:
-    """Return an encoded scene unchanged, and a state converted to one; see :func:`gsmerge.online.state.to_encoded`."""
+    """Return an encoded scene unchanged, and a state converted to one; see :func:`gsmerge.states.state.to_encoded`."""
     return stored if isinstance(stored, Encoded) else to_encoded(stored, fitted_colors=fitted_colors)
 
 

@@ -31,10 +31,10 @@ from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
-from gsmerge.encoded.gsm_file import STATE
 from gsmerge.errors import SceneError
-from gsmerge.online.file import load_state, load_stored, save_state
-from gsmerge.online.state import OnlineState
+from gsmerge.states.file import load_state, load_stored, save_state
+from gsmerge.states.gsm_file import STATE
+from gsmerge.states.state import OnlineState
 
 
 @pytest.fixture(scope="module")

@@ -26,8 +26,8 @@ from network_fixtures import noisy, written
 from safetensors.numpy import load_file, save_file
 
 from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
-from gsmerge.encoded.gsm_file import ENCODED
 from gsmerge.errors import SceneError
+from gsmerge.states.gsm_file import ENCODED
 
 
 @pytest.fixture(scope="module")

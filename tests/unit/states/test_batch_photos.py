@@ -16,7 +16,10 @@ from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
 from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.online.batch import (
+from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster.photos import Photos, photos_of, scene_photos
+from gsmerge.raster.weights import apply
+from gsmerge.states.batch import (
     MARGIN,
     REACH,
     BatchPhotos,
@@ -28,10 +31,7 @@ from gsmerge.online.batch import (
     update_replay,
     view_ids,
 )
-from gsmerge.online.state import GroupSet, Replay, moments_of
-from gsmerge.raster import contributions, plan_view, prepare
-from gsmerge.raster.photos import Photos, photos_of, scene_photos
-from gsmerge.raster.weights import apply
+from gsmerge.states.state import GroupSet, Replay, moments_of
 from gsmerge.types import SH_C0, FeatureGaussians
 
 

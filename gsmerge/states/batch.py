@@ -16,13 +16,13 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
 from gsmerge.moments import Members, feature_to_gaussians
-from gsmerge.online.options import OnlineOptions
-from gsmerge.online.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_pictures
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
+from gsmerge.states.options import OnlineOptions
+from gsmerge.states.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
 
 if TYPE_CHECKING:
