@@ -135,7 +135,7 @@ def _settings_page() -> str:
     from gsmerge.settings.placement import PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
-    from gsmerge.states.options import OnlineOptions
+    from gsmerge.states.options import ExtendOptions
 
     whole = settings_of(CompactOptions)
     stages = {name: list(flat_settings(one.kind).values()) for name, one in whole.items() if one.is_group}
@@ -148,7 +148,7 @@ def _settings_page() -> str:
         "The whole run": [one for name, one in whole.items() if name not in stages],
         "Files": flat_settings(FileOptions).values(),
         "The frame of what is written": flat_settings(PlacementOptions).values(),
-        "`gsmerge extend`": flat_settings(OnlineOptions).values(),
+        "`gsmerge extend`": flat_settings(ExtendOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
     lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]

@@ -40,11 +40,6 @@ if TYPE_CHECKING:
     from gsmerge.stages.superpixels import saliency as saliency
     from gsmerge.stages.superpixels import superpixels as superpixels
     from gsmerge.states.compactor import Compactor as Compactor
-    from gsmerge.states.encoded import Encoded as Encoded
-    from gsmerge.states.gsm_file import load_encoded as load_encoded
-    from gsmerge.states.gsm_file import save_encoded as save_encoded
-    from gsmerge.states.to_encoded import encode_scene as encode_scene
-    from gsmerge.states.to_gaussians import decode_scene as decode_scene
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
@@ -56,10 +51,6 @@ _PUBLIC = {
     "compaction.compact": ("compact",),
     "compaction.result": ("CompactReport", "CompactResult"),
     "compaction.tensors": ("compact_tensors",),
-    "states.encoded": ("Encoded",),
-    "states.gsm_file": ("load_encoded", "save_encoded"),
-    "states.to_encoded": ("encode_scene",),
-    "states.to_gaussians": ("decode_scene",),
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),

@@ -21,9 +21,10 @@ from gsmerge.raster.photos import Photos, photo_errors, photos_of, scene_picture
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
-from gsmerge.states.options import OnlineOptions
-from gsmerge.states.state import GroupSet, OnlineState, Replay, StateNetworks, replace_groups, select_groups
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene
+from gsmerge.states.groups import replace_groups, select_groups
+from gsmerge.states.options import ExtendOptions
+from gsmerge.states.state import DividedGroups, GroupSet, Replay, State, StateNetworks
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, Segmentation
 
 if TYPE_CHECKING:
     from gsmerge.networks.apply import NetworkContext
@@ -62,8 +63,7 @@ class Batch:
 
     prepared: Prepared
     plan: Plan
-    online: OnlineOptions
-    max_k: int  # Most Gaussians of a group of the state
+    online: ExtendOptions
     photos: BatchPhotos  # At the size of the state's views; the colours of the Gaussians where there are no photos
     view_ids: np.ndarray  # [v] int64, which of all views each is
     is_new: np.ndarray  # [v] bool, which views the state does not have yet
@@ -78,14 +78,19 @@ class Batch:
         """Number of input Gaussians for the share of views that are new: a state counts the input of a view once."""
         return round(self.prepared.input_scene.num_gaussians * float(self.is_new.mean()))
 
+    @property
+    def min_contribution(self) -> float:
+        """Least blending weight of a group: as asked for, in drafts, too."""
+        return float(self.plan.settings["min_contribution"])
 
-def make_batch(state: OnlineState | None, prepared: Prepared, plan: Plan, online: OnlineOptions, max_k: int) -> Batch:
+
+def make_batch(state: State | None, prepared: Prepared, plan: Plan, online: ExtendOptions) -> Batch:
     """Make a batch: resize its photos to those of the state, and find out which views are new."""
     cameras = prepared.scene.cameras
     before = cameras[:0] if state is None else state.cameras
     photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
     ids = view_ids(before, photos.cameras)
-    return Batch(prepared, plan, online, max_k, photos, ids, ids >= len(before))
+    return Batch(prepared, plan, online, photos, ids, ids >= len(before))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +99,7 @@ class BatchFeatures:
 
     features: FeatureGaussians
     members: Members  # The batch's Gaussians, which `features.members` are rows of
+    segmentation: Segmentation  # The superpixels, and the number of Gaussians to make
     context: NetworkContext | None  # Networks that correct; None without
     networks: StateNetworks | None = None  # What the state keeps of them: None where groups are decoded as they enter
 
@@ -103,11 +109,12 @@ class StateKind:
     """The functions and constants that differ between states of moments and of latents."""
 
     reach: float  # Standard deviations of a group, to where a view touches it
-    encode: Callable[[OnlineState | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians
+    encode: Callable[[State | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians
     decode: Callable[[GroupSet, BatchFeatures], tuple[Gaussians, Gaussians]]  # One of each group, and of each feature
-    first: Callable[[BatchFeatures, Batch], GroupSet]  # Make the groups of a first batch
-    # Merge a batch with the groups at some rows, those in reach; return all groups, and counts by key of the report
-    join: Callable[[GroupSet, np.ndarray, BatchFeatures, Batch], tuple[GroupSet, dict[str, int]]]
+    divide: Callable[[BatchFeatures, Batch, int], DividedGroups]  # Make the groups of a first batch, up to `max_k` each
+    # Merge a batch with the groups at some rows, those in reach, up to `max_k` each; return all groups, and counts by
+    # key of the report
+    join: Callable[[GroupSet, np.ndarray, BatchFeatures, Batch, int], tuple[GroupSet, dict[str, int]]]
 
 
 def view_ids(known_cameras: Cameras, cameras: Cameras) -> np.ndarray:

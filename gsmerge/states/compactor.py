@@ -9,11 +9,11 @@ from typing import Any
 from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.states.decode_stored import decode_stored
+from gsmerge.states.decode import decode_state
 from gsmerge.states.extend import BatchReport, extend
-from gsmerge.states.file import load_state, save_state
 from gsmerge.states.options import merge_settings
-from gsmerge.states.state import OnlineState
+from gsmerge.states.state import State
+from gsmerge.states.state_file import load_state, save_state
 from gsmerge.types import Gaussians, Scene
 
 
@@ -22,7 +22,7 @@ class Compactor:
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.states.options.OnlineOptions`: ``Compactor(superpixels="3%", max_k=2)``.
+            :class:`gsmerge.states.options.ExtendOptions`: ``Compactor(superpixels="3%", max_k=2)``.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
@@ -36,7 +36,7 @@ class Compactor:
 
     def __init__(self, **settings: Any) -> None:
         self._options, self._online = merge_settings(settings)
-        self._state: OnlineState | None = None
+        self._state: State | None = None
 
     @classmethod
     def load(cls, path: str | PathLike[str], **settings: Any) -> Compactor:
@@ -52,12 +52,16 @@ class Compactor:
         compactor._options, compactor._online = merge_settings(settings, state.about["options"])
         return compactor
 
+    def __repr__(self) -> str:
+        num_views = 0 if self._state is None else len(self._state.cameras)
+        return f"Compactor({len(self):,} Feature Gaussians of {num_views:,} views)"
+
     def __len__(self) -> int:
         """Return the number of groups so far."""
         return 0 if self._state is None else len(self._state)
 
     @property
-    def state(self) -> OnlineState | None:
+    def state(self) -> State | None:
         """State after all batches so far; None before the first."""
         return self._state
 
@@ -74,7 +78,7 @@ class Compactor:
     def decode(
         self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
     ) -> Gaussians:
-        """Decode the current state into Gaussians; see :func:`gsmerge.states.decode_stored.decode_stored`.
+        """Decode the current state into Gaussians; see :func:`gsmerge.states.decode.decode_state`.
 
         Args:
             k: Gaussians of each group; None: that of the settings.
@@ -89,12 +93,12 @@ class Compactor:
             raise ValueError("expected at least one batch of views before decoding, got none")
         options = resolve_fit(CompactOptions().with_settings(fit)) if fit else None
         seed, threads = self._options.seed, self._options.threads
-        return decode_stored(
+        return decode_state(
             self._state, k=k, budget=budget, options=options, seed=seed, threads=threads, progress=progress
         ).gaussians
 
     def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the state to a file; see :func:`gsmerge.states.file.save_state`.
+        """Write the state to a file; see :func:`gsmerge.states.state_file.save_state`.
 
         Raises:
             ValueError: If there was no batch yet.

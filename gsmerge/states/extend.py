@@ -16,11 +16,13 @@ from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.stages import USUAL_K
-from gsmerge.stages.decode import keep_all
-from gsmerge.stages.merge import take
+from gsmerge.settings.stages import MAX_CHILDREN, USUAL_K
+from gsmerge.stages.decode import keep_all, merged_count
+from gsmerge.stages.merge import MergedViews, take
+from gsmerge.stages.segment import knee_count
 from gsmerge.states.batch import (
     Batch,
+    BatchFeatures,
     StateKind,
     fit_batch_colors,
     make_batch,
@@ -28,12 +30,14 @@ from gsmerge.states.batch import (
     rows_in_view,
     update_replay,
 )
-from gsmerge.states.encoded import StoredSettings
 from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
 from gsmerge.states.extend_moments import MOMENTS
-from gsmerge.states.options import OnlineOptions
-from gsmerge.states.state import GroupSet, OnlineState, no_photos, select_groups
+from gsmerge.states.groups import select_groups, share, share_groups
+from gsmerge.states.options import ExtendOptions
+from gsmerge.states.state import Colors, DividedGroups, GroupSet, State, StoredSettings, no_photos
 from gsmerge.types import Gaussians, Scene
+
+USUAL_MAX_K = 4  # children that are stored of a group, unless more are asked for, or a number of Gaussians is
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,13 @@ class BatchReport:
 
 
 def extend(
-    state: OnlineState | None,
+    state: State | None,
     scene: Scene,
     options: CompactOptions | None = None,
-    online: OnlineOptions | None = None,
+    online: ExtendOptions | None = None,
     *,
     progress: Progress | None = None,
-) -> tuple[OnlineState, BatchReport]:
+) -> tuple[State, BatchReport]:
     """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
 
     ``state``: what earlier batches left, which is not changed; None: this is the first batch. ``scene``: the new views,
@@ -68,29 +72,38 @@ def extend(
     and how. Raises ValueError if a setting is out of range or not possible for a state, or the SH degree differs from
     the state's.
     """
-    options, online = options or CompactOptions().with_settings({"fit": "none"}), online or OnlineOptions()
-    if options.decode.k == AUTO:
-        options = replace(options, decode=replace(options.decode, k=USUAL_K))  # whatever the first batch is like
+    options, online = options or CompactOptions().with_settings({"fit": "none"}), online or ExtendOptions()
+    if state is not None and options.decode.k == AUTO:
+        options = replace(options, decode=replace(options.decode, k=USUAL_K))  # whatever the batch is like
     max_k = online.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:
         fixed = replace(options.prepare, poses="fixed", exposure="fixed")  # as all other batches
         prepared = prepare(scene.numpy(), fixed, None if state is None else state.frame)
         plan = make_plan(prepared, options, None if state is None else own_checkpoint(state, options))
-        plan = plan.with_fit(replace(plan.fit, min_contribution=options.fit.min_contribution))  # in drafts, too
-        require_children("max_k", max_k, plan.checkpoint)
+        require_children("max_k", max_k or 1, plan.checkpoint)
         count = choose_count(prepared, plan)
         if keep_all(prepared.scene, count) is not None:
-            raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact")
+            raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact without one")
         has_latents = keeps_latents(plan) if state is None else state.networks is not None
         if keeps_latents(plan) and not has_latents:
             note("the state holds no latents: groups of this batch are decoded when they enter")
-        batch = make_batch(state, prepared, plan, online, max_k)
+        batch, kind = make_batch(state, prepared, plan, online), LATENTS if has_latents else MOMENTS
         if not batch.is_new.all():
             note(
                 f"views with the cameras of earlier ones, which count once: {sum(~batch.is_new)} of {len(batch.is_new)}"
             )
-        state, counts = _add_batch(state, batch, LATENTS if has_latents else MOMENTS, count)
+        new = kind.encode(state, batch, count)
+        counts = {"num_new": len(new.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
+        if state is None:
+            state = _begin(new, batch, kind)
+        else:
+            state, others = _join(state, new, batch, kind)
+            counts |= others
+        if new.networks is not None and plan.checkpoint is not None:
+            choose(groups=counts["num_new"], clusters=len(state), networks=plan.checkpoint.facts())
+        if prepared.input_scene.images is not None:
+            state = _with_photos(state, batch)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(online)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
@@ -98,71 +111,100 @@ def extend(
     report = BatchReport(
         **numbers, seconds=record.seconds, choices=record.choices, notes=tuple(record.notes), options=settings
     )  # fmt: skip
-    return replace(state, about=about), report
+    return replace(state, about={**state.about, **about}), report
 
 
-def _add_batch(
-    state: OnlineState | None, batch: Batch, kind: StateKind, count: int | None
-) -> tuple[OnlineState, dict[str, int]]:
-    """Add a batch to the state; return it, and the numbers of the batch's groups by key of the report."""
-    new = kind.encode(state, batch, count)
-    counts = {"num_new": len(new.features), "num_covered": 0, "num_joined": 0, "num_hidden": 0}
-    if state is None:
-        groups = kind.first(new, batch)
-    else:
-        rows = rows_in_view(state.groups.features, batch.photos.cameras, kind.reach)
-        if batch.online.tolerance > 0:
-            with stage("cover"):
-                novel = novel_rows(new, batch, *kind.decode(select_groups(state.groups, rows), new))
-                counts["num_covered"] = len(new.features) - len(novel)
-                new = replace(new, features=take(new.features, novel))
-        groups, joined = kind.join(state.groups, rows, new, batch)
-        counts |= joined
-    if new.networks is not None and batch.plan.checkpoint is not None:
-        choose(groups=counts["num_new"], clusters=len(groups), networks=batch.plan.checkpoint.facts())
-    state = replace(_with_views(state, groups, batch), networks=new.networks)
-    if batch.prepared.input_scene.images is None:
-        return state, counts
-    if batch.online.fit_colors and new.networks is None:
-        with stage("fit"):
-            groups, report = fit_batch_colors(groups, batch.photos, batch.plan.fit, batch.plan.seed)
-            choose(fit=report.to_dict())
-    replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.online.replay)
-    return replace(state, groups=groups, replay=replay), counts
-
-
-def _with_views(state: OnlineState | None, groups: GroupSet, batch: Batch) -> OnlineState:
-    """Return the state with other groups, and with the views and unseen Gaussians of a batch."""
-    plan, input_scene, cameras = batch.plan, batch.prepared.input_scene, batch.photos.cameras[batch.is_new]
-    k = AUTO if plan.auto_count else plan.decode.k
-    if state is None:
-        least = plan.fit.min_contribution if input_scene.images is not None else 0.0
-        return OnlineState(
-            groups=groups,
-            kept=plan.unseen,
-            frame=batch.prepared.frame,
-            cameras=in_float64(cameras),
-            replay=no_photos(cameras),
-            settings=StoredSettings(input_scene.num_gaussians, k, batch.max_k, plan.decode.min_opacity, least),
-            about={},
-        )
-    kept = [gaussians for gaussians in (state.kept, plan.unseen) if gaussians is not None]
-    return replace(
-        state,
+def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
+    """Make a state of a first batch, whose groups divide as its own Gaussians say."""
+    prepared, plan, cameras = batch.prepared, batch.plan, batch.photos.cameras
+    max_k = _most_children(new, batch)
+    groups = kind.divide(new, batch, max_k)
+    merged = MergedViews(groups.features, new.members, new.segmentation, len(new.features))
+    count, exact = merged_count(merged, plan.decode, grows=False), new.segmentation.exact
+    settings = StoredSettings(
+        num_input=prepared.input_scene.num_gaussians,
+        k=AUTO if plan.auto_count else min(plan.decode.max_k, max_k),
+        max_k=max_k,
+        min_opacity=plan.decode.min_opacity,
+        min_contribution=plan.fit.min_contribution,
+        target_count=count if exact else None,
+        num_slots=None if exact or count is None else count // plan.decode.max_k,
+        knee_count=knee_count(prepared.scene, plan.superpixels),
+    )
+    return State(
         groups=groups,
-        kept=Gaussians.concat(kept) if kept else None,
-        cameras=concat_cameras(state.cameras, cameras),
-        settings=replace(state.settings, num_input=state.settings.num_input + batch.num_new, k=k),
+        kept=plan.unseen,
+        frame=prepared.frame,
+        cameras=in_float64(cameras),
+        replay=no_photos(cameras),
+        settings=settings,
+        about={},
+        networks=new.networks,
     )
 
 
-def _check(state: OnlineState | None, scene: Scene, options: CompactOptions, max_k: int) -> None:
+def _most_children(new: BatchFeatures, batch: Batch) -> int:
+    """Return the largest number of children of a group that is stored."""
+    most, decode = batch.online.max_k, batch.plan.decode
+    if most is None:
+        asks_for_number = new.segmentation.exact or new.members.pixels is not None
+        most = MAX_CHILDREN if asks_for_number or decode.max_k > USUAL_MAX_K else USUAL_MAX_K
+    return most if new.context is None else min(most, new.context.options.max_children)
+
+
+def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tuple[State, dict[str, int]]:
+    """Add a further batch to a state; return it, and numbers of the batch's groups by key of the report."""
+    state, counts, cameras = share(state), dict[str, int](), batch.photos.cameras
+    groups, settings = state.groups, state.settings
+    assert isinstance(groups, GroupSet)
+    rows = rows_in_view(groups.features, cameras, kind.reach)
+    if batch.online.tolerance > 0:
+        with stage("cover"):
+            novel = novel_rows(new, batch, *kind.decode(select_groups(groups, rows), new))
+            counts["num_covered"] = len(new.features) - len(novel)
+            new = replace(new, features=take(new.features, novel))
+    groups, joined = kind.join(groups, rows, new, batch, settings.max_k)
+    kept = [gaussians for gaussians in (state.kept, batch.plan.unseen) if gaussians is not None]
+    settings = replace(
+        settings,
+        num_input=settings.num_input + batch.num_new,
+        k=AUTO if batch.plan.auto_count else batch.plan.decode.k,
+        min_contribution=batch.min_contribution,
+    )
+    state = replace(
+        state,
+        groups=groups,
+        kept=Gaussians.concat(kept) if kept else None,
+        cameras=concat_cameras(state.cameras, cameras[batch.is_new]),
+        settings=settings,
+        networks=new.networks,
+    )
+    return state, counts | joined
+
+
+def _with_photos(state: State, batch: Batch) -> State:
+    """Fit colours to a batch's photos, but those of heads, and keep some of the photos."""
+    groups = state.groups
+    if batch.online.fit_colors and state.networks is None:
+        with stage("fit"):
+            shared = share_groups(groups, state.cameras, 1) if isinstance(groups, DividedGroups) else groups
+            shared, report = fit_batch_colors(shared, batch.photos, batch.plan.fit, batch.plan.seed)
+            choose(fit=report.to_dict())
+        colors = Colors(shared.fitted_sh0, shared.color_precision)
+        groups = replace(groups, colors=colors) if isinstance(groups, DividedGroups) else shared
+    replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.online.replay)
+    return replace(state, groups=groups, replay=replay)
+
+
+def _check(state: State | None, scene: Scene, options: CompactOptions, max_k: int | None) -> None:
     """Refuse settings that no state can have, and harmonics of another degree."""
     for name in options.compact_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":
-        raise UsageError("fit full: goes with all photos together; expected none, and the full fit at decoding")
-    if options.decode.max_k > max_k:
+        raise UsageError(
+            "fit full: goes with all photos together; expected none, and the full fit when the state is compacted"
+        )
+    if max_k is not None and options.decode.max_k > max_k:
         raise UsageError(f"max_k: expected at least {options.decode.k}, which is k, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:

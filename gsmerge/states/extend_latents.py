@@ -13,13 +13,13 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
-from gsmerge.moments import feature_to_gaussians
+from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with_group_features, find_neighbors
 from gsmerge.networks.checkpoint import IN_PACKAGE, Checkpoint, load_checkpoint
-from gsmerge.networks.tokens import GroupFeatures, choose_views
+from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.plan import Plan
-from gsmerge.runtime.record import note
+from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.assign import assign
@@ -29,20 +29,18 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.segment import segment_scene
 from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
-from gsmerge.states.encoded import without_members
+from gsmerge.states.division import divide_all
+from gsmerge.states.groups import concat_groups, limit_children, make_groups, select_groups, without_members
 from gsmerge.states.state import (
+    DividedGroups,
     GroupSet,
+    Heads,
     Learned,
-    OnlineState,
+    State,
     StateNetworks,
     ViewSamples,
-    concat_groups,
-    limit_children,
-    make_groups,
-    sample_views,
-    select_groups,
 )
-from gsmerge.types import FeatureGaussians, Gaussians, Matches
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
@@ -84,7 +82,7 @@ def keeps_latents(plan: Plan) -> bool:
     return len(plan.networks) == 1 and networks is not None and networks.options.encoder
 
 
-def own_checkpoint(state: OnlineState, options: CompactOptions) -> Checkpoint | None:
+def own_checkpoint(state: State, options: CompactOptions) -> Checkpoint | None:
     """Return the networks of a state as a checkpoint; None for a state without networks.
 
     Raises UsageError if the options name others, SceneError if they name a file that cannot be read.
@@ -117,14 +115,33 @@ def _same(networks: NetworkWeights, other: NetworkWeights) -> bool:
     return all(np.array_equal(array, other.arrays[name]) for name, array in networks.arrays.items())
 
 
-def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> BatchFeatures:
+def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
+    """Sample the Gaussians that the pixels at the centres of a grid of ``shape`` show."""
+    (height, width), num_views = shape, len(cameras)
+    rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
+    columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
+    pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
+    ids = (np.arange(num_views)[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
+    if members.pixels is not None:
+        ids = np.full_like(ids, -1) if members.fronts is None else members.fronts.reshape(-1)[ids]
+    means, sh0 = members.means[ids], members.sh0[ids, 0]
+    usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
+    grid = num_views, height, width
+    return ViewSamples(
+        np.where(usable[:, None], means, 0).astype(np.float32).reshape(*grid, 3),
+        np.where(usable, members.opacities[ids], 0).astype(np.float32).reshape(grid),
+        np.where(usable[:, None], sh0, 0).astype(np.float32).reshape(*grid, 3),
+    )
+
+
+def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatures:
     """Encode a batch's superpixels, which stay of one view each."""
     plan, cameras = batch.plan, batch.scene.cameras
     weights = plan.networks[0]
     assert weights is not None
-    superpixels = segment_scene(batch.scene, plan.superpixels, count).groups
-    members = assign(batch.scene, superpixels, draws=False)
-    pooled = encode(batch.scene, members, superpixels)
+    segmentation = segment_scene(batch.scene, plan.superpixels, count)
+    members = assign(batch.scene, segmentation.groups, draws=False)
+    pooled = encode(batch.scene, members, segmentation.groups)
     context = NetworkContext(weights, members, cameras, plan.seed)
     if state is None:
         samples = sample_views(members, cameras, (-(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)))
@@ -146,18 +163,24 @@ def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> Batch
             part_weights=members.opacities,
         )
     features = correct(pooled, members, cameras, context, weaken=False)
-    return BatchFeatures(features, members, context, StateNetworks(weights, samples))
+    return BatchFeatures(features, members, segmentation, context, StateNetworks(weights, samples))
 
 
-def _first(new: BatchFeatures, batch: Batch) -> GroupSet:
+def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     """Match, merge and refine the Feature Gaussians of a first batch, as for a scene of its views."""
-    context = new.context
+    context, networks = new.context, new.networks
     assert context is not None
+    assert networks is not None
     merged = merge(new.features, match(new.features, batch.plan.match, context), context)
     refined = refine(merged, context)
-    views = choose_views(refined, context.members, context.cameras)
-    learned = Learned(refined, views, np.diff(refined.starts))
-    return make_groups(merged, *_children(refined, context, batch.max_k), learned)
+    with stage("decode"):
+        described = context.describe(refined)
+        return DividedGroups(
+            without_members(merged),
+            divide_all(refined, new.members, max_k),
+            Heads(networks.weights, described.views, described.group),
+            learned=Learned(without_members(refined), described.views, np.diff(refined.starts)),
+        )
 
 
 def _children(features: FeatureGaussians, context: NetworkContext, max_k: int) -> tuple[Gaussians, np.ndarray]:
@@ -178,7 +201,9 @@ def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]
     return state_gaussians, batch_gaussians
 
 
-def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) -> tuple[GroupSet, dict[str, int]]:
+def _join(
+    groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch, max_k: int
+) -> tuple[GroupSet, dict[str, int]]:
     """Match, merge and refine a batch with the state's ``rows`` in reach; the other groups come first.
 
     The state's groups come before the batch's, so that the merger's cluster begins with one of them.
@@ -186,7 +211,7 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
     far, near = (select_groups(groups, r) for r in (np.setdiff1d(np.arange(len(groups)), rows), rows))
     assert isinstance(new.context, StateContext)
     assert near.learned is not None
-    both, num_old = concat_groups([near, _parts(new.features, new.context, batch)]), len(near)
+    both, num_old = concat_groups([near, _parts(new.features, new.context, batch, max_k)]), len(near)
     assert both.learned is not None
     context = replace(
         new.context,
@@ -204,15 +229,15 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
     joined = make_groups(merged, children, owners.repeat(sizes), context.learn(refined))
     has_old = np.bincount(owners, merged.members < num_old, len(merged)) > 0
     num_joined = int((has_old[owners] & (merged.members >= num_old)).sum())
-    return concat_groups([far, limit_children(joined, batch.max_k)]), {"num_joined": num_joined}
+    return concat_groups([far, limit_children(joined, max_k)]), {"num_joined": num_joined}
 
 
-def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch) -> GroupSet:
+def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch, max_k: int) -> GroupSet:
     """Make groups of a batch's Feature Gaussians, each of one view."""
     views = batch.view_ids[features.views]
     parts = replace(features, views=views)
     learned = Learned(parts, views, np.diff(features.starts))
-    return make_groups(parts, *_children(features, context, batch.max_k), learned)
+    return make_groups(parts, *_children(features, context, max_k), learned)
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, context: StateContext) -> Matches:
@@ -249,4 +274,4 @@ def _refine_near(merged: FeatureGaussians, before: FeatureGaussians, context: St
     return replace(take(every, index), starts=merged.starts, members=merged.members)
 
 
-LATENTS = StateKind(WIDE, _encode, _decode, _first, _join)
+LATENTS = StateKind(WIDE, _encode, _decode, _divide, _join)

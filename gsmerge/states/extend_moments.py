@@ -14,29 +14,34 @@ from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
 from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
-from gsmerge.states.state import (
-    GroupSet,
-    OnlineState,
+from gsmerge.states.division import divide_all
+from gsmerge.states.groups import (
     bake,
     concat_groups,
     limit_children,
     replace_groups,
     select_groups,
     with_fitted_colors,
+    without_members,
 )
+from gsmerge.states.state import DividedGroups, GroupSet, Heads, State
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 
-def _encode(state: OnlineState | None, batch: Batch, count: int | None) -> BatchFeatures:
+def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatures:
     """Merge a batch's superpixels across its own views."""
     merged = merge_views(batch.prepared, batch.plan, count)
-    return BatchFeatures(merged.features, merged.members, merged.networks)
+    return BatchFeatures(merged.features, merged.members, merged.segmentation, merged.networks)
 
 
 @stage("decode")
-def _first(new: BatchFeatures, batch: Batch) -> GroupSet:
-    """Decode Feature Gaussians into groups of a state."""
-    return bake(new.features, new.members, new.context, batch.max_k)
+def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
+    """Divide Feature Gaussians into groups of a state, with the networks that correct them."""
+    heads, checkpoint = None, batch.plan.checkpoint
+    if new.context is not None and checkpoint is not None:
+        described = new.context.describe(new.features)
+        heads = Heads(checkpoint.networks, described.views, described.group)
+    return DividedGroups(without_members(new.features), divide_all(new.features, new.members, max_k), heads)
 
 
 def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
@@ -44,16 +49,19 @@ def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]
     return feature_to_gaussians(with_fitted_colors(groups).features), feature_to_gaussians(new.features)
 
 
-def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) -> tuple[GroupSet, dict[str, int]]:
+def _join(
+    groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch, max_k: int
+) -> tuple[GroupSet, dict[str, int]]:
     """Merge a batch into the state's ``rows`` in view, and add the rest where a view shows it."""
-    fresh = _first(new, batch)
+    with stage("decode"):
+        fresh = bake(new.features, new.members, new.context, max_k)
     with stage("join"):
         partners = find_partners(take(groups.features, rows), fresh.features, batch.plan.match)
         has_partner = partners >= 0
         joining = select_groups(fresh, np.flatnonzero(has_partner))
-        groups = merge_into(groups, joining, rows[partners[has_partner]], batch.max_k)
+        groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
         alone = select_groups(fresh, np.flatnonzero(~has_partner))
-        counts, least = {"num_joined": int(has_partner.sum())}, batch.plan.fit.min_contribution
+        counts, least = {"num_joined": int(has_partner.sum())}, batch.min_contribution
         if least > 0:
             in_view = feature_to_gaussians(take(groups.features, rows))
             both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
@@ -63,7 +71,7 @@ def _join(groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch) 
         return concat_groups([groups, alone]), counts
 
 
-MOMENTS = StateKind(REACH, _encode, _decode, _first, _join)
+MOMENTS = StateKind(REACH, _encode, _decode, _divide, _join)
 
 
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""The ``.gsm`` container, of encoded scenes and of states, and the encoded scene in it.
+"""The ``.gsm`` container of a state.
 
-A safetensors file with one metadata entry, whose name says the kind of content and whose text is a header in JSON.
-Nothing in a file is ever executed; every array and every entry is checked before it is used. Within one major schema
-arrays and entries are only ever added, and unknown ones are ignored. Keys are the names of fields in the code.
+A safetensors file with one metadata entry, whose text is a header in JSON. Nothing in a file is ever executed; every
+array and every entry is checked before it is used. Within one schema arrays and entries are only ever added, and
+unknown ones are ignored. Keys are the names of fields in the code.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,16 +27,17 @@ from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.settings.stages import MAX_CHILDREN
-from gsmerge.states.encoded import Division, Encoded, StoredHeads, StoredScene, StoredSettings
+from gsmerge.states.options import SUFFIX
+from gsmerge.states.state import StoredSettings
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
 
-SCHEMA, MINOR = 1, 1  # files of a larger schema cannot be read; minor: what was added since the schema's first files
-SUFFIX = ".gsm"
-ENCODED, STATE = "gsmerge-encoded", "gsmerge-state"  # names of the metadata entry
-REMEDY = "copy it again, or encode the scene again"
+SCHEMA = 2  # files of a larger one cannot be read
+STATE = "gsmerge-state"  # name of the metadata entry
+ENCODED = "gsmerge-encoded"  # its name in files of gsmerge 0.1's command `encode`, of schema 1
+REMEDY = "copy it again, or extend a new state"
 MAX_COUNT = 1 << 40
 NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
 MAX_NUMBER = 1e37  # of any array: float32 ends at 3e38
@@ -55,11 +56,7 @@ NOT_NEGATIVE = (
 # Pixels of a view that a file may claim: each of its bytes says something about some of them, or it is a small one.
 PIXELS_PER_BYTE, SMALL_VIEW = 100, 1 << 20
 
-COMMON_ENTRIES = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}
-ENTRIES: dict[str, dict[str, Any]] = {  # types of the header's entries, by kind of content
-    ENCODED: COMMON_ENTRIES | {"networks": dict | None},
-    STATE: COMMON_ENTRIES,
-}
+ENTRIES: Mapping[str, Any] = {"settings": dict, "unit": float, "width": int, "height": int, "about": dict}  # types
 ABOUT = {"gsmerge": str, "options": dict, "choices": dict, "notes": list, "batches": list, "source": dict}  # types
 PREFIXES = (
     "features.", "division.", "children.", "kept.", "cameras.", "frame.", "heads.", "networks.", "replay.", "refined.",
@@ -69,42 +66,14 @@ FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not i
 
 
 def write_gsm(
-    path: str | PathLike[str],
-    kind: str,
-    stored: StoredScene,
-    features: FeatureGaussians,
-    children: tuple[str, Gaussians],
-    entries: Mapping[str, Any],
-    arrays: Mapping[str, np.ndarray],
-    *,
-    overwrite: bool,
+    path: str | PathLike[str], header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, overwrite: bool
 ) -> None:
-    """Write a ``.gsm`` file: the fields common to all kinds, and ``entries`` and ``arrays`` of one kind.
-
-    ``children``: the prefix of the children's keys, and the children.
-    """
-    frame, cameras, settings = stored.frame, stored.cameras, asdict(stored.settings)
-    header = {
-        "schema": SCHEMA,
-        "gsmerge": __version__,
-        "minor": MINOR,
-        "settings": settings,
-        "unit": frame.unit,
-        "width": cameras.width,
-        "height": cameras.height,
-        **entries,
-    }
-    kept = children[1][:0] if stored.kept is None else stored.kept
-    content = {f"features.{name}": _float32(getattr(features, name)) for name in FEATURE_COLUMNS}
-    content |= {"features.views": features.views.astype(np.int32)}
-    content |= {"cameras.viewmats": cameras.viewmats.astype(np.float64), "cameras.Ks": cameras.Ks.astype(np.float64)}
-    content |= {"frame.origin": frame.origin.astype(np.float64)}
-    for prefix, gaussians in (children, ("kept", kept)):
-        content |= {f"{prefix}.{f.name}": _float32(getattr(gaussians, f.name)) for f in fields(Gaussians)}
-    data = {name: np.ascontiguousarray(array) for name, array in (content | dict(arrays)).items()}
+    """Write a ``.gsm`` file with the entries of a header, schema and checksums added."""
+    header = {"schema": SCHEMA, "gsmerge": __version__, **header}
+    data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     with atomic_output(path, overwrite=overwrite) as temporary:
         header["checksums"] = _checksums(header, data)
-        temporary.write_bytes(save(data, {kind: json.dumps(header)}))  # one entry: the order of several is not fixed
+        temporary.write_bytes(save(data, {STATE: json.dumps(header)}))  # one entry: the order of several is not fixed
 
 
 def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
@@ -127,48 +96,11 @@ def wrong_checksums(file: GsmFile) -> list[str] | None:
     return [name for name, value in checksums.items() if stored.get(name) != value] + missing
 
 
-def _float32(values: Array) -> np.ndarray:
+def float32(values: Array) -> np.ndarray:
     """Return float32 numbers within the range that a reader accepts."""
     with np.errstate(over="ignore"):
         numbers = np.nan_to_num(as_array(values).astype(np.float32, copy=False))
     return np.clip(numbers, -MAX_NUMBER, MAX_NUMBER, dtype=np.float32)
-
-
-def save_encoded(
-    path: str | PathLike[str], encoded: Encoded, *, overwrite: bool = False, source: Mapping[str, Any] | None = None
-) -> None:
-    """Write an encoded scene to a file.
-
-    Args:
-        path: The file, ``.gsm`` by convention; complete or not there at all.
-        encoded: From :func:`gsmerge.encode_scene`.
-        overwrite: Replace an existing file.
-        source: Facts about the file of the scene; plain JSON types.
-
-    Raises:
-        SceneError: If the file exists or cannot be written.
-
-    Example:
-        >>> encoded = gsmerge.encode_scene(gsmerge.read_scene("demo"), superpixels="2%")
-        >>> gsmerge.save_encoded("demo/scene.gsm", encoded, overwrite=True)
-    """
-    division, heads = encoded.division, encoded.heads
-    entries = {
-        "networks": None if heads is None else asdict(heads.networks.options),
-        "about": {**encoded.about, **({} if source is None else {"source": dict(source)})},
-        "precision": "float32",  # of the networks' arithmetic: earlier versions had others and expect the key
-    }
-    arrays = {
-        "division.splits": division.splits,
-        "division.slots": division.slots,
-        "division.uniform": division.uniform.astype(np.int32),
-        "division.growth_order": division.growth_order.astype(np.int32),
-    }
-    if heads is not None:
-        arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": _float32(heads.group)}
-        arrays |= {f"networks.{name}": array for name, array in heads.networks.arrays.items()}
-    children = "division", division.children
-    write_gsm(path, ENCODED, encoded, encoded.features, children, entries, arrays, overwrite=overwrite)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,13 +108,17 @@ class GsmFile:
     """Content of a ``.gsm`` file, each part checked when it is read."""
 
     path: Path
-    kind: str  # `ENCODED` or `STATE`
+    is_encoded: bool  # Whether 0.1's command `encode` wrote it
     header: Mapping[str, Any]  # Its header, each entry of its type
     arrays: Mapping[str, np.ndarray]
 
     def error(self, problem: str) -> SceneError:
         """Make the SceneError for a damaged file."""
         return SceneError(self.path, problem, REMEDY)
+
+    def has(self, *prefixes: str) -> bool:
+        """Return whether some array's name begins with one of the prefixes."""
+        return any(name.startswith(prefixes) for name in self.arrays)
 
     def array(self, key: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
         """Return an array, checked for type, shape (None: any size), finite values and range."""
@@ -226,7 +162,7 @@ class GsmFile:
         return Gaussians(*(self.array(f"{prefix}.{name}", np.float32, n, *shape) for name, shape in shapes.items()))
 
     def common(self, num_higher: int) -> dict[str, Any]:
-        """Return the fields common to encoded scenes and states: kept, frame, cameras."""
+        """Return the fields of every state that are no groups: kept, frame, cameras."""
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
         origin = self.array("frame.origin", np.float64, 3)
@@ -281,8 +217,8 @@ class GsmFile:
         return StoredSettings(**values)
 
 
-def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
-    """Read a ``.gsm`` file that has one of the ``kinds``; SceneError for other files."""
+def read_gsm(path: str | PathLike[str]) -> GsmFile:
+    """Read a ``.gsm`` file; SceneError for other files."""
     path = Path(path)
     budget = read_budget(path)
     try:
@@ -291,16 +227,16 @@ def read_gsm(path: str | PathLike[str], *kinds: str) -> GsmFile:
             metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
         reason = str(error).splitlines()[0]
-        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge encode or extend"
+        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge extend"
         raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({reason})", remedy) from error
-    kind = next((kind for kind in kinds if kind in metadata), None)
-    if kind is None:
+    text = metadata.get(STATE, metadata.get(ENCODED))
+    if text is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    return GsmFile(path, kind, _read_header(metadata[kind], ENTRIES[kind], budget), arrays)
+    return GsmFile(path, STATE not in metadata, _read_header(text, budget), arrays)
 
 
-def _read_header(text: str, entries: Mapping[str, Any], budget: ReadBudget) -> dict[str, Any]:
-    """Parse the header of a known schema; ``entries``: the type of each required entry."""
+def _read_header(text: str, budget: ReadBudget) -> dict[str, Any]:
+    """Parse the header of a known schema."""
     path = budget.path
     try:
         header = parse_json(text, budget)
@@ -308,11 +244,11 @@ def _read_header(text: str, entries: Mapping[str, Any], budget: ReadBudget) -> d
         raise SceneError(path, "expected a header in JSON, found something else", REMEDY) from error
     if not isinstance(header, dict) or not isinstance(header.get("schema"), int):
         raise SceneError(path, "expected a header with its schema, found none", REMEDY)
-    if header["schema"] != SCHEMA:
+    if not 1 <= header["schema"] <= SCHEMA:
         newer = f"written by gsmerge {str(header.get('gsmerge'))[:40]}; this is {__version__}, update it"
-        problem = f"expected schema {SCHEMA}, found {header['schema']}"
+        problem = f"expected schema 1 to {SCHEMA}, found {header['schema']}"
         raise SceneError(path, problem, newer if header["schema"] > SCHEMA else REMEDY)
-    for name, kind in entries.items():
+    for name, kind in ENTRIES.items():
         if not isinstance(header.get(name, ...), kind) or isinstance(header[name], bool):
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
     about = header["about"]
@@ -321,71 +257,3 @@ def _read_header(text: str, entries: Mapping[str, Any], budget: ReadBudget) -> d
             problem = f"about: expected {name} as a {kind.__name__}, found {about[name]!r:.40}"
             raise SceneError(path, problem, REMEDY)
     return header
-
-
-def load_encoded(path: str | PathLike[str]) -> Encoded:
-    """Read an encoded scene from a file; nothing in the file is executed.
-
-    Raises:
-        SceneError: If the file is missing or damaged, of another format or a newer schema, lacks an array, or holds
-            numbers out of range.
-
-    Example:
-        >>> gsmerge.save_encoded("demo/scene.gsm", gsmerge.encode_scene(gsmerge.read_scene("demo")), overwrite=True)
-        >>> len(gsmerge.decode_scene(gsmerge.load_encoded("demo/scene.gsm"), budget=200))
-        200
-    """
-    return read_encoded(read_gsm(path, ENCODED))
-
-
-def read_encoded(file: GsmFile) -> Encoded:
-    """Read the encoded scene from an open ``.gsm`` file."""
-    features, settings = file.features(), file.settings()
-    common = file.common(features.shN.shape[1])
-    heads = _read_heads(file, features, len(common["cameras"]))
-    return Encoded(
-        features=features,
-        division=_read_division(file, features),
-        settings=settings,
-        heads=heads,
-        about=file.header["about"],
-        **common,
-    )
-
-
-def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
-    """Return the children, with every index within its range."""
-    g = len(features)
-    splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
-    uniform = file.array("division.uniform", np.int32, None)
-    order = file.array("division.growth_order", np.int32, None)
-    counts = splits.astype(np.int64)
-    ok = counts.max(initial=0) < MAX_CHILDREN and counts.sum() == len(slots)
-    if ok:
-        steps = np.arange(len(slots)) - np.repeat(np.cumsum(counts) - counts, counts)
-        in_order = len(uniform) == 0 or bool(uniform[0] >= 0 and uniform[-1] < g and (np.diff(uniform) > 0).all())
-        ok = bool((slots <= steps).all()) and in_order and not counts[uniform].any()
-    if ok and len(order):
-        ok = int(order.min()) >= 0 and int(order.max()) < g
-        ok = ok and bool((np.bincount(order, minlength=g) <= counts).all())
-    if not ok:
-        raise file.error("division: expected children that belong to their groups, found others")
-    children = file.gaussians("division", 2 * len(slots) + len(uniform), features.shN.shape[1])
-    return Division(splits, slots, uniform.astype(np.int64), children, order.astype(np.int64))
-
-
-def _read_heads(file: GsmFile, features: FeatureGaussians, num_views: int) -> StoredHeads | None:
-    """Return the networks and their descriptions of the groups; None without networks."""
-    networks = file.networks()
-    if networks is None:
-        return None
-    from gsmerge.networks.options import GROUP
-
-    views = file.array("heads.views", np.int32, len(features)).astype(np.int64)
-    if len(views) and not 0 <= int(views.min()) <= int(views.max()) < num_views:
-        raise file.error("heads.views: expected views of the scene, found others")
-    latent, expected = features.latents.shape[1], networks.options.latent
-    if latent != expected:
-        raise file.error(f"features.latents: expected {expected} numbers, as of its networks, found {latent}")
-    group = file.array("heads.group", np.float32, len(features), GROUP)
-    return StoredHeads(networks, views, group)

@@ -10,16 +10,20 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import MAX_CHILDREN
 
+SUFFIX = ".gsm"  # of the file of a state
+
 # Settings of this module under the name of a recipe, see gsmerge.settings.compact.RECIPES
 RECIPES: Mapping[str, Mapping[str, Any]] = {"paper": {"tolerance": 0.0, "replay": 0}}
 
 
 @dataclass(frozen=True)
-class OnlineOptions(Settings):
+class ExtendOptions(Settings):
     """Settings of how new views enter a state."""
 
-    max_k: int = setting(4, "Most Gaussians per superpixel that can be decoded later: fixed by the first batch.",
-        "More take more space.", least=1, most=MAX_CHILDREN)  # fmt: skip
+    max_k: int | None = setting(None, "Most Gaussians per superpixel that can be decoded later: fixed by the first "
+        "batch. More take more space.",
+        "None: 4; 8 where `k` is larger, or a number of Gaussians is asked for (budgets, unaligned scenes).", least=1,
+        most=MAX_CHILDREN, shown="4, or 8 with a --budget")  # fmt: skip
     tolerance: float = setting(0.06, "Leave out a new group where the state shows its pixels with a colour error (root "
         "mean square, sRGB in [0, 1], holes counted) below this, or no larger than `margin` times that of the new "
         "views' own Gaussians.",
@@ -35,12 +39,12 @@ class OnlineOptions(Settings):
 
 def merge_settings(
     settings: Mapping[str, Any], stored: Mapping[str, Any] | None = None
-) -> tuple[CompactOptions, OnlineOptions]:
+) -> tuple[CompactOptions, ExtendOptions]:
     """Combine settings: those given, else those stored in a state, else the defaults without a full fit."""
-    names = OnlineOptions.__dataclass_fields__.keys()
+    names = ExtendOptions.__dataclass_fields__.keys()
     all_names = names | CompactOptions().to_dict().keys()
     before = {name: value for name, value in (stored or {}).items() if name in all_names}
     recipe = settings.get("recipe", before.get("recipe"))
     merged = {"fit": "none"} | dict(RECIPES.get(str(recipe), {})) | before | dict(settings)
-    online = OnlineOptions(**{name: merged.pop(name) for name in names if name in merged})
+    online = ExtendOptions(**{name: merged.pop(name) for name in names if name in merged})
     return CompactOptions().with_settings(merged), online

@@ -105,10 +105,11 @@ def colmap(suffix: str) -> Callable[[Path], None]:
     return make
 
 
-def encoded(*words: str) -> Callable[[Path], None]:
+def extended(*batches: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
-        last = [str(folder) if word == "{}" else str(folder / word) if "." in word else word for word in words]
-        assert main([*last, "--superpixels", "60", "--checkpoint", "none", "--quiet"]) == 0
+        scenes = [str(folder / batch) for batch in batches]
+        small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+        assert main(["extend", str(folder / "a.gsm"), *scenes, *small]) == 0
 
     return make
 
@@ -124,7 +125,7 @@ class Kind:
 
 
 INSPECT = ("inspect", "levels/lod-meta.json")
-DECODE = ("decode", "-o", "made.ply", "--overwrite")
+STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", any_of(EXACT, change_ply_head)),
     "parts": Kind("view_*.ply", any_of(EXACT, change_ply_head), places.in_parts(lambda path: None)),
@@ -142,9 +143,8 @@ KINDS = {
     "glb": Kind("a.glb", EXACT, alone("a.glb"), ("inspect", "a.glb")),
     "index": Kind("levels/lod-meta.json", any_of(change_json, change_bytes), in_levels, INSPECT),
     "chunks": Kind("levels/*/*", EXACT, in_levels, INSPECT),
-    "encoded": Kind("a.gsm", any_of(change_bytes, in_safetensors), encoded("encode", "{}", "-o", "a.gsm"),
-                    (*DECODE, "a.gsm")),
-    "state": Kind("a.gsm", any_of(change_bytes, in_safetensors), encoded("extend", "a.gsm", "{}"), (*DECODE, "a.gsm")),
+    "state": Kind("a.gsm", any_of(change_bytes, in_safetensors), extended("."), STATE),
+    "state of two batches": Kind("a.gsm", any_of(change_bytes, in_safetensors), extended(".", "."), STATE),
 }  # fmt: skip
 
 

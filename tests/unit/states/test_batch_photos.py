@@ -31,7 +31,8 @@ from gsmerge.states.batch import (
     update_replay,
     view_ids,
 )
-from gsmerge.states.state import GroupSet, Replay, moments_of
+from gsmerge.states.groups import moments_of, share
+from gsmerge.states.state import GroupSet, Replay
 from gsmerge.types import SH_C0, FeatureGaussians
 
 
@@ -161,7 +162,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def groups(scene: Scene) -> GroupSet:
     """Groups of all views, their colours off by a little."""
-    actual = state_of(fed([scene], fit_colors=False)).groups
+    actual = share(state_of(fed([scene], fit_colors=False))).groups
     noise = np.random.default_rng(0).normal(0, 0.1 / SH_C0, actual.features.sh0.shape).astype(np.float32)
     sh0 = actual.features.sh0 + noise
     return replace(actual, features=replace(actual.features, sh0=sh0), fitted_sh0=sh0)

@@ -11,14 +11,15 @@ from view_batches import fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.states.extend_moments import find_partners, merge_into
-from gsmerge.states.state import GroupSet, limit_children, select_groups
+from gsmerge.states.groups import limit_children, select_groups, share
+from gsmerge.states.state import GroupSet
 
 
 @pytest.fixture(scope="module")
 def sides() -> tuple[GroupSet, GroupSet]:
     """The groups of two views each, with photos that held the first."""
     first, second = parts_of(room(4), 2)
-    return state_of(fed([first])).groups, state_of(fed([second], fit="none")).groups
+    return share(state_of(fed([first]))).groups, share(state_of(fed([second], fit="none"))).groups
 
 
 @pytest.fixture(scope="module")

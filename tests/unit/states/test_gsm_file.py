@@ -1,4 +1,4 @@
-"""The file: what comes back, what is ignored, and every kind of damage."""
+"""The file of one batch, with networks: what comes back, what is ignored, and every kind of damage."""
 
 from __future__ import annotations
 
@@ -24,22 +24,27 @@ from hostile.gsm_files import (
 )
 from network_fixtures import noisy, written
 from safetensors.numpy import load_file, save_file
+from view_batches import decoded, one_batch, same_state
 
-from gsmerge import Encoded, decode_scene, encode_scene, load_encoded, save_encoded
 from gsmerge.errors import SceneError
-from gsmerge.states.gsm_file import ENCODED
+from gsmerge.states.gsm_file import STATE
+from gsmerge.states.state import DividedGroups, State
+from gsmerge.states.state_file import load_state, save_state
 
 
 @pytest.fixture(scope="module")
-def encoded(tmp_path_factory: pytest.TempPathFactory) -> Encoded:
+def state(tmp_path_factory: pytest.TempPathFactory) -> State:
     checkpoint = written(tmp_path_factory.mktemp("networks") / "a.safetensors", noisy())
     scene = scenes.make_scene(scenes.room(), scenes.arc(3), degree=1)
-    return encode_scene(scene, superpixels=60, checkpoint=str(checkpoint), fit="none")
+    state = one_batch(scene, superpixels=60, checkpoint=str(checkpoint))
+    assert isinstance(state.groups, DividedGroups)
+    assert state.networks is not None
+    return state
 
 
 @pytest.fixture
-def path(encoded: Encoded, tmp_path: Path) -> Path:
-    save_encoded(tmp_path / "scene.gsm", encoded)
+def path(state: State, tmp_path: Path) -> Path:
+    save_state(tmp_path / "scene.gsm", state)
     return tmp_path / "scene.gsm"
 
 
@@ -54,7 +59,8 @@ ARRAYS = (
         "division.shN",
     ),
     *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "heads.views", "heads.group"),
-    "networks.heads.1.out.weight",
+    *("networks.heads.1.out.weight", "replay.images", "replay.views", "refined.means", "heads.num_members"),
+    "samples.means",
 )
 DAMAGED: dict[str, Spoil] = {
     **UNREADABLE,
@@ -77,63 +83,55 @@ DAMAGED: dict[str, Spoil] = {
 }
 
 
-def test_everything_comes_back(path: Path, encoded: Encoded) -> None:
-    actual = load_encoded(path)
-    assert actual.settings == encoded.settings
-    assert actual.frame.unit == encoded.frame.unit
-    assert actual.about == json.loads(json.dumps(encoded.about))
-    assert len(actual) == len(encoded)
-    assert actual.heads is not None
-    for name, column in vars(encoded.features).items():
-        np.testing.assert_array_equal(getattr(actual.features, name), column, name)
+def test_everything_comes_back(path: Path, state: State) -> None:
+    actual = load_state(path)
+    same_state(actual, state)
+    assert actual.about == json.loads(json.dumps(state.about))
     for k in (1, 2, 4):
-        assert scenes.identical(decode_scene(actual, k=k), decode_scene(encoded, k=k))
+        assert scenes.identical(decoded(actual, k=k), decoded(state, k=k))
 
 
-def test_what_no_view_sees_comes_back(encoded: Encoded, tmp_path: Path) -> None:
-    kept = replace(encoded, kept=encoded.division.children[:5])
-    save_encoded(tmp_path / "kept.gsm", kept)
-    actual = load_encoded(tmp_path / "kept.gsm")
+def test_what_no_view_sees_comes_back(state: State, tmp_path: Path) -> None:
+    kept = replace(state, kept=state.groups.division.children[:5])
+    save_state(tmp_path / "kept.gsm", kept)
+    actual = load_state(tmp_path / "kept.gsm")
     assert actual.num_kept == 5
-    assert scenes.identical(decode_scene(actual), decode_scene(kept))
+    assert scenes.identical(decoded(actual), decoded(kept))
 
 
-def test_the_same_scene_gives_the_same_bytes(path: Path, encoded: Encoded, tmp_path: Path) -> None:
-    save_encoded(tmp_path / "again.gsm", encoded)
+def test_the_same_scene_gives_the_same_bytes(path: Path, state: State, tmp_path: Path) -> None:
+    save_state(tmp_path / "again.gsm", state)
     assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
-    save_encoded(tmp_path / "loaded.gsm", load_encoded(path))
+    save_state(tmp_path / "loaded.gsm", load_state(path))
     assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
 
 
-def test_the_source_is_told(encoded: Encoded, tmp_path: Path) -> None:
-    save_encoded(tmp_path / "scene.gsm", encoded, source={"name": "scene.ply", "bytes": 5})
-    assert load_encoded(tmp_path / "scene.gsm").about["source"] == {"name": "scene.ply", "bytes": 5}
-
-
-def test_what_is_not_known_is_not_looked_at(path: Path, encoded: Encoded) -> None:
+def test_what_is_not_known_is_not_looked_at(path: Path, state: State) -> None:
     said, arrays = header(path), load_file(path)
     arrays["features.moods"], arrays["state.views"] = np.full(7, np.nan), np.zeros(3)
-    said |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # older versions wrote a precision
+    said |= {"minor": 7, "moods": ["good"], "precision": "bfloat16"}  # 0.1 wrote a precision
     said["settings"]["mood"] = "better"
-    save_file(arrays, path, {ENCODED: json.dumps(said), "mood": "best"})
-    assert scenes.identical(decode_scene(load_encoded(path)), decode_scene(encoded))
+    save_file(arrays, path, {STATE: json.dumps(said), "mood": "best"})
+    assert scenes.identical(decoded(load_state(path)), decoded(state))
 
 
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
-    assert_refused_in_one_line(load_encoded, path)
+    assert_refused_in_one_line(load_state, path)
 
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:
     DAMAGED["a newer schema"](path)
-    with pytest.raises(SceneError, match=r"expected schema 1, found 2; written by gsmerge 9\.9; this is .*, update it"):
-        load_encoded(path)
+    with pytest.raises(
+        SceneError, match=r"expected schema 1 to 2, found 3; written by gsmerge 9\.9; this is .*, update it"
+    ):
+        load_state(path)
 
 
-def test_an_existing_file_is_kept(path: Path, encoded: Encoded) -> None:
+def test_an_existing_file_is_kept(path: Path, state: State) -> None:
     before = path.read_bytes()
     with pytest.raises(SceneError, match="exists"):
-        save_encoded(path, encoded)
-    save_encoded(path, encoded, overwrite=True)
+        save_state(path, state)
+    save_state(path, state, overwrite=True)
     assert path.read_bytes() == before

@@ -1,4 +1,4 @@
-"""The file of a state: what comes back, and every kind of damage."""
+"""The file of several batches: what comes back, and every kind of damage."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from safetensors.numpy import load_file, save_file
 from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
 
-from gsmerge import Compactor, Encoded, Gaussians, encode_scene, load_encoded, save_encoded
+from gsmerge import Compactor, Gaussians
 from gsmerge.errors import SceneError
-from gsmerge.states.file import load_state, load_stored, save_state
 from gsmerge.states.gsm_file import STATE
-from gsmerge.states.state import OnlineState
+from gsmerge.states.state import State
+from gsmerge.states.state_file import load_state, save_state
 
 
 @pytest.fixture(scope="module")
-def state() -> OnlineState:
+def state() -> State:
     return state_of(fed(parts_of(room(4, degree=1), 2)))
 
 
 @pytest.fixture
-def path(state: OnlineState, tmp_path: Path) -> Path:
+def path(state: State, tmp_path: Path) -> Path:
     save_state(tmp_path / "state.gsm", state)
     return tmp_path / "state.gsm"
 
@@ -87,11 +87,11 @@ DAMAGED: dict[str, Spoil] = {
 }
 
 
-def test_everything_comes_back(path: Path, state: OnlineState) -> None:
+def test_everything_comes_back(path: Path, state: State) -> None:
     same_state(load_state(path), state)
 
 
-def test_the_same_state_gives_the_same_bytes(path: Path, state: OnlineState, tmp_path: Path) -> None:
+def test_the_same_state_gives_the_same_bytes(path: Path, state: State, tmp_path: Path) -> None:
     save_state(tmp_path / "again.gsm", state)
     save_state(tmp_path / "loaded.gsm", load_state(path))
     assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
@@ -120,26 +120,13 @@ def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
     same_state(load_state(tmp_path / "a.gsm"), state)
 
 
-def test_what_is_not_known_is_not_looked_at(path: Path, state: OnlineState) -> None:
+def test_what_is_not_known_is_not_looked_at(path: Path, state: State) -> None:
     said, arrays = header(path), load_file(path)
-    arrays["features.moods"], arrays["division.slots"] = np.full(7, np.nan), np.zeros(3)
+    arrays["features.moods"], arrays["division.moods"] = np.full(7, np.nan), np.zeros(3)
     said |= {"minor": 7, "moods": ["good"]}
     said["settings"]["mood"] = "better"
     save_file(arrays, path, {STATE: json.dumps(said), "mood": "best"})
     same_state(load_state(path), state)
-
-
-def test_an_encoded_scene_is_one_too(tmp_path: Path) -> None:
-    encoded = encode_scene(room(2), superpixels="10%", checkpoint="none")
-    save_encoded(tmp_path / "scene.gsm", encoded)
-    assert isinstance(load_stored(tmp_path / "scene.gsm"), Encoded)
-    assert len(load_state(tmp_path / "scene.gsm")) == len(encoded)
-
-
-def test_a_state_is_no_encoded_scene(path: Path) -> None:
-    assert isinstance(load_stored(path), OnlineState)
-    with pytest.raises(SceneError, match="expected Feature Gaussians"):
-        load_encoded(path)
 
 
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
@@ -150,5 +137,5 @@ def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
 
 def test_a_newer_schema_says_what_to_do(path: Path) -> None:
     DAMAGED["a newer schema"](path)
-    with refuses(SceneError, path, 1, 2, 9.9):
+    with refuses(SceneError, path, 2, 3, 9.9):
         load_state(path)

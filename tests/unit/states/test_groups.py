@@ -10,26 +10,25 @@ import pytest
 import scenes
 from network_fixtures import SMALL, Made, made, noisy, written
 from unaligned_scenes import far_behind, shuffled, voxels
-from view_batches import group, random_gaussians, same_group, same_groups
+from view_batches import decoded, group, one_batch, random_gaussians, same_group, same_groups
 
-from gsmerge import Gaussians, Scene, decode_scene, encode_scene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
 from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
-from gsmerge.states.options import merge_settings
-from gsmerge.states.state import (
-    GroupSet,
+from gsmerge.states.groups import (
     bake,
     child_members,
-    from_encoded,
+    divide_groups,
     limit_children,
     moments_of,
     select_groups,
-    to_encoded,
+    share,
     with_fitted_colors,
 )
+from gsmerge.states.state import GroupSet
 from gsmerge.types import SH_C0, FeatureGaussians
 
 ALL = DecodeOptions(min_opacity=0.0)
@@ -170,7 +169,7 @@ def test_part_members_know_the_footprint_of_their_group(groups: GroupSet) -> Non
     assert members.means.shape == gaussian_members(groups.children, members.footprints).means.shape
 
 
-# of an encoded scene
+# of one batch
 
 
 @pytest.fixture(scope="module")
@@ -180,65 +179,74 @@ def pixels() -> Scene:
 
 @pytest.mark.parametrize("most", [1, 2, 4])
 @pytest.mark.parametrize("networks", [False, True])
-def test_an_encoded_scene_is_a_state(networks: bool, most: int, pixels: Scene, tmp_path: Path) -> None:
-    checkpoint = str(written(tmp_path / "a.safetensors", noisy())) if networks else "none"
-    encoded = encode_scene(pixels, superpixels="5%", max_k=most, checkpoint=checkpoint)
-    assert (encoded.heads is not None) == networks
-    state = from_encoded(encoded)
-    assert (len(state), len(state.replay), state.sh_degree) == (len(encoded), 0, 1)
-    again = to_encoded(state)
-    assert again.heads is None
+def test_others_join_the_same_groups(networks: bool, most: int, pixels: Scene, tmp_path: Path) -> None:
+    """Decoded as they are then, and in the same colours while no photo said anything."""
+    options = replace(SMALL, encoder=False)
+    checkpoint = str(written(tmp_path / "a.safetensors", noisy(options))) if networks else "none"
+    state = one_batch(pixels, superpixels="5%", max_k=most, checkpoint=checkpoint, fit_colors=False)
+    assert (state.groups.heads is not None) == networks
+    assert state.networks is None
+    shared = share(state)
+    assert isinstance(shared.groups, GroupSet)
+    assert (len(shared), shared.sh_degree) == (len(state), 1)
+    assert divide_groups(shared).heads is None
     for k in {1, most}:
-        assert_same_children(decode_scene(again, k=k), decode_scene(encoded, k=k))
+        assert_same_children(decoded(shared, k=k), decoded(state, k=k))
 
 
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"k": 2}], ids=str)
-def test_settings_of_an_encoded_scene(settings: dict[str, object], pixels: Scene) -> None:
-    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none", **settings)
-    state = from_encoded(encoded)
-    assert state.settings.target_count is None
-    assert state.settings.max_k == encoded.settings.max_k
-    actual = to_encoded(state)
-    assert len(decode_scene(actual, k=1)) <= len(encoded)
-    for k in (1, encoded.settings.max_k):
-        assert_same_children(decode_scene(actual, k=k), decode_scene(encoded, k=k))
-
-
-def test_the_device_of_another_machine_is_not_asked_for(pixels: Scene) -> None:
-    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
-    options = encoded.about["options"] | {"device": "cuda"}
-    state = from_encoded(replace(encoded, about=encoded.about | {"options": options}))
-    settings, _ = merge_settings({}, state.about["options"])
-    assert (settings.device, settings.segment.superpixels) == ("cpu", "5%")
+def test_numbers_are_of_one_batch(settings: dict[str, object], pixels: Scene) -> None:
+    state = one_batch(pixels, superpixels="5%", checkpoint="none", fit_colors=False, **settings)
+    shared = share(state)
+    assert shared.settings.target_count is None
+    assert shared.settings.max_k == state.settings.max_k
+    assert len(decoded(shared, k=1)) <= len(state)
+    for k in (1, state.settings.max_k):
+        assert_same_children(decoded(shared, k=k), decoded(state, k=k))
 
 
 def test_division_between_one_and_most_is_about_as_good(pixels: Scene) -> None:
     """Children are divided again, of what they are and not of the pixels: close, not equal."""
-    encoded = encode_scene(pixels, superpixels="5%", checkpoint="none")
-    again = to_encoded(from_encoded(encoded))
+    state = one_batch(pixels, superpixels="5%", checkpoint="none", fit_colors=False)
+    shared = share(state)
     for k in (2, 3):
-        before, after = (scenes.psnr_of(decode_scene(one, k=k), pixels) for one in (encoded, again))
+        before, after = (scenes.psnr_of(decoded(one, k=k), pixels) for one in (state, shared))
         assert after > before - 0.3, k
 
 
 def test_scenes_in_no_order_and_what_no_view_sees(pixels: Scene) -> None:
     unaligned = voxels(pixels, 0.05)
-    state = from_encoded(encode_scene(unaligned, superpixels="10%"))
-    assert state.settings.num_slots is None
-    assert len(decode_scene(to_encoded(state), k=2)) > len(state)
+    shared = share(one_batch(unaligned, superpixels="10%"))
+    assert shared.settings.num_slots is None
+    assert len(decoded(shared, k=2)) > len(shared)
     unaligned = shuffled(pixels)
     hidden = far_behind(unaligned.gaussians, 200)
     both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, hidden]))
-    encoded = encode_scene(both, superpixels="10%", unseen="keep")
-    state = from_encoded(encoded)
-    assert scenes.identical(state.kept, encoded.kept)
-    assert to_encoded(state).num_kept == encoded.num_kept > 0
+    state = one_batch(both, superpixels="10%", unseen="keep")
+    shared = share(state)
+    assert scenes.identical(shared.kept, state.kept)
+    assert shared.num_kept == state.num_kept > 0
 
 
-def test_unsolved_colours_are_there_too(groups: GroupSet, pixels: Scene) -> None:
-    state = from_encoded(encode_scene(pixels, superpixels="5%", checkpoint="none"))
+def test_colours_of_one_batch_are_fitted_for_later_ones(pixels: Scene) -> None:
+    """Alone it shows those of its file; where others join, all show fitted ones unless a fit begins with them."""
+    state = one_batch(pixels, superpixels="5%", checkpoint="none")
+    assert state.groups.colors is not None
+    assert state.groups.colors.precision.any()
+    plain = replace(state, groups=replace(state.groups, colors=None))
+    assert scenes.identical(decoded(state, k=2), decoded(plain, k=2))
+    shared = share(state)
+    np.testing.assert_array_equal(shared.groups.fitted_sh0, state.groups.colors.sh0)
+    as_came, fitted = divide_groups(shared, fitted_colors=False), divide_groups(shared)
+    np.testing.assert_array_equal(as_came.features.sh0, shared.groups.features.sh0)
+    np.testing.assert_array_equal(fitted.features.sh0, shared.groups.fitted_sh0)
+    assert scenes.psnr_of(decoded(shared, k=1), pixels) > scenes.psnr_of(decoded(state, k=1), pixels)
+
+
+def test_unsolved_colours_are_there_too(pixels: Scene) -> None:
+    state = share(one_batch(pixels, superpixels="5%", checkpoint="none", fit_colors=False))
     state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
-    as_came, fitted = to_encoded(state, fitted_colors=False), to_encoded(state)
+    as_came, fitted = divide_groups(state, fitted_colors=False), divide_groups(state)
     np.testing.assert_array_equal(as_came.features.sh0, state.groups.features.sh0)
     np.testing.assert_array_equal(fitted.features.sh0, state.groups.fitted_sh0)
     moved = fitted.division.children.sh0 - as_came.division.children.sh0

@@ -7,7 +7,7 @@ from messages import refuses
 
 from gsmerge import Compactor
 from gsmerge.states.compactor import merge_settings
-from gsmerge.states.options import OnlineOptions
+from gsmerge.states.options import ExtendOptions
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from gsmerge.states.options import OnlineOptions
     ],
 )  # fmt: skip
 def test_settings_out_of_range(name: str, value: float) -> None:
-    for use in (OnlineOptions, Compactor):
+    for use in (ExtendOptions, Compactor):
         with refuses(ValueError, name, value):
             use(**{name: value})
 
@@ -26,7 +26,7 @@ def test_settings_out_of_range(name: str, value: float) -> None:
 def test_colours_are_fitted_unless_told_otherwise() -> None:
     options, online = merge_settings({})
     assert options.fit.fit == "none"
-    assert online == OnlineOptions()
+    assert online == ExtendOptions()
     assert online.fit_colors
     assert not merge_settings({"fit_colors": False})[1].fit_colors
 

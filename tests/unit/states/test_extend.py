@@ -13,13 +13,14 @@ from messages import noted, refuses
 from unaligned_scenes import NO_CAMERAS, far_behind, shuffled, without_order
 from view_batches import FAST, counts, fed, parts_of, room, same_groups, same_state, state_of
 
-from gsmerge import Compactor, Gaussians, Scene, decode_scene, encode_scene
+from gsmerge import Compactor, Gaussians, Scene
 from gsmerge.errors import UsageError
 from gsmerge.fit import FitOptions, FitReport
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.states.decode_stored import decode_stored
+from gsmerge.states.decode import decode_state
 from gsmerge.states.extend import extend
-from gsmerge.states.state import OnlineState, from_encoded
+from gsmerge.states.groups import select_groups, share
+from gsmerge.states.state import State
 from gsmerge.types import grid_ids
 
 Change = Callable[[Scene], Scene]
@@ -36,7 +37,7 @@ def pairs(scene: Scene) -> list[Scene]:
 
 
 @pytest.fixture(scope="module")
-def first(pairs: list[Scene]) -> OnlineState:
+def first(pairs: list[Scene]) -> State:
     """Of the first pair alone."""
     return state_of(fed(pairs[:1]))
 
@@ -46,14 +47,6 @@ def options(**settings: Any) -> CompactOptions:
 
 
 # the first batch
-
-
-@pytest.mark.parametrize("k", [1, 4])
-def test_a_first_batch_is_an_encoded_scene(k: int, scene: Scene) -> None:
-    """As many Gaussians, about the same ones: what is solid is told by the moments, in float32."""
-    actual = fed([scene], fit_colors=False).decode(k=k, fit="none")
-    expected = decode_scene(encode_scene(scene, **FAST), k=k)
-    scenes.assert_same_set(actual, expected, atol=5e-3, unit=0.05)
 
 
 def test_shipped_networks_compete_in_every_batch(pairs: list[Scene]) -> None:
@@ -100,7 +93,7 @@ def test_reports_add_up(pairs: list[Scene]) -> None:
     assert len(state_of(compactor).cameras) == 6
 
 
-def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: OnlineState) -> None:
+def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: State) -> None:
     before = state_of(fed(pairs[:1]))
     after, _ = extend(first, pairs[1], options())
     assert after is not first
@@ -108,7 +101,7 @@ def test_the_old_state_is_left_as_it_is(pairs: list[Scene], first: OnlineState) 
     same_state(first, before)
 
 
-def test_views_that_come_again_count_once(pairs: list[Scene], first: OnlineState) -> None:
+def test_views_that_come_again_count_once(pairs: list[Scene], first: State) -> None:
     state, report = extend(first, pairs[0], options())
     assert state.settings.num_input == first.settings.num_input
     assert len(state.cameras) == len(first.cameras)
@@ -134,7 +127,7 @@ def test_the_threads_do_not_matter(settings: dict[str, Any], pairs: list[Scene])
         assert scenes.identical(gaussians, actual[0])
 
 
-def test_the_settings_of_each_batch_are_its_own(pairs: list[Scene], first: OnlineState) -> None:
+def test_the_settings_of_each_batch_are_its_own(pairs: list[Scene], first: State) -> None:
     _, few = extend(first, pairs[1], options(superpixels=20))
     _, many = extend(first, pairs[1], options(superpixels=60))
     assert few.num_new < many.num_new
@@ -143,14 +136,14 @@ def test_the_settings_of_each_batch_are_its_own(pairs: list[Scene], first: Onlin
 # what batches may be
 
 
-def test_pictures_of_another_size(scene: Scene, first: OnlineState, floor: Callable[..., None]) -> None:
+def test_pictures_of_another_size(scene: Scene, first: State, floor: Callable[..., None]) -> None:
     large = room(6, 54, 36)
     state, report = extend(first, scenes.take_views(large, [2, 3]), options())
     assert report.num_input == 2 * 54 * 36
     assert (state.cameras.width, state.cameras.height) == (36, 24)
     assert state.replay.images.shape == (4, 24, 36, 3)
     assert report.num_covered + report.num_joined > 0.3 * report.num_new
-    gaussians = decode_stored(state, options=options().fit).gaussians
+    gaussians = decode_state(state, options=options().fit).gaussians
     floor(scenes.psnr_of(gaussians, scenes.take_views(scene, [2, 3])))
     single, _ = extend(first, scenes.take_views(scene, [2, 3]), options())
     np.testing.assert_allclose(state.cameras.Ks, single.cameras.Ks, rtol=1e-9)
@@ -225,39 +218,25 @@ def test_what_no_view_sees_is_kept(pairs: list[Scene]) -> None:
         assert len(compactor.decode(**wish, budget=expected)) == pytest.approx(expected, abs=2), wish
 
 
-def test_views_that_see_nothing_of_the_state(first: OnlineState) -> None:
+def test_views_that_see_nothing_of_the_state(first: State) -> None:
     """A room far away: all is new, and what was there stays as it was."""
     away = scenes.move(room(2), np.eye(3), 1.0, np.array([100.0, 0.0, 0.0]))
     state, report = extend(first, away, options())
     assert (report.num_covered, report.num_joined) == (0, 0)
     assert len(state) == len(first) + report.num_new - report.num_hidden
-    before = replace(state, groups=first.groups)
-    select_groups = np.arange(len(first))
-    from gsmerge.states.state import select_groups as picked
-
-    same_groups(picked(state.groups, select_groups), picked(before.groups, select_groups))
+    rows = np.arange(len(first))
+    same_groups(select_groups(state.groups, rows), select_groups(share(first).groups, rows))
 
 
-def test_a_batch_without_a_valid_gaussian(pairs: list[Scene], first: OnlineState) -> None:
+def test_a_batch_without_a_valid_gaussian(pairs: list[Scene], first: State) -> None:
     """Its photos count all the same."""
     nothing = replace(pairs[1], pixel_ids=grid_ids(np.zeros_like(pairs[1].valid)))
     state, report = extend(first, nothing, options())
     assert (report.num_new, len(state)) == (0, len(first))
     assert len(state.replay) == 4
-    assert scenes.identical(state.groups.children, first.groups.children)
+    assert scenes.identical(state.groups.children, share(first).groups.children)
     with refuses(ValueError, "", "valid", "none"):
         Compactor(**FAST).extend(nothing)
-
-
-def test_an_encoded_scene_is_extended(pairs: list[Scene]) -> None:
-    encoded = encode_scene(pairs[0], **FAST)
-    state, report = extend(from_encoded(encoded), pairs[1], options())
-    assert report.num_covered + report.num_joined > 0
-    assert len(state) > len(encoded)
-    assert state.replay.views.tolist() == [2, 3]
-    assert [batch["num_views"] for batch in state.about["batches"]] == [2, 2]
-    other, _ = extend(state_of(fed(pairs[:1], fit_colors=False)), pairs[1], options())
-    assert abs(len(state) - len(other)) < 0.1 * len(other)
 
 
 def test_everything_counts_without_a_tolerance(pairs: list[Scene]) -> None:
@@ -305,14 +284,14 @@ def test_a_full_fit_shows_more(scene: Scene, pairs: list[Scene]) -> None:
 
 
 def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsmerge.states import decode_stored as decode_module
+    from gsmerge.states import decode as decode_module
 
     def refused(gaussians: Gaussians, *_: object, **__: object) -> tuple[Gaussians, FitReport]:
         return gaussians, FitReport("none", False, 1, 20.0, 19.0, "in vain")
 
     monkeypatch.setattr(decode_module, "fit", refused)
     compactor = fed(pairs)
-    actual = decode_stored(state_of(compactor), k=1, options=FitOptions(fit_steps=4))
+    actual = decode_state(state_of(compactor), k=1, options=FitOptions(fit_steps=4))
     assert not actual.fit.accepted
     assert noted(actual.notes, "fit", "accepted")
     assert scenes.identical(actual.gaussians, compactor.decode(k=1, fit="none"))
@@ -321,9 +300,8 @@ def test_a_fit_in_vain_leaves_the_solved_colours(pairs: list[Scene], monkeypatch
 @pytest.mark.parametrize("settings", [{"budget": "10%"}, {"budget": "auto"}, {"budget": "20KB"}], ids=str)
 def test_numbers_that_each_batch_is_cut_to(settings: dict[str, Any], pairs: list[Scene]) -> None:
     compactor = fed(pairs[:2], **settings)
-    own, _ = extend(from_encoded(encode_scene(pairs[0], **FAST | settings)), pairs[1], options(**settings))
-    assert abs(len(own) - len(compactor)) < 0.1 * len(own)
-    assert len(decode_stored(own, options=FitOptions(fit="none")).gaussians) >= len(own) - 5
+    assert len(compactor) > len(fed(pairs[:1], **settings))
+    assert len(compactor.decode(fit="none")) >= len(compactor) - 5
 
 
 def test_decoding_changes_nothing(pairs: list[Scene]) -> None:
@@ -355,7 +333,7 @@ def test_what_a_state_cannot_have(settings: dict[str, Any], place: str, pairs: l
     assert compactor.state is None
 
 
-def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: OnlineState) -> None:
+def test_more_gaussians_of_a_group_than_are_kept(pairs: list[Scene], first: State) -> None:
     with refuses(UsageError, "max_k", 3, 2):
         Compactor(**FAST, k=3, max_k=2).extend(pairs[0])
     with refuses(UsageError, "max_k", 5, 4):
