@@ -151,11 +151,9 @@ def _settings_page() -> str:
         "`gsmerge extend`": flat_settings(ExtendOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
-    lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
-    lines += [
-        "`--set poses=fixed --set min_opacity=0.01`; `decode` takes those of the fit, `render` and `view` those of"
-    ]
-    lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
+    lines += ["`compact`, `batch`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
+    lines += ["`--set poses=fixed --set min_opacity=0.01`; `compact` of a state takes those of the fit and of files,"]
+    lines += ["`render` and `view` those of superpixels. In Python they are arguments of `gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
     for title, settings in tables.items():

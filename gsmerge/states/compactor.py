@@ -20,6 +20,10 @@ from gsmerge.types import Gaussians, Scene
 class Compactor:
     """Compact views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
 
+    After one batch ``decode(k=2, fit="none")`` equals ``compact(scene, k=2, fit="none", poses="fixed",
+    exposure="fixed")`` bit for bit, as does any other ``k`` up to ``max_k``, with two exceptions: a budget or the size
+    of the input limits the number of superpixels; or Gaussians that no view sees are kept, which are merged for one K.
+
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
             :class:`gsmerge.states.options.ExtendOptions`: ``Compactor(superpixels="3%", max_k=2)``.
@@ -81,8 +85,9 @@ class Compactor:
         """Decode the current state into Gaussians; see :func:`gsmerge.states.decode.decode_state`.
 
         Args:
-            k: Gaussians of each group; None: that of the settings.
-            budget: Gaussians in all instead.
+            k: Gaussians of each group, 1 to ``max_k``; None: that of the settings.
+            budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size
+                as "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most.
             progress: See :func:`gsmerge.compact`.
             **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``.
 
