@@ -63,7 +63,7 @@ class Batch:
 
     prepared: Prepared
     plan: Plan
-    online: ExtendOptions
+    extend_options: ExtendOptions
     photos: BatchPhotos  # At the size of the state's views; the colours of the Gaussians where there are no photos
     view_ids: np.ndarray  # [v] int64, which of all views each is
     is_new: np.ndarray  # [v] bool, which views the state does not have yet
@@ -84,13 +84,13 @@ class Batch:
         return float(self.plan.settings["min_contribution"])
 
 
-def make_batch(state: State | None, prepared: Prepared, plan: Plan, online: ExtendOptions) -> Batch:
+def make_batch(state: State | None, prepared: Prepared, plan: Plan, extend_options: ExtendOptions) -> Batch:
     """Make a batch: resize its photos to those of the state, and find out which views are new."""
     cameras = prepared.scene.cameras
     before = cameras[:0] if state is None else state.cameras
     photos = resize_photos(scene_pictures(prepared.scene), cameras, before.width, before.height)
     ids = view_ids(before, photos.cameras)
-    return Batch(prepared, plan, online, photos, ids, ids >= len(before))
+    return Batch(prepared, plan, extend_options, photos, ids, ids >= len(before))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +220,9 @@ def group_errors(features: FeatureGaussians, members: Members, errors: np.ndarra
 
 def novel_rows(new: BatchFeatures, batch: Batch, state_gaussians: Gaussians, batch_gaussians: Gaussians) -> np.ndarray:
     """Return the rows of a batch's Feature Gaussians that explain the photos clearly better than the state does."""
-    photos, cameras, online = batch.photos.photos(2), batch.scene.cameras, batch.online
+    photos, cameras, options = batch.photos.photos(2), batch.scene.cameras, batch.extend_options
     state_errors, batch_errors = (
         group_errors(new.features, new.members, pixel_errors(gaussians, photos, cameras.height, cameras.width))
         for gaussians in (state_gaussians, batch_gaussians)
     )
-    return np.flatnonzero(state_errors > np.maximum(online.tolerance**2, online.margin**2 * batch_errors))
+    return np.flatnonzero(state_errors > np.maximum(options.tolerance**2, options.margin**2 * batch_errors))

@@ -39,7 +39,7 @@ class Compactor:
     """
 
     def __init__(self, **settings: Any) -> None:
-        self._options, self._online = merge_settings(settings)
+        self._options, self._extend_options = merge_settings(settings)
         self._state: State | None = None
 
     @classmethod
@@ -53,7 +53,7 @@ class Compactor:
         state = load_state(path)
         compactor = cls.__new__(cls)
         compactor._state = state
-        compactor._options, compactor._online = merge_settings(settings, state.about["options"])
+        compactor._options, compactor._extend_options = merge_settings(settings, state.about["options"])
         return compactor
 
     def __repr__(self) -> str:
@@ -76,7 +76,7 @@ class Compactor:
 
     def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
         """Add a batch of views, see :func:`gsmerge.states.extend.extend`."""
-        self._state, report = extend(self._state, scene, self._options, self._online, progress=progress)
+        self._state, report = extend(self._state, scene, self._options, self._extend_options, progress=progress)
         return report
 
     def decode(

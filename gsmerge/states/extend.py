@@ -61,21 +61,22 @@ def extend(
     state: State | None,
     scene: Scene,
     options: CompactOptions | None = None,
-    online: ExtendOptions | None = None,
+    extend_options: ExtendOptions | None = None,
     *,
     progress: Progress | None = None,
 ) -> tuple[State, BatchReport]:
     """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
 
     ``state``: what earlier batches left, which is not changed; None: this is the first batch. ``scene``: the new views,
-    in the same world as the earlier ones; tensors become arrays. ``online``: which part of the batch enters the state,
-    and how. Raises ValueError if a setting is out of range or not possible for a state, or the SH degree differs from
-    the state's.
+    in the same world as the earlier ones; tensors become arrays. ``extend_options``: which part of the batch enters the
+    state, and how. Raises ValueError if a setting is out of range or not possible for a state, or the SH degree differs
+    from the state's.
     """
-    options, online = options or CompactOptions().with_settings({"fit": "none"}), online or ExtendOptions()
+    options = options or CompactOptions().with_settings({"fit": "none"})
+    extend_options = extend_options or ExtendOptions()
     if state is not None and options.decode.k == AUTO:
         options = replace(options, decode=replace(options.decode, k=USUAL_K))  # whatever the batch is like
-    max_k = online.max_k if state is None else state.settings.max_k
+    max_k = extend_options.max_k if state is None else state.settings.max_k
     _check(state, scene, options, max_k)
     with use_threads(options.threads), record_run(progress) as record:
         fixed = replace(options.prepare, poses="fixed", exposure="fixed")  # as all other batches
@@ -88,7 +89,7 @@ def extend(
         has_latents = keeps_latents(plan) if state is None else state.networks is not None
         if keeps_latents(plan) and not has_latents:
             note("the state holds no latents: groups of this batch are decoded when they enter")
-        batch, kind = make_batch(state, prepared, plan, online), LATENTS if has_latents else MOMENTS
+        batch, kind = make_batch(state, prepared, plan, extend_options), LATENTS if has_latents else MOMENTS
         if not batch.is_new.all():
             note(
                 f"views with the cameras of earlier ones, which count once: {sum(~batch.is_new)} of {len(batch.is_new)}"
@@ -105,7 +106,7 @@ def extend(
         if prepared.input_scene.images is not None:
             state = _with_photos(state, batch)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
-    settings = options.to_dict() | asdict(online)
+    settings = options.to_dict() | asdict(extend_options)
     stored = {name: value for name, value in settings.items() if name != "threads"}  # which depend on the machine
     about = {"gsmerge": __version__, "options": stored, "batches": [*state.about.get("batches", []), numbers]}
     report = BatchReport(
@@ -145,7 +146,7 @@ def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
 
 def _most_children(new: BatchFeatures, batch: Batch) -> int:
     """Return the largest number of children of a group that is stored."""
-    most, decode = batch.online.max_k, batch.plan.decode
+    most, decode = batch.extend_options.max_k, batch.plan.decode
     if most is None:
         asks_for_number = new.segmentation.exact or new.members.pixels is not None
         most = MAX_CHILDREN if asks_for_number or decode.max_k > USUAL_MAX_K else USUAL_MAX_K
@@ -158,7 +159,7 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
     groups, settings = state.groups, state.settings
     assert isinstance(groups, GroupSet)
     rows = rows_in_view(groups.features, cameras, kind.reach)
-    if batch.online.tolerance > 0:
+    if batch.extend_options.tolerance > 0:
         with stage("cover"):
             novel = novel_rows(new, batch, *kind.decode(select_groups(groups, rows), new))
             counts["num_covered"] = len(new.features) - len(novel)
@@ -185,14 +186,14 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
 def _with_photos(state: State, batch: Batch) -> State:
     """Fit colours to a batch's photos, but those of heads, and keep some of the photos."""
     groups = state.groups
-    if batch.online.fit_colors and state.networks is None:
+    if batch.extend_options.fit_colors and state.networks is None:
         with stage("fit"):
             shared = share_groups(groups, state.cameras, 1) if isinstance(groups, DividedGroups) else groups
             shared, report = fit_batch_colors(shared, batch.photos, batch.plan.fit, batch.plan.seed)
             choose(fit=report.to_dict())
         colors = Colors(shared.fitted_sh0, shared.color_precision)
         groups = replace(groups, colors=colors) if isinstance(groups, DividedGroups) else shared
-    replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.online.replay)
+    replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.extend_options.replay)
     return replace(state, groups=groups, replay=replay)
 
 

@@ -62,7 +62,7 @@ def extend_file(
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)
     try:
-        options, online = merge_settings(settings, None if state is None else state.about["options"])
+        options, extend_options = merge_settings(settings, None if state is None else state.about["options"])
     except ValueError as error:
         raise UsageError(str(error)) from error
     with ExitStack() as until_renamed, atomic_output(path, overwrite=identity is not None) as temporary:
@@ -70,7 +70,7 @@ def extend_file(
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
         is_first = state is None
-        state, report = extend(state, load.scene, options, online, progress=progress)
+        state, report = extend(state, load.scene, options, extend_options, progress=progress)
         if is_first:
             state = replace(state, about={**state.about, "source": _source(files, load)})
         done = perf_counter()

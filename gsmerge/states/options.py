@@ -46,5 +46,5 @@ def merge_settings(
     before = {name: value for name, value in (stored or {}).items() if name in all_names}
     recipe = settings.get("recipe", before.get("recipe"))
     merged = {"fit": "none"} | dict(RECIPES.get(str(recipe), {})) | before | dict(settings)
-    online = ExtendOptions(**{name: merged.pop(name) for name in names if name in merged})
-    return CompactOptions().with_settings(merged), online
+    extend_options = ExtendOptions(**{name: merged.pop(name) for name in names if name in merged})
+    return CompactOptions().with_settings(merged), extend_options

@@ -1,7 +1,7 @@
 """The table of hostile inputs: what careless or malicious files may hold, and what has to come of it.
 
 Read by ``tests/e2e/test_hostile_input.py`` and ``benchmarks/hostile.py``. ``changes`` makes further ones at random of
-sound files; ``gsm_files`` damages encoded scenes and states.
+sound files; ``gsm_files`` damages states.
 """
 
 from __future__ import annotations

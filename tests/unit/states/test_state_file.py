@@ -59,7 +59,7 @@ FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.mean
 DAMAGED: dict[str, Spoil] = {
     **UNREADABLE,
     **GSM_HEADERS,
-    "an encoded scene by its name": with_text("{}", "gsmerge-encoded"),
+    "of 0.1's encode by its name": with_text("{}", "gsmerge-encoded"),
     "views of another size": with_header(width=35),
     "no about": without("about"),
     "about without options": with_header(about={"batches": []}),
