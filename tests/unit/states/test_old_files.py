@@ -48,6 +48,7 @@ def test_what_each_holds() -> None:
     assert (encoded.networks, state.networks) == (None, None)
     assert latents.networks is not None
     assert encoded.about["source"]["name"] == "room.ply"
+    assert not {"fit", "device"} & encoded.about["options"].keys()  # there is nothing to fit to, and other machines
     assert [len(one.about["batches"]) for one in (encoded, state, latents)] == [1, 2, 2]
 
 
