@@ -2,7 +2,7 @@
 
 python benchmarks/kills.py                                       # every call of six commands; Linux and gcc
 python benchmarks/kills.py --calls 6 --commands compact extend   # six calls of each, at equal distances
-python benchmarks/kills.py --plant copies --commands encode      # with a fault, which must be reported
+python benchmarks/kills.py --plant copies --commands extend      # with a fault, which must be reported
 
 A preloaded library (kills.c) counts the calls (opens for writing, writes, syncs, renames, removals, new folders) and
 ends the process by SIGKILL before one of them. Then every file must be what it was or what the command makes, no index
@@ -39,7 +39,6 @@ COMMANDS = {
     "compact": (COMPACT.format(scene="{a}", out="{out}"), COMPACT.format(scene="{b}", out="{out}")),
     "extend": ("extend {out}/a.gsm {b} --effort draft --threads 1", "extend {out}/a.gsm {a} --effort draft"),
     "batch": (f"batch {{scenes}} -o {{out}} --jobs 1 {FAST}", None),
-    "encode": tuple(f"encode {{{x}}} -o {{out}}/a.gsm --effort draft --threads 1 --overwrite" for x in "ab"),
     "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
     "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
 }

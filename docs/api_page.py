@@ -14,14 +14,7 @@ TOPICS = {
     "Compact": ("compact", "compact_tensors", "CompactOptions", "CompactResult", "CompactReport"),
     "Write": ("write_ply", "write_gaussians", "write_levels"),
     "Draw and measure": ("render", "Rendering", "evaluate", "EvaluateOptions", "Evaluation", "superpixels", "saliency"),
-    "Encode once, decode many": (
-        "encode_scene",
-        "decode_scene",
-        "save_encoded",
-        "load_encoded",
-        "Encoded",
-        "Compactor",
-    ),
+    "Views in batches, results of any size": ("Compactor",),
     "Data": ("Scene", "Gaussians", "Cameras", "Views"),
     "Errors": ("GsmergeError", "SceneError"),
 }

@@ -131,11 +131,11 @@ def _cell(text: str | None) -> str:
 
 def _settings_page() -> str:
     from gsmerge.cli.paths import FileOptions
-    from gsmerge.online.options import OnlineOptions
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.placement import PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
+    from gsmerge.states.options import ExtendOptions
 
     whole = settings_of(CompactOptions)
     stages = {name: list(flat_settings(one.kind).values()) for name, one in whole.items() if one.is_group}
@@ -148,14 +148,12 @@ def _settings_page() -> str:
         "The whole run": [one for name, one in whole.items() if name not in stages],
         "Files": flat_settings(FileOptions).values(),
         "The frame of what is written": flat_settings(PlacementOptions).values(),
-        "`gsmerge extend`": flat_settings(OnlineOptions).values(),
+        "`gsmerge extend`": flat_settings(ExtendOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
-    lines += ["`compact`, `batch`, `encode`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
-    lines += [
-        "`--set poses=fixed --set min_opacity=0.01`; `decode` takes those of the fit, `render` and `view` those of"
-    ]
-    lines += ["superpixels, `compact` and `decode` those of files. In Python they are arguments of `gsmerge.compact`."]
+    lines += ["`compact`, `batch`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
+    lines += ["`--set poses=fixed --set min_opacity=0.01`; `compact` of a state takes those of the fit and of files,"]
+    lines += ["`render` and `view` those of superpixels. In Python they are arguments of `gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
     for title, settings in tables.items():

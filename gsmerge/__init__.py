@@ -21,11 +21,6 @@ if TYPE_CHECKING:
     from gsmerge.compaction.result import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
-    from gsmerge.encoded.encoded import Encoded as Encoded
-    from gsmerge.encoded.gsm_file import load_encoded as load_encoded
-    from gsmerge.encoded.gsm_file import save_encoded as save_encoded
-    from gsmerge.encoded.to_encoded import encode_scene as encode_scene
-    from gsmerge.encoded.to_gaussians import decode_scene as decode_scene
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
     from gsmerge.io import read_cameras as read_cameras
@@ -37,7 +32,6 @@ if TYPE_CHECKING:
     from gsmerge.io import write_ply as write_ply
     from gsmerge.measure.evaluate import Evaluation as Evaluation
     from gsmerge.measure.evaluate import evaluate as evaluate
-    from gsmerge.online.compactor import Compactor as Compactor
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
     from gsmerge.scene.read import read_scene as read_scene
@@ -45,6 +39,7 @@ if TYPE_CHECKING:
     from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.stages.superpixels import saliency as saliency
     from gsmerge.stages.superpixels import superpixels as superpixels
+    from gsmerge.states.compactor import Compactor as Compactor
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
@@ -57,15 +52,11 @@ _PUBLIC = {
     "compaction.inspect": ("inspect",),
     "compaction.result": ("CompactReport", "CompactResult"),
     "compaction.tensors": ("compact_tensors",),
-    "encoded.encoded": ("Encoded",),
-    "encoded.gsm_file": ("load_encoded", "save_encoded"),
-    "encoded.to_encoded": ("encode_scene",),
-    "encoded.to_gaussians": ("decode_scene",),
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),
     "measure.evaluate": ("Evaluation", "evaluate"),
-    "online.compactor": ("Compactor",),
+    "states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
     "scene.read": ("read_scene",),
     "settings.compact": ("CompactOptions",),

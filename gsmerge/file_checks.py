@@ -9,8 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsmerge.encoded.encoded import Encoded
-from gsmerge.encoded.gsm_file import ENCODED, STATE, SUFFIX, read_gsm, wrong_checksums
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
 from gsmerge.io.bounds import check_file
@@ -24,11 +22,13 @@ from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import FileInfo, degree_notes, read_level
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.online.file import load_stored
 from gsmerge.report import human_bytes
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.no_gaussians import check_scene_file
 from gsmerge.scene.read import load_files
+from gsmerge.states.gsm_file import read_gsm, wrong_checksums
+from gsmerge.states.options import SUFFIX
+from gsmerge.states.state_file import load_state
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
@@ -40,8 +40,7 @@ class FileCheck:
     """Content of a file and the problems found in it."""
 
     path: str
-    # "Gaussians", "cameras", "networks", "encoded scene" or "state"; "" where it cannot be read
-    kind: str
+    kind: str  # "Gaussians", "cameras", "networks" or "state"; "" where it cannot be read
     count: int = 0  # Gaussians, views, parameters or groups
     layout: str = ""  # of the columns or of the cameras' file
     file_bytes: int = 0
@@ -196,16 +195,15 @@ def _problems(info: FileInfo) -> list[str]:
 
 
 def _read_gsm(path: Path) -> FileCheck:
-    wrong = wrong_checksums(read_gsm(path, ENCODED, STATE))
+    wrong = wrong_checksums(read_gsm(path))
     notes = () if wrong is not None else ("no checksums: an older gsmerge wrote it",)
     problems = [f"{', '.join(wrong[:4])}: not what was written, by the checksums"] if wrong else []
     try:
-        stored = load_stored(path)
+        state = load_state(path)
     except SceneError as error:
         problems.append(_problem(error, path))
         return FileCheck(str(path), "", problems=tuple(problems), notes=notes)
-    kind = "encoded scene" if isinstance(stored, Encoded) else "state"
-    return FileCheck(str(path), kind, len(stored), problems=tuple(problems), notes=notes)
+    return FileCheck(str(path), "state", len(state), problems=tuple(problems), notes=notes)
 
 
 def _damaged_member(path: Path) -> str | None:

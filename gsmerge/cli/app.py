@@ -50,6 +50,8 @@ OTHER_WORDS = {
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
+# Commands of 0.1 -> what does the same; to be left out after the next release
+REPLACED = {"encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2"}
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
@@ -61,7 +63,7 @@ REPLACED = {"rerun": "overwrite", "max_memory": "jobs"}
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
     "Compact": ("compact", "convert"),
-    "Many scenes, and encoding once": ("batch", "encode", "decode", "extend"),
+    "Many scenes, and views in batches": ("batch", "extend"),
     "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
 }
 OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
@@ -143,6 +145,8 @@ def _usage_message(error: Any) -> str:
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
+        if match[1] in REPLACED:
+            return f"{match[1]} is no command any more: use {REPLACED[match[1]]}"
         near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
         message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
     return f"{message}; see '{place} --help'"

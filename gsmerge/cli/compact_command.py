@@ -26,6 +26,7 @@ from gsmerge.cli.paths import (
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
+from gsmerge.states.options import SUFFIX
 
 if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
@@ -39,7 +40,8 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
 
 @opt.command(
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
-                 "or the folder it is in; several of one place, as SHARP writes them, are joined."),
+                 "or the folder it is in; several of one place, as SHARP writes them, are joined. Or a .gsm of gsmerge "
+                 "extend."),
     f"{opt.READING} masks k superpixels budget quality levels blocks",
     "effort fit exposure poses method recipe checkpoint set crop drop up scale rotate translate",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
@@ -52,6 +54,11 @@ MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them bett
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
+    if any(path.suffix.lower() == SUFFIX for path in args.scenes):
+        from gsmerge.cli.compact_state import compact_state
+
+        compact_state(args, start)
+        return
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
@@ -158,12 +165,13 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
-    """Print an estimate of what ``compact`` or ``encode`` would make of a scene."""
+    """Print an estimate of what ``compact`` would make of a scene."""
     from gsmerge.compaction.files import Outputs, plan_files, plan_lines, read_input
 
-    load, embeds = read_input(files, opacity=args.opacity, hints=hints), bool(vars(args).get("embed_cameras"))
-    saved = vars(args).get("save_cameras")
+    load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
-        outputs = Outputs(out, saved_cameras=saved, embed_cameras=embeds, overwrite=args.overwrite)
+        outputs = Outputs(
+            out, saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras, overwrite=args.overwrite
+        )
         document = plan_files(load, settings, outputs)
     print_document(document, plan_lines(document), as_json=args.json, wrap=True)

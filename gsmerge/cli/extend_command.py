@@ -14,24 +14,21 @@ from gsmerge.errors import UsageError
 
 
 @opt.command(
-    opt.argument("state", Path, "STATE", "A .gsm file: of gsmerge extend or encode, or made by the first batch."),
+    opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
     opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as of compact."),
-    f"{opt.READING} k superpixels",
-    *opt.panel(opt.COUNT, opt.setting_option("max_k")),
-    "effort recipe checkpoint set",
-    opt.RUN,
-)  # fmt: skip
+    f"{opt.READING} k max_k superpixels budget effort recipe checkpoint set {opt.RUN}",
+)
 def extend(args: opt.Args) -> None:
-    """Add new views to a state, which gsmerge decode turns into a compact scene at any time."""
+    """Add the views of scenes to a state, of which gsmerge compact makes a result of any size at any time."""
     start = perf_counter()
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
-    from gsmerge.online.file import batch_line, extend_file
-    from gsmerge.online.options import OnlineOptions
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.states.files import batch_line, extend_file
+    from gsmerge.states.options import ExtendOptions
 
-    settings = args.values(CompactOptions, OnlineOptions)
+    settings = args.values(CompactOptions, ExtendOptions)
     batches = [args.files(scene) for scene in args.scenes]
     for files in batches:
         if any(path.resolve() == args.state.resolve() for path in input_files(files)):

@@ -25,13 +25,13 @@ import typer
 
 from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
-from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
 from gsmerge.settings.stages import CROP_FILES, Engine
+from gsmerge.states.options import ExtendOptions
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
@@ -46,7 +46,7 @@ REQUIRED = Parameter.empty
 SETTINGS_PAGE = "docs/reference/settings.md"
 
 SETTINGS = {
-    setting.name: setting for kind in (EvaluateOptions, Engine, OnlineOptions, PlacementOptions, CompactOptions)
+    setting.name: setting for kind in (EvaluateOptions, Engine, ExtendOptions, PlacementOptions, CompactOptions)
     for setting in flat_settings(kind).values()
 }  # fmt: skip
 
@@ -308,8 +308,7 @@ _TABLE = (
         setting_option("quality"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
         setting_option("blocks", parser=number_or_text),
-        setting_option("max_k", help="Most Gaussians per superpixel that can be decoded later: more take more space.",
-                       wording="4, or 8 with a --budget"),
+        setting_option("max_k"),
     ),
     panel(
         METHOD,

@@ -136,7 +136,7 @@ def compact_files(
 
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return as a document what :func:`compact_files`, or an encoding, would make of a scene."""
+    """Return as a document what :func:`compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs)
     _, unused = check_method(settings, scene)

@@ -110,7 +110,7 @@ class CompactOptions(Settings):
 
     @property
     def compact_only(self) -> list[str]:
-        """Names of the settings in use that ``encode`` and ``extend`` cannot honour."""
+        """Names of the settings in use that ``extend`` cannot honour."""
         asked = {"k mixed": self.decode.k == MIXED, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
         return [*self.whole_only, *(name for name, wanted in asked.items() if wanted)]
 

@@ -65,7 +65,7 @@ def calls_in(page: str) -> list[str]:
 
 
 def test_commands_are_the_documented_ones() -> None:
-    listed = "compact convert batch encode decode extend inspect check view render evaluate chart generate stress train"
+    listed = "compact convert batch extend inspect check view render evaluate chart generate stress train"
     assert list(COMMANDS) == listed.split()
 
 

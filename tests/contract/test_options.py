@@ -13,8 +13,9 @@ import typer.main
 from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
-from gsmerge.online.options import OnlineOptions
 from gsmerge.research.generate import GenerateOptions
+from gsmerge.settings.setting import flat_settings
+from gsmerge.states.options import ExtendOptions
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 
@@ -28,7 +29,7 @@ def shown(command: str, name: str) -> Any:
 
 
 def test_defaults_of_single_commands_are_the_library_s() -> None:
-    assert shown("extend", "max_k") == str(OnlineOptions().max_k)
+    assert shown("extend", "max_k") == flat_settings(ExtendOptions)["max_k"].shown
     assert shown("batch", "engine") == BatchOptions().engine == "local"
     assert shown("batch", "name") == BatchOptions().output
     made = GenerateOptions()
@@ -65,7 +66,7 @@ def test_output_is_one_option_everywhere(command: str) -> None:
     [
         ("compact scene --fit-steps 60", "--set fit_steps=VALUE"),
         ("batch scene --require-checkpoint", "--set require_checkpoint=true"),
-        ("decode a.gsm --no-normals", "--set normals=false"),
+        ("compact a.gsm --no-normals", "--set normals=false"),
         ("inspect scene --order none", "--hint order=VALUE"),
         ("inspect scene --poses fixed", ": --poses"),
         ("generate -o rooms --segmentation grid", ": --segmentation"),
@@ -126,5 +127,5 @@ def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: p
 
 def test_commands_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:
     text = help_of(capsys, "--help")
-    titles = ("Compact", "Many scenes, and encoding once", "Look and measure", "Research")
+    titles = ("Compact", "Many scenes, and views in batches", "Look and measure", "Research")
     assert [text.index(f"─ {title} ─") for title in titles] == sorted(text.index(f"─ {title} ─") for title in titles)

@@ -11,7 +11,7 @@ import pytest
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
 COMMANDS = (
-    "compact", "batch", "encode", "decode", "extend", "inspect", "check", "view", "render", "evaluate", "stress",
+    "compact", "batch", "extend", "inspect", "check", "view", "render", "evaluate", "stress",
     "chart", "generate", "train",
 )  # fmt: skip
 

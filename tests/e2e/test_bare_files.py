@@ -74,7 +74,7 @@ def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
         ("compact", bare, "--dry-run"), ("inspect", bare), ("render", bare, small, "-o", tmp_path / "p.png"),
         ("render", bare, "--path", "orbit", "--frames", "2", "-o", tmp_path / "frames"),
         ("view", bare, small, "-o", tmp_path / "v.html"), ("evaluate", bare, small, "--lpips", "none"),
-        ("encode", bare, "-o", tmp_path / "s.gsm", *quick), ("extend", tmp_path / "state.gsm", bare, *quick),
+        ("extend", tmp_path / "state.gsm", bare, *quick),
     ):  # fmt: skip
         document = report_of(run, *words)
         notes = document.get("batches", [document])[0]["notes"]

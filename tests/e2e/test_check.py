@@ -25,7 +25,7 @@ from gsmerge.networks.checkpoint import IN_PACKAGE
 from .conftest import Run, assert_refused, listing
 
 FORMATS = ("scene.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog")
-OTHERS = ("room.gsm", "state.gsm", "networks.safetensors", "transforms.json", "views.npz")
+OTHERS = ("state.gsm", "networks.safetensors", "transforms.json", "views.npz")
 Spoil = Callable[[Path], object]
 
 
@@ -39,7 +39,6 @@ def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = gsmerge.read_cameras(folder / "transforms.json")
     np.savez(folder / "views.npz", extrinsics=cameras.viewmats[:, :3], intrinsics=cameras.Ks)
     small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
-    assert main(["encode", str(small_scene), "-o", str(folder / "room.gsm"), *small]) == 0
     assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
     return folder
 
@@ -51,7 +50,6 @@ def test_sound_files(sound: Path, run: Run) -> None:
         f"ok     {sound / name}" for name in (*FORMATS, *OTHERS)
     ]
     assert "scene.ply: 7,680 Gaussians, 17-column export" in done.out
-    assert ", encoded scene, " in done.out
     assert ", state, " in done.out
     assert "views.npz: 5 cameras" in done.out
     assert run("check", sound / "a.spz", "-q", code=0).out == ""
@@ -142,9 +140,9 @@ WRONG: dict[str, tuple[Any, ...]] = {
     "half a splat": ("a.splat", lambda path: path.write_bytes(path.read_bytes()[:-5]), "", "32 bytes"),
     "a bit of a sog": ("a.sog", member_bit, "", "CRC-32"),
     "a bit of an npz": ("views.npz", member_bit, "", "CRC-32"),
-    "a bit of a gsm": ("room.gsm", flip(-9), "", "checksums"),
+    "a bit of a gsm": ("state.gsm", flip(-9), "", "checksums"),
     "an array of a gsm": ("state.gsm", one_number, "features.means", "checksums"),
-    "NaN in a gsm": ("room.gsm", with_array("features.covars", filled(np.nan)), "features.covars", "finite"),
+    "NaN in a gsm": ("state.gsm", with_array("features.covars", filled(np.nan)), "features.covars", "finite"),
     "half a gsm": ("state.gsm", halve, "", ".gsm", "read"),
     "inf in networks": ("networks.safetensors", infinite, "", "finite"),
     "a view without a pose": ("transforms.json", without_key, "", "'transform_matrix'"),
@@ -162,7 +160,7 @@ def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
 
 
 def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) -> None:
-    path = Path(shutil.copy(sound / "room.gsm", tmp_path))
+    path = Path(shutil.copy(sound / "state.gsm", tmp_path))
     header = entry(path)[1]
     del header["checksums"]
     with_text(json.dumps(header))(path)

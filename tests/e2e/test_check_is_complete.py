@@ -75,10 +75,11 @@ def colmap(suffix: str) -> Callable[[Path], None]:
     return make
 
 
-def encoded(*words: str) -> Callable[[Path], None]:
+def extended(*batches: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
-        last = [str(folder) if word == "{}" else str(folder / word) if "." in word else word for word in words]
-        assert main([*last, "--superpixels", "60", "--checkpoint", "none", "--quiet"]) == 0
+        scenes = [str(folder / batch) for batch in batches]
+        small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+        assert main(["extend", str(folder / "a.gsm"), *scenes, *small]) == 0
 
     return make
 
@@ -103,7 +104,7 @@ def chunks_module() -> Any:
 
 
 INSPECT = ("inspect", "levels/lod-meta.json")
-DECODE = ("decode", "-o", "made.ply", "--overwrite")
+STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply"),
     "parts": Kind("view_*.ply", places.in_parts(lambda path: None)),
@@ -121,10 +122,10 @@ KINDS = {
     "glb": Kind("a.glb", alone("a.glb"), ("inspect", "a.glb")),
     "index": Kind("levels/lod-meta.json", in_levels, INSPECT),
     "chunks": Kind("levels/*/*", in_levels, INSPECT),
-    "encoded": Kind("a.gsm", encoded("encode", "{}", "-o", "a.gsm"), (*DECODE, "a.gsm")),
-    "state": Kind("a.gsm", encoded("extend", "a.gsm", "{}"), (*DECODE, "a.gsm")),
+    "state": Kind("a.gsm", extended("."), STATE),
+    "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
-OFTEN = ("rows", "photos", "views.npz", "encoded")  # in the default run; the others are in the sweep
+OFTEN = ("rows", "photos", "views.npz", "state")  # in the default run; the others are in the sweep
 
 
 def placed(words: tuple[str, ...], folder: Path) -> list[object]:

@@ -106,27 +106,28 @@ def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pyte
     assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
 
 
-@pytest.mark.parametrize("command", ["compact", "encode", "decode"])
+@pytest.mark.parametrize("kind", ["compact", "extend", "compact a state"])
 def test_failures_while_writing_leave_nothing(
-    command: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    kind: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def half(path: Path, *_: object, **__: object) -> None:
         Path(path).write_bytes(b"ply\n")
         raise OSError(28, "No space left on device")
 
-    quick = ("--superpixels", 40)
-    given: Path = scene_copy
-    if command == "decode":
-        given = scene_copy / "kept.gsm"
-        assert run("encode", scene_copy, "-o", given, *quick).code == 0
-    for place in ("gsmerge.compaction.files", "gsmerge.online.decode_stored"):
+    quick, state = ("--superpixels", 40), scene_copy / "kept.gsm"
+    words, name = {
+        "compact": (("compact", scene_copy, *quick, "--fit", "none"), "scene.compact.ply"),
+        "extend": (("extend", scene_copy / "new.gsm", scene_copy, *quick), "new.gsm"),
+        "compact a state": (("compact", state, "--fit", "none"), "kept.compact.ply"),
+    }[kind]
+    assert run("extend", state, scene_copy, *quick).code == 0
+    for place in ("gsmerge.compaction.files", "gsmerge.states.files"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
-    monkeypatch.setattr("gsmerge.encoded.to_encoded.save_encoded", half)
+    monkeypatch.setattr("gsmerge.states.files.save_state", half)
     before = listing(scene_copy)
-    more = {"compact": (*quick, "--fit", "none"), "encode": quick, "decode": ()}[command]
-    outcome = run(command, given, "--quiet", *more, code=3)
+    outcome = run(*words, "--quiet", code=3)
     assert outcome.err.count("\n") == 1
-    assert {"compact": "scene.compact.ply", "encode": "scene.gsm", "decode": "kept.compact.ply"}[command] in outcome.err
+    assert name in outcome.err
     assert "No space" in outcome.err
     assert listing(scene_copy) == before
 

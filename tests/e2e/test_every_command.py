@@ -20,7 +20,6 @@ from .conftest import Run, assert_refused, listing
 VIEWS = 5
 WRITERS: dict[str, tuple[str, ...]] = {
     "compact": ("small.ply", "--superpixels", "100", "--fit", "none"),
-    "encode": ("small.gsm", "--superpixels", "100"),
     "render --as superpixels": ("overlays", "--superpixels", "100"),
     "render --as views": ("renders",),
     "render --as panel": ("sheet.png", "--views", "1"),
@@ -29,7 +28,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "view": ("page.html", "--no-open"),
 }
 OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
-    "decode": ("decoded.ply",),
+    "compact a state": ("decoded.ply",),
     "extend": ("state.gsm", "--superpixels", "100"),
     "generate": ("made", "--scenes", "1", "--views", "3", "--size", "48x36"),
 }
@@ -51,10 +50,11 @@ def call(command: str, scene: Path) -> list[object]:
     if command == "evaluate":
         return [command, scene, *targets, "--lpips", "none"]
     output, *rest = (WRITERS | OTHERS)[command]
-    if command == "decode":
+    if command == "compact a state":
         if not (scene / "kept.gsm").exists():
-            assert main(["encode", str(scene), "-o", str(scene / "kept.gsm"), "--superpixels", "60", "--quiet"]) == 0
-        return [command, scene / "kept.gsm", "-o", scene / output]
+            small = ["--superpixels", "60", "--set", "replay=0", "--quiet"]
+            assert main(["extend", str(scene / "kept.gsm"), str(scene), *small]) == 0
+        return ["compact", scene / "kept.gsm", "-o", scene / output]
     if command == "extend":
         return [command, scene / output, scene, *rest]
     if command == "generate":
@@ -98,7 +98,7 @@ def test_quiet_says_nothing(command: str, scene_copy: Path, run: Run) -> None:
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
-@pytest.mark.parametrize("command", [*WRITERS, "decode", "generate"])
+@pytest.mark.parametrize("command", [*WRITERS, "compact a state", "generate"])
 def test_a_dry_run_writes_nothing(command: str, scene_copy: Path, run: Run) -> None:
     words = call(command, scene_copy)
     before = listing(scene_copy)
@@ -162,7 +162,7 @@ def test_odd_rows_reach_the_scene_s_notes_and_the_report(scene_copy: Path, run: 
 @pytest.mark.parametrize(
     ("command", "output"),
     [
-        ("compact", "transforms.json"), ("encode", "transforms.json"), ("view", "transforms.json"),
+        ("compact", "transforms.json"), ("view", "transforms.json"),
         ("render", "images/view_000.png"), ("render --as views", "images"), ("render --as superpixels", "images"),
         ("render --path orbit", "images"),
     ],

@@ -1,4 +1,4 @@
-"""``extend`` and ``decode`` of states, on scenes that the project makes itself; and whatever may happen meanwhile."""
+"""``extend``, and ``compact`` of states, on scenes that the project makes itself; and whatever may happen meanwhile."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from hostile.gsm_files import Spoil, cut, with_header
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
-from gsmerge.online.file import load_state
 from gsmerge.scene.files import find_scene_files
+from gsmerge.states.state_file import load_state
 
 from .conftest import Outcome, Run, assert_refused, listing
 
@@ -49,14 +49,6 @@ def states(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[
     shutil.copy(folder / "1.gsm", folder / "2.gsm")
     assert main(["extend", str(folder / "2.gsm"), str(walks[1]), "--quiet"]) == 0
     return [folder / "1.gsm", folder / "2.gsm"]
-
-
-@pytest.fixture(scope="session")
-def encoded(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first scene, encoded. Read only."""
-    out = tmp_path_factory.mktemp("encoded") / "scene.gsm"
-    assert main(["encode", str(walks[0]), "-o", str(out), *map(str, SMALL), "--quiet"]) == 0
-    return out
 
 
 @pytest.fixture
@@ -122,14 +114,6 @@ def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run:
     assert document["num_covered"] > 0
 
 
-def test_an_encoded_scene_is_extended(encoded: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
-    state = Path(shutil.copy(encoded, tmp_path / "state.gsm"))
-    outcome = run("extend", state, walks[1], code=0)
-    assert "batch 2," in outcome.out
-    assert len(load_state(state).replay) == 4
-    assert run("decode", state, "--set", "fit_steps=4", "-o", tmp_path / "a.ply").code == 0
-
-
 def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
     moved = shutil.move(scene / "transforms.json", tmp_path / "poses.json")
@@ -143,24 +127,24 @@ def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, ru
 def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, run: Run) -> None:
     groups, actual = len(load_state(states[1])), []
     for k in (1, 2, 4):
-        outcome = run("decode", states[1], "--k", k, "--fit", "none", "-o", tmp_path / f"{k}.ply")
+        outcome = run("compact", states[1], "--k", k, "--fit", "none", "-o", tmp_path / f"{k}.ply")
         assert (outcome.code, outcome.out.count("\n")) == (0, 1), outcome.err
         actual.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
     assert actual == sorted(actual)
     assert actual[0] <= groups < actual[2] <= 4 * groups
     said = ("--budget", groups + 40, "--fit", "none", "-o", tmp_path / "b.ply", "--json")
-    document = json.loads(run("decode", states[1], *said).out)
+    document = json.loads(run("compact", states[1], *said).out)
     assert groups < document["output"]["num_gaussians"] <= groups + 40
     assert document["fit"] is None
     assert document["input"]["num_groups"] == groups
-    assert document["input"]["num_gaussians_encoded"] == 7 * 48 * 32
+    assert document["input"]["num_gaussians"] == 7 * 48 * 32
 
 
 def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, run: Run) -> None:
     said = ("--set", "fit_steps=4")
     for fit in ((), ("--fit", "full")):
         out = tmp_path / f"{len(listing(tmp_path))}.ply"
-        outcome = run("decode", states[1], *fit, *said, "-o", out, "--json")
+        outcome = run("compact", states[1], *fit, *said, "-o", out, "--json")
         assert (outcome.code, outcome.err) == (0, "")
         document = json.loads(outcome.out)
         assert document["fit"]["method"] in {"full", "color", "none"}
@@ -171,14 +155,14 @@ def test_fits_to_the_photos_that_were_kept(states: list[Path], tmp_path: Path, r
 def test_decoding_twice_gives_the_same_bytes(states: list[Path], tmp_path: Path, run: Run) -> None:
     for threads in (1, 2):
         said = ("--set", "fit_steps=4", "--threads", threads, "-o", tmp_path / f"{threads}.ply")
-        assert run("decode", states[1], *said).code == 0
+        assert run("compact", states[1], *said).code == 0
     assert (tmp_path / "1.ply").read_bytes() == (tmp_path / "2.ply").read_bytes()
 
 
-def test_a_dry_run_of_decode_knows_the_most(states: list[Path], tmp_path: Path, run: Run) -> None:
-    most = json.loads(run("decode", states[1], "--k", 2, "-o", tmp_path / "a.ply", "--dry-run", "--json").out)
+def test_a_dry_run_knows_the_most(states: list[Path], tmp_path: Path, run: Run) -> None:
+    most = json.loads(run("compact", states[1], "--k", 2, "-o", tmp_path / "a.ply", "--dry-run", "--json").out)
     assert listing(tmp_path) == {}
-    assert run("decode", states[1], "--k", 2, "--fit", "none", "-o", tmp_path / "a.ply").code == 0
+    assert run("compact", states[1], "--k", 2, "--fit", "none", "-o", tmp_path / "a.ply").code == 0
     assert len(gsmerge.read_ply(tmp_path / "a.ply").gaussians) <= most["output"]["num_gaussians_at_most"]
 
 
@@ -199,7 +183,7 @@ def test_the_heads_run_when_they_are_asked(latents: Path, tmp_path: Path, run: R
     assert state.networks is not None
     assert len(state.about["batches"]) == 2
     for k in (1, 2, 4):
-        outcome = run("decode", latents, "--k", k, "-o", tmp_path / f"{k}.ply", "--json", code=0)
+        outcome = run("compact", latents, "--k", k, "-o", tmp_path / f"{k}.ply", "--json", code=0)
         assert json.loads(outcome.out)["fit"] is None  # no photos are stored
         counts.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
     assert counts[0] < counts[1] < counts[2] <= 4 * len(state)
@@ -239,7 +223,7 @@ def test_harmonics_of_another_degree(state: Path, walks: list[Path], tmp_path: P
     [(with_header(schema=9, gsmerge="9.9"), ("schema 1", 9, "gsmerge 9.9")), (cut(0.5), (".gsm", "read"))],
     ids=["newer", "half"],
 )
-@pytest.mark.parametrize("command", ["extend", "decode"])
+@pytest.mark.parametrize("command", ["extend", "compact"])
 def test_a_damaged_state_is_refused(
     spoil: Spoil, found: tuple[object, ...], command: str, state: Path, walks: list[Path], run: Run
 ) -> None:
@@ -270,7 +254,7 @@ def test_a_broken_first_batch_makes_no_file(scene_copy: Path, tmp_path: Path, ru
 def test_a_state_that_another_process_changes_meanwhile(
     state: Path, states: list[Path], walks: list[Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsmerge.online.file as files
+    import gsmerge.states.files as files
 
     extended = files.extend
 
@@ -289,7 +273,7 @@ def test_a_state_that_another_process_changes_meanwhile(
 def test_a_state_that_another_process_makes_meanwhile(
     states: list[Path], walks: list[Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsmerge.online.file as files
+    import gsmerge.states.files as files
 
     extended, state = files.extend, tmp_path / "state.gsm"
 
@@ -309,7 +293,7 @@ def test_two_that_end_together_lose_no_batch(
 ) -> None:
     """Both have read the state before either goes on; whoever may rename waits until the other may as well, or not."""
     import gsmerge.io.atomic as atomic
-    import gsmerge.online.file as files
+    import gsmerge.states.files as files
 
     path = state if exists else tmp_path / "new.gsm"
     before = len(load_state(path).about["batches"]) if exists else 0
@@ -376,7 +360,7 @@ def test_killed_in_the_middle(state: Path, states: list[Path], walks: list[Path]
     assert state.read_bytes() == states[0].read_bytes()
     code = (
         "import os, signal, sys\n"
-        "import gsmerge.online.file as files\n"
+        "import gsmerge.states.files as files\n"
         "from gsmerge.cli import main\n"
         "saved = files.save_state\n"
         "def save(path, state, **named):\n"

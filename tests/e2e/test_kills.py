@@ -29,6 +29,6 @@ def test_nothing_is_half_written_and_the_next_run_succeeds(command: str, root: P
 
 @pytest.mark.slow
 def test_files_that_are_not_synced_are_reported(root: Path) -> None:
-    done = kill(root, "--calls", "1", "--commands", "encode", "--plant", "no syncs")
+    done = kill(root, "--calls", "1", "--commands", "extend", "--plant", "no syncs")
     assert done.returncode == 1, done.stderr
     assert "after a loss of power, a.gsm is half-written" in done.stdout

@@ -91,13 +91,13 @@ def test_a_run_that_fails_leaves_no_folder(
     assert cli.main(["compact", str(made_scene), "-o", str(index.parent / "deep" / "lod-meta.json")]) == 3
 
 
-@pytest.mark.parametrize("command", ["decode", "batch"])
-def test_other_commands_write_no_levels(command: str, made_scene: Path, index: Path, tmp_path: Path, run: Run) -> None:
+@pytest.mark.parametrize("kind", ["state", "batch"])
+def test_others_write_no_levels(kind: str, made_scene: Path, index: Path, tmp_path: Path, run: Run) -> None:
     state = tmp_path / "a.gsm"
     index.parent.mkdir()
-    run("encode", made_scene, "-o", state, *QUICK[:2], "--checkpoint", "none", code=0)
-    given, place = {
-        "decode": ((state, "-o", index), index),
-        "batch": ((made_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json"), "output"),
-    }[command]
-    assert_refused(run(command, *given), 2, place, ".compressed.ply")
+    run("extend", state, made_scene, *QUICK[:2], "--checkpoint", "none", code=0)
+    words, place = {
+        "state": (("compact", state, "-o", index), index),
+        "batch": (("batch", made_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json"), "output"),
+    }[kind]
+    assert_refused(run(*words), 2, place, ".compressed.ply")

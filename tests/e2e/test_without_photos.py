@@ -72,12 +72,10 @@ def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_pa
     assert planned["compact"]["fit"] == "full"
 
 
-def test_stored_scenes(bare: Path, tmp_path: Path, run: Run) -> None:
-    encoded, state, out = tmp_path / "scene.gsm", tmp_path / "state.gsm", tmp_path / "small.ply"
-    run("encode", bare, "-o", encoded, "--superpixels", 200, code=0)
-    run("decode", encoded, "-o", out, code=0)
+def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
+    state, out = tmp_path / "state.gsm", tmp_path / "small.ply"
     run("extend", state, bare, "--superpixels", 200, code=0)
-    document = json.loads(run("decode", state, "-o", out, "--overwrite", "--json", code=0).out)
+    document = json.loads(run("compact", state, "-o", out, "--json", code=0).out)
     assert document["fit"]["method"] == "full"
 
 

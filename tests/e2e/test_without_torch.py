@@ -27,8 +27,7 @@ COMMANDS = {
     "compact with networks": ("compact", "scene", *FEW, "--recipe", "paper", "-o", "new.ply"),
     "compact to a curve": ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.ply"),
     "batch": ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
-    "encode": ("encode", "scene", *FEW, "-o", "new.gsm"),
-    "decode": ("decode", "scene.gsm", "-o", "new.ply"),
+    "compact a state": ("compact", "scene.gsm", "-o", "new.ply"),
     "extend": ("extend", "new.gsm", "scene", *FEW),
     "inspect": ("inspect", "scene"),
     "view": ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
@@ -42,12 +41,12 @@ OFTEN = ("compact with networks", "extend")  # the others are in the sweep
 
 @pytest.fixture(scope="module")
 def work(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a scene, its compact and its encoded form. Read only."""
+    """A folder with a scene, its compact form and its state. Read only."""
     folder = tmp_path_factory.mktemp("work")
     shutil.copytree(small_scene, folder / "scene")
     scene = str(folder / "scene")
     assert main(["compact", scene, *FEW, "--quiet", "-o", str(folder / "small.ply")]) == 0
-    assert main(["encode", scene, *FEW, "--quiet", "-o", str(folder / "scene.gsm")]) == 0
+    assert main(["extend", str(folder / "scene.gsm"), scene, *FEW, "--quiet"]) == 0
     return folder
 
 

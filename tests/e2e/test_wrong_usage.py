@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from bare_files import write_without_grid
 
-import gsmerge
+from gsmerge import Compactor
 from gsmerge.cli import main
 
 from .conftest import Run, assert_refused, listing
 
-# Words after ``gsmerge``, run in a folder with the scene ``room`` of 5 views of 48 x 32, what it is encoded to, and a
-# state of it: the place that the error line names, none for some, and values in it, with * between them
+# Words after ``gsmerge``, run in a folder with the scene ``room`` of 5 views of 48 x 32, a state of it, and one
+# without photos: the place that the error line names, none for some, and values in it, with * between them
 USAGE = {
     "compact room --k 9": "k*9",
     "compact room --superpixels 1537": "superpixels*1536*1537",
@@ -61,27 +61,36 @@ USAGE = {
     "batch room -o out --hint exporter=nobody": "exporter*'nobody'",
     "batch room -o room": "room*results",
     "batch room -o alone.ply": "--output*alone.ply",
-    "encode room --fit full": "*--fit*fit=VALUE",
-    "decode room.gsm --k 8": "k*1 to 4*8",
-    "decode room.gsm --k 2 --budget 900": "*k*budget*both",
-    "decode room.gsm --budget many": "budget*'many'",
-    "decode room.gsm --budget 10": "budget*{groups}*10",
-    "decode room.gsm -o room.gsm --overwrite": "room.gsm*input*--output",
-    "decode room.gsm -o alone.ply": "alone.ply*--overwrite*--output",
-    "decode room.gsm -o a.ply --set spz_version=4": "spz_version 4*.spz*.ply",
-    "decode room.gsm --set viewer_cameras=true": "--set viewer_cameras*unknown",
-    "decode room.gsm --fit full": "fit full*photos*none",
-    "decode state.gsm --k 8": "k*1 to 4*8",
-    "decode state.gsm --k 2 --budget 900": "*k*budget*both",
-    "decode state.gsm --budget 3": "budget*{groups}*3",
-    "decode state.gsm --fit some": "--fit*'some'",
+    "encode room": "*encode*gsmerge extend room.gsm SCENE",
+    "decode room.gsm --k 8": "*decode*gsmerge compact room.gsm --k 2",
+    "compact room.gsm --k 8": "k*1 to 4*8",
+    "compact room.gsm --k 2 --budget 900": "*k*budget*both",
+    "compact room.gsm --budget many": "budget*'many'",
+    "compact room.gsm --budget 10": "budget*{groups}*10",
+    "compact room.gsm -o room.gsm --overwrite": "room.gsm*input*--output",
+    "compact room.gsm -o alone.ply": "alone.ply*--overwrite*--output",
+    "compact room.gsm -o a.ply --set spz_version=4": "spz_version 4*.spz*.ply",
+    "compact room.gsm --set viewer_cameras=true": "--set viewer_cameras*unknown",
+    "compact room.gsm --set columns=full": "--set columns*unknown",
+    "compact room.gsm --fit full": "fit full*photos*none",
+    "compact room.gsm room": "room.gsm*alone*2",
+    "compact room room.gsm": "room.gsm*alone*2",
+    "compact room.gsm --cameras room/transforms.json": "--cameras*room.gsm",
+    "compact room.gsm --superpixels 3%": "--superpixels*room.gsm",
+    "compact room.gsm --set superpixels=3%": "--set superpixels*unknown",
+    "compact room.gsm --save-cameras a.json": "--save-cameras*room.gsm",
+    "compact room.gsm --strict": "--strict*room.gsm",
+    "compact state.gsm --k 8": "k*1 to 4*8",
+    "compact state.gsm --k 2 --budget 900": "*k*budget*both",
+    "compact state.gsm --budget 3": "budget*{groups}*3",
+    "compact state.gsm --fit some": "--fit*'some'",
     "extend state.gsm": "*'SCENE'",
     "extend state.gsm room --fit full": "*--fit*fit=VALUE",
     "extend state.gsm room --set tolerance=2": "tolerance*2",
     "extend state.gsm room --max-k 9": "--max-k*8",
     "extend state.gsm room --set replay=-1": "replay*-1",
     "extend state.gsm room --superpixels 0%": "superpixels*'0%'",
-    "extend state.gsm room --budget many": "*--budget*budget=VALUE",
+    "extend state.gsm room --budget many": "budget*'many'",
     "extend state.gsm room --hint exporter=nobody": "exporter*'nobody'",
     "extend room/scene.ply room": "room/scene.ply*input",
     "extend state.gsm room room --cameras a --images b": "--cameras and --images*several",
@@ -176,7 +185,8 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
     small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
-    assert main(["encode", str(small_scene), "-o", str(folder / "room.gsm"), *small]) == 0
+    bare = ["--set", "replay=0"]
+    assert main(["extend", str(folder / "room.gsm"), str(small_scene), *small, *bare]) == 0
     assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
     return folder
 
@@ -192,9 +202,9 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)
-    groups = len(gsmerge.load_encoded("room.gsm")) if "{groups}" in USAGE.get(words, "") else 0
+    groups = len(Compactor.load("room.gsm")) if "{groups}" in USAGE.get(words, "") else 0
     parts = (USAGE | PLACES)[words].format(groups=groups).split("*")
-    planned = words.startswith("compact")
+    planned = words.startswith("compact") and ".gsm" not in words
     for more in ([], ["--dry-run"]) if planned else ([],):
         assert_refused(run(*shlex.split(words.format()), *more), 2 if words in USAGE else 3, *parts)
     assert listing(prepared) == before

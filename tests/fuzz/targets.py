@@ -42,10 +42,10 @@ from gsmerge.io.photo_files import decode_alpha, decode_mask
 from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.online.compactor import Compactor
-from gsmerge.online.file import load_stored
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.states.compactor import Compactor
+from gsmerge.states.state_file import load_state
 from gsmerge.types import Cameras
 
 PHOTO_ENDINGS = (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")
@@ -309,14 +309,13 @@ def photos(folder: Path, endings: Sequence[str] = PHOTO_ENDINGS) -> Iterator[byt
             yield cv2.imencode(".png", image)[1].tobytes()
 
 
-def encoded(folder: Path) -> Iterable[bytes]:
-    """Make an encoded scene, and the state of two batches."""
+def states(folder: Path) -> Iterable[bytes]:
+    """Make the states of one batch and of two."""
     scene = gsmerge.read_scene(make_tiny(6, 4).save(folder / "scene"))
-    gsmerge.save_encoded(folder / "a.gsm", gsmerge.encode_scene(scene, checkpoint="none"))
     compactor = Compactor(checkpoint="none")
-    compactor.extend(scene)
-    compactor.save(folder / "b.gsm")
     for name in "ab":
+        compactor.extend(scene)
+        compactor.save(folder / f"{name}.gsm")
         yield (folder / f"{name}.gsm").read_bytes()
 
 
@@ -354,7 +353,7 @@ TARGETS: dict[str, Target] = {
     "chunk": Target("000000.torch", chunk, check_cameras),
     "cameras-embedded": Target("a.ply", plys, check_cameras),
     "sharp": Target("a.ply", sharp, read_sharp_camera),
-    "gsm": Target("a.gsm", encoded, load_stored),
+    "gsm": Target("a.gsm", states, load_state),
     "checkpoint": Target("a.safetensors", checkpoint, load_checkpoint),
     "settings-json": Target("a.json", texts(TRAINING), check_settings),
     "settings-toml": Target("a.toml", texts(b"steps = 100\nrate = 1e-3\n[network]\nwidth = 32\n"), check_settings),

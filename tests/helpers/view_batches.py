@@ -10,8 +10,10 @@ import numpy as np
 import scenes
 
 from gsmerge import Compactor, Scene
-from gsmerge.online.state import GroupSet, OnlineState
+from gsmerge.fit import FitOptions
 from gsmerge.stages.merge import take
+from gsmerge.states.decode import decode_state
+from gsmerge.states.state import DividedGroups, GroupSet, Learned, State
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 FAST: dict[str, Any] = {"superpixels": "10%", "checkpoint": "none"}
@@ -38,14 +40,30 @@ def fed(batches: Iterable[Scene], **settings: Any) -> Compactor:
     return compactor
 
 
-def state_of(compactor: Compactor) -> OnlineState:
+def state_of(compactor: Compactor) -> State:
     """The state, which must be there."""
     return compactor.state
 
 
-def same_state(one: OnlineState, other: OnlineState) -> None:
+def one_batch(scene: Scene, **settings: Any) -> State:
+    """The state of a scene alone."""
+    compactor = Compactor(**settings)
+    compactor.extend(scene)
+    return state_of(compactor)
+
+
+def decoded(state: State, **wish: Any) -> Gaussians:
+    """What a state is without a fit."""
+    return decode_state(state, options=FitOptions(fit="none"), **wish).gaussians
+
+
+def same_state(one: State, other: State) -> None:
     """To the last bit, and in everything that is told."""
-    same_groups(one.groups, other.groups)
+    assert type(one.groups) is type(other.groups)
+    if isinstance(one.groups, GroupSet) and isinstance(other.groups, GroupSet):
+        same_groups(one.groups, other.groups)
+    elif isinstance(one.groups, DividedGroups) and isinstance(other.groups, DividedGroups):
+        same_divided(one.groups, other.groups)
     assert (one.kept is None) == (other.kept is None)
     if one.kept is not None and other.kept is not None:
         assert scenes.identical(one.kept, other.kept)
@@ -67,14 +85,35 @@ def same_state(one: OnlineState, other: OnlineState) -> None:
         assert all(np.array_equal(array, other.networks.weights.arrays[name]) for name, array in arrays.items())
 
 
+def same_divided(one: DividedGroups, other: DividedGroups) -> None:
+    """To the last bit, types included."""
+    same_features(one.features, other.features)
+    same_learned(one.learned, other.learned)
+    for name in ("splits", "slots", "uniform", "growth_order"):
+        a, b = getattr(one.division, name), getattr(other.division, name)
+        assert a.dtype == b.dtype, name
+        np.testing.assert_array_equal(a, b, name)
+    assert scenes.identical(one.division.children, other.division.children)
+    for part, names in {"heads": ("views", "group"), "colors": ("sh0", "precision")}.items():
+        a, b = getattr(one, part), getattr(other, part)
+        assert (a is None) == (b is None), part
+        for name in names if a is not None else ():
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name), f"{part}.{name}")
+
+
+def same_learned(one: Learned | None, other: Learned | None) -> None:
+    """To the last bit, types included."""
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        same_features(one.refined, other.refined)
+        np.testing.assert_array_equal(one.views, other.views)
+        np.testing.assert_array_equal(one.num_members, other.num_members)
+
+
 def same_groups(one: GroupSet, other: GroupSet) -> None:
     """To the last bit, types included."""
     same_features(one.features, other.features)
-    assert (one.learned is None) == (other.learned is None)
-    if one.learned is not None:
-        same_features(one.learned.refined, other.learned.refined)
-        np.testing.assert_array_equal(one.learned.views, other.learned.views)
-        np.testing.assert_array_equal(one.learned.num_members, other.learned.num_members)
+    same_learned(one.learned, other.learned)
     assert scenes.identical(one.children, other.children)
     np.testing.assert_array_equal(one.fitted_sh0, other.fitted_sh0)
     np.testing.assert_array_equal(one.color_precision, other.color_precision)

@@ -1,7 +1,7 @@
 """The table of hostile inputs: files that ask for much memory or time, would run code, or name odd places.
 
 Read by ``tests/e2e/test_hostile_input.py``. What a reader refuses, and in which words, is in its unit test;
-``tests/fuzz`` changes sound files at random. ``gsm_files`` damages encoded scenes and states.
+``tests/fuzz`` changes sound files at random. ``gsm_files`` damages states.
 """
 
 from __future__ import annotations

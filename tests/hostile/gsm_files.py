@@ -1,4 +1,4 @@
-"""Ways to damage a file in the safetensors format: an encoded scene, a state, networks."""
+"""Ways to damage a file in the safetensors format: a state, networks."""
 
 from __future__ import annotations
 
@@ -126,12 +126,12 @@ UNREADABLE: dict[str, Spoil] = {
     "a list": with_text("[]"),
     "deep JSON": with_text("[" * 100_000),
 }
-# What is wrong with the header of an encoded scene or a state
+# What is wrong with the header of a state
 GSM_HEADERS: dict[str, Spoil] = {
     "networks": with_text("{}", "gsmerge-networks"),
     "no schema": without("schema"),
     "an older schema": with_header(schema=0),
-    "a newer schema": with_header(schema=2, gsmerge="9.9"),
+    "a newer schema": with_header(schema=3, gsmerge="9.9"),
     "no settings": without("settings"),
     "settings in a list": with_header(settings=[]),
     "no unit": without("unit"),

@@ -15,8 +15,8 @@ from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.prepare import PrepareOptions, prepare
 from gsmerge.facts.views import subset
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.online.extend import extend
 from gsmerge.runtime.record import record_run
+from gsmerge.states.extend import extend
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]

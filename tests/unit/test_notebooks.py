@@ -30,6 +30,8 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
     file = gsmerge.read_ply(made_scene / "scene.ply")
     cameras = gsmerge.read_cameras(made_scene / "transforms.json")
     options = gsmerge.EvaluateOptions(lpips=(), fog=False)
+    compactor = gsmerge.Compactor(superpixels="2%", checkpoint="none")
+    compactor.extend(scene)
     shown = [
         (scene, (f"{scene.num_gaussians:,} Gaussians", f"{views} views of {size}", "images", "aligned")),
         (scene.gaussians, (f"{len(scene.gaussians):,}", "degree 0")),
@@ -40,7 +42,8 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
         (result.report, (f"{scene.num_gaussians:,} -> 300", "dB")),
         (file, (f"{len(scene.gaussians):,}", str(made_scene / "scene.ply"))),
         (cameras, (str(views), cameras.path, cameras.source)),
-        (gsmerge.encode_scene(scene, superpixels="2%", checkpoint="none"), ("Feature Gaussians",)),
+        (compactor, ("Feature Gaussians", f"{views} views")),
+        (compactor.state, ("Feature Gaussians", f"{views} views")),
         (gsmerge.evaluate(scene, {"small": result.gaussians}, options=options), ("input", "small", "dB", "photos")),
     ]  # fmt: skip
     for value, words in shown:

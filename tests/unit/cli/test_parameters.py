@@ -9,9 +9,9 @@ from messages import refuse_all, refuses
 
 from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
-from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.states.options import ExtendOptions
 
 KNOWN = flat_settings(CompactOptions)
 
@@ -64,8 +64,8 @@ def test_options_and_set_are_one() -> None:
 
 
 def test_several_kinds_of_settings() -> None:
-    assert Args(set=["k=2", "replay=3"], max_k=4).values(CompactOptions, OnlineOptions) == {
+    assert Args(set=["k=2", "replay=3"], max_k=4).values(CompactOptions, ExtendOptions) == {
         "k": 2, "replay": 3, "max_k": 4,
     }  # fmt: skip
-    made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, OnlineOptions)
+    made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, ExtendOptions)
     assert (made.segment.segmentation, online.replay) == ("bass-st", 3)

@@ -12,12 +12,11 @@ from messages import refuses
 from network_fixtures import noisy, untrained, written
 
 from gsmerge import Scene
-from gsmerge.encoded.to_encoded import encode_scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.options import NetworkOptions
-from gsmerge.online.extend import extend
-from gsmerge.online.options import OnlineOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.extend import extend
+from gsmerge.states.options import ExtendOptions
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
 
@@ -87,9 +86,7 @@ def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path)
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
     options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": str(absolute)})
     with refuses(UsageError, "max_k", 4, 8):
-        encode_scene(scene, options, max_k=8)
-    with refuses(UsageError, "max_k", 4, 8):
-        extend(None, scene, options, OnlineOptions(max_k=8))
+        extend(None, scene, options, ExtendOptions(max_k=8))
 
 
 @pytest.mark.parametrize("rule", ["saliency", "distortion"])

@@ -19,6 +19,7 @@ from gsmerge.scene.content_hash import read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.state_file import load_state
 
 
 def split(folder: Path, tiny: Tiny, names: list[str], cuts: list[int]) -> Path:
@@ -94,10 +95,10 @@ def test_scenes_of_one_backbone_stay_apart(tmp_path: Path, tiny: Tiny) -> None:
         find_scene_files(folder)
 
 
-def test_encode_reads_all_parts(tmp_path: Path, tiny: Tiny) -> None:
+def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
-    assert main(["encode", str(folder), "--superpixels", "20%", "-q"]) == 0
-    source = gsmerge.load_encoded(folder / "scene.gsm").about["source"]
+    assert main(["extend", str(folder / "scene.gsm"), str(folder), "--superpixels", "20%", "-q"]) == 0
+    source = load_state(folder / "scene.gsm").about["source"]
     assert source["bytes"] == sum(path.stat().st_size for path in find_scene_files(folder).plys)
 
 

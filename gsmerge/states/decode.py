@@ -1,0 +1,175 @@
+"""State -> Gaussians: decoded at any K or number, and fitted to the stored photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.budget import exact_count
+from gsmerge.errors import UsageError
+from gsmerge.fit import FitJob, FitOptions, FitReport, fit, report_steps, start_share, visible_mask
+from gsmerge.raster.photos import blank_photos, photos_of
+from gsmerge.runtime.record import Progress, record_run, stage
+from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.budget import AUTO, BudgetOptions
+from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.stages.decode import deal_visible
+from gsmerge.states.groups import children_of, divide_groups, share
+from gsmerge.states.state import DividedGroups, State
+from gsmerge.types import Gaussians
+
+
+@dataclass(frozen=True, eq=False)
+class DecodePlan:
+    """Number of Gaussians to decode, per group and in all."""
+
+    counts: np.ndarray  # [g] most Gaussians of each group
+    min_contribution: float  # See StoredSettings; 0: contributions are not measured
+    total: int | None = None  # Gaussians to be met; None: as many as can be seen
+    notes: tuple[str, ...] = ()  # What differs from what was asked for, one sentence each
+
+
+def plan_decode(
+    state: State, groups: DividedGroups, *, k: int | None = None, budget: int | str | None = None
+) -> DecodePlan:
+    """Plan how many Gaussians each group of a state becomes; see :func:`decode_state`."""
+    s = state.settings
+    if budget is not None and k is not None:
+        raise UsageError("expected one of k and budget, got both")
+    auto = AUTO in (budget, s.k) and k is None and budget in (None, AUTO)
+    if s.target_count is not None and k is None and (budget is None or (auto and s.k == AUTO)):
+        return _distribute(state, groups, s.target_count)
+    if auto:
+        knee = s.knee_count or len(groups)
+        plan = _distribute(state, groups, max(len(groups), knee))
+        if knee >= len(groups):
+            return plan
+        note = f"budget auto would take {knee} Gaussians, fewer than there are groups; begin a state with budget auto"
+        return replace(plan, notes=(note,))
+    if budget is not None:
+        return _distribute(state, groups, _group_budget(state, groups, budget))
+    number = s.k if k is None else k
+    if not isinstance(number, int) or not 1 <= number <= s.max_k:
+        more = "" if s.max_k == MAX_CHILDREN else ", as its first batch set (more with a larger max k)"
+        raise UsageError(f"k: expected 1 to {s.max_k}{more}, got {number!r}")
+    if s.num_slots is not None:
+        plan = _distribute(state, groups, s.num_slots * number)
+        return replace(plan, min_contribution=s.min_contribution, total=None)
+    return DecodePlan(np.full(len(groups), number), s.min_contribution)
+
+
+def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int:
+    """Return the number of Gaussians that a budget leaves for the groups."""
+    try:
+        count = exact_count(BudgetOptions(budget), state.settings.num_input, state.sh_degree)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    remedy = "begin a state with that budget"
+    if count is None:
+        raise UsageError(f"budget: expected a number, a share or a size, got {budget}; {remedy}")
+    min_count = len(groups) + state.num_kept
+    if count < min_count:
+        raise UsageError(f"budget: expected at least {min_count}, one for each group, got {count}; {remedy}")
+    return count - state.num_kept
+
+
+def _distribute(state: State, groups: DividedGroups, total: int) -> DecodePlan:
+    """Distribute a number of Gaussians to the groups where they help most."""
+    order, extra = groups.division.growth_order, max(0, total - len(groups))
+    counts = 1 + np.bincount(order[:extra], minlength=len(groups))
+    if extra <= len(order):
+        return DecodePlan(counts, 0.0, total)
+    limit, count = len(groups) + len(order) + state.num_kept, total + state.num_kept
+    note = f"{count} Gaussians were asked for, and the groups divide into {limit} at most"
+    return DecodePlan(counts, 0.0, total, (note,))
+
+
+def decode_planned(state: State, groups: DividedGroups, plan: DecodePlan) -> Gaussians:
+    """Decode the planned number of canonical Gaussians, without a fit."""
+    s, cameras = state.settings, state.cameras
+    if plan.total is None:
+        gaussians, _ = children_of(groups, plan.counts, cameras)
+        gaussians = gaussians[gaussians.opacities >= s.min_opacity]
+    else:
+        order, total = groups.division.growth_order, plan.total
+        gaussians = deal_visible(
+            order, len(groups), total, s.min_opacity, lambda counts: children_of(groups, counts, cameras)[0]
+        )
+    if plan.min_contribution > 0:
+        gaussians = gaussians[visible_mask(gaussians, blank_photos(cameras, 2), plan.min_contribution)]
+    return gaussians if state.kept is None else Gaussians.concat([gaussians, state.kept])
+
+
+@dataclass(frozen=True)
+class DecodeResult:
+    """Result of decoding: Gaussians in the world frame, report of the fit (None without a fit), and notes."""
+
+    gaussians: Gaussians
+    fit: FitReport | None
+    notes: tuple[str, ...]
+
+
+def check_fit(state: State, options: FitOptions) -> None:
+    """Raise UsageError if a fit is asked for and no photos are stored."""
+    if options.fit != "none" and not len(state.replay):
+        raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
+
+
+def decode_state(
+    state: State,
+    *,
+    k: int | None = None,
+    budget: int | str | None = None,
+    options: FitOptions | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> DecodeResult:
+    """Decode a state into Gaussians in the world frame; fit them to stored photos, if any.
+
+    Without a fit, a state of one batch gives what ``compact(scene, fit="none", poses="fixed", exposure="fixed")``
+    gives, bit for bit, with the ``k`` or ``budget`` that it was extended with, and with any other ``k`` where neither a
+    budget nor the size of the input limits the number of superpixels. Gaussians that no view sees were merged for the
+    ``k`` of the batch. States of several batches have the colours that were fitted batch by batch.
+
+    Args:
+        state: From :func:`gsmerge.states.extend.extend` or :func:`gsmerge.states.state_file.load_state`.
+        k: Gaussians of each group, 1 to the largest number stored. None: the state's own.
+        budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size as
+            "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most. A full fit begins
+            with fewer and grows to the number.
+        options: The fit. None: the full one at its defaults where there are photos, otherwise none.
+        seed: Seed of the fit.
+        threads: Threads to use; None: all processors. The result does not depend on it.
+        progress: See :func:`gsmerge.compact`.
+
+    Raises:
+        UsageError: If a fit is asked for and there are no photos, K or the budget is out of range, or both are given.
+    """
+    options = options or FitOptions(fit="full" if len(state.replay) else "none")
+    check_fit(state, options)
+    groups = divide_groups(state, fitted_colors=options.fit == "none")
+    plan = plan_decode(state, groups, k=k, budget=budget)
+    if options.fit == "none":
+        with use_threads(threads):
+            return DecodeResult(state.frame.leave(decode_planned(state, groups, plan)), None, plan.notes)
+    notes = plan.notes
+    if options.photo_scale not in ("auto", 1):
+        notes = *notes, f"photo_scale {options.photo_scale:g} is 1: a state stores its photos at the size of its views"
+    max_count = int(plan.counts.sum())
+    start_count = max(len(groups), int(start_share(options) * max_count)) + state.num_kept
+    with use_threads(threads), record_run(progress) as record:
+        gaussians = decode_planned(state, groups, plan_decode(state, groups, budget=start_count))
+        images = state.replay.images.astype(np.float32) / np.float32(255)
+        cameras = state.cameras[state.replay.views]
+        photos = photos_of(images, cameras), photos_of(images, cameras, 2)
+        with stage("fit"):
+            job = FitJob(photos, options, max_count, seed, report_steps)
+            gaussians, report = fit(gaussians, job)
+        notes = *notes, *record.notes
+        if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
+            note = "the fit was not accepted: held-out parts of the photos did not get better"
+            groups, notes = divide_groups(share(state)), (*notes, note)
+            gaussians = decode_planned(state, groups, plan_decode(state, groups, k=k, budget=budget))
+    return DecodeResult(state.frame.leave(gaussians), report, notes)

@@ -1,0 +1,107 @@
+"""Batches for a state whose groups are decoded: they enter as moments, which add up, and children."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.fit import visible_mask
+from gsmerge.moments import feature_to_gaussians
+from gsmerge.networks.apply import NetworkContext
+from gsmerge.pipeline import merge_views
+from gsmerge.runtime.record import stage
+from gsmerge.settings.stages import MatchOptions
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import merge, take
+from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.states.division import divide_all
+from gsmerge.states.groups import (
+    bake,
+    concat_groups,
+    limit_children,
+    replace_groups,
+    select_groups,
+    with_fitted_colors,
+    without_members,
+)
+from gsmerge.states.state import DividedGroups, GroupSet, Heads, State
+from gsmerge.types import FeatureGaussians, Gaussians, Matches
+
+
+def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatures:
+    """Merge a batch's superpixels across its own views."""
+    merged = merge_views(batch.prepared, batch.plan, count)
+    return BatchFeatures(merged.features, merged.members, merged.segmentation, merged.networks)
+
+
+@stage("decode")
+def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
+    """Divide Feature Gaussians into groups of a state, with the networks that correct them."""
+    heads, networks = None, batch.plan.networks
+    if isinstance(new.context, NetworkContext) and networks is not None:
+        described = new.context.describe(new.features)
+        heads = Heads(networks, described.views, described.group)
+    return DividedGroups(without_members(new.features), divide_all(new.features, new.members, max_k), heads)
+
+
+def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
+    """Return the Gaussians of the state and of the batch, one for each group."""
+    return feature_to_gaussians(with_fitted_colors(groups).features), feature_to_gaussians(new.features)
+
+
+def _join(
+    groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch, max_k: int
+) -> tuple[GroupSet, dict[str, int]]:
+    """Merge a batch into the state's ``rows`` in view, and add the rest where a view shows it."""
+    with stage("decode"):
+        fresh = bake(new.features, new.members, new.context, max_k)
+    with stage("join"):
+        partners = find_partners(take(groups.features, rows), fresh.features, batch.plan.match)
+        has_partner = partners >= 0
+        joining = select_groups(fresh, np.flatnonzero(has_partner))
+        groups = merge_into(groups, joining, rows[partners[has_partner]], max_k)
+        alone = select_groups(fresh, np.flatnonzero(~has_partner))
+        counts, least = {"num_joined": int(has_partner.sum())}, batch.min_contribution
+        if least > 0:
+            in_view = feature_to_gaussians(take(groups.features, rows))
+            both = Gaussians.concat([in_view, feature_to_gaussians(alone.features)])
+            visible = visible_mask(both, batch.photos.photos(2), least)[len(in_view) :]
+            counts["num_hidden"] = int((~visible).sum())
+            alone = select_groups(alone, np.flatnonzero(visible))
+        return concat_groups([groups, alone]), counts
+
+
+MOMENTS = StateKind(REACH, _encode, _decode, _divide, _join)
+
+
+def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
+    """Return, for each of n new groups, the state's group with the same surface, ``[n]`` int64; -1 for none.
+
+    Matching is that across the views of one batch, with the state as one view and the batch as another. A group gets
+    one partner at most: the first of several in a cluster.
+    """
+    both = FeatureGaussians.concat([features, new])
+    sides = (np.arange(len(both)) >= len(features)).astype(np.int64)
+    matches = match(replace(both, views=sides), replace(options, cluster_size=2))
+    owner = np.full(matches.count, -1)
+    owner[matches.clusters[: len(features)]] = np.arange(len(features))
+    partners = owner[matches.clusters[len(features) :]]
+    again = np.ones(len(partners), bool)
+    again[np.unique(partners, return_index=True)[1]] = False
+    partners[again] = -1
+    return partners
+
+
+def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) -> GroupSet:
+    """Merge n new groups into the state's groups at ``rows [n]`` int64, all different: moments add up."""
+    if len(rows) == 0:
+        return groups
+    old = select_groups(groups, rows)
+    both = concat_groups([old, new])
+    pairs = np.tile(np.arange(len(rows)), 2)
+    features = merge(both.features, Matches(pairs, len(rows)))
+    children = both.children[features.members]
+    fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
+    merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
+    return replace_groups(groups, rows, limit_children(merged, max_k))

@@ -1,0 +1,162 @@
+"""A state of one batch, compacted as its scene is, and outputs in other formats."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from hostile.gsm_files import with_about
+
+import gsmerge
+
+from .conftest import Run, assert_refused
+
+SMALL = ("--superpixels", 120)
+
+
+PLAIN = ("--fit", "none")
+
+
+@pytest.fixture(scope="module")
+def state(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The made scene as a state, by the command line. Read only."""
+    from gsmerge.cli import main
+
+    out = tmp_path_factory.mktemp("state") / "scene.gsm"
+    assert main(["extend", str(out), str(made_scene), *map(str, SMALL), "--quiet"]) == 0
+    return out
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_it_is_compacted_as_its_scene_is(k: int, state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Byte for byte."""
+    one, other = tmp_path / "one.ply", tmp_path / "other.ply"
+    assert run("compact", state, *PLAIN, "--k", k, "-o", one).code == 0
+    assert run("compact", made_scene, *PLAIN, *SMALL, "--k", k, "-o", other).code == 0
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [("--budget", "3%"), ("--budget", "700", "--k", "2"), ("--budget", "auto"), ("--recipe", "paper")],
+    ids=str,
+)
+def test_what_the_batch_was_asked_for_is_the_default(
+    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
+    assert run("extend", kept, made_scene, *SMALL, *wish).code == 0
+    assert run("compact", kept, *PLAIN, "-o", one).code == 0
+    assert run("compact", made_scene, *PLAIN, *SMALL, *wish, "-o", other).code == 0
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_no_files_of_the_scene_are_needed(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    assert run("extend", scene_copy / "scene.gsm", scene_copy / "scene.ply", *SMALL).code == 0
+    kept = shutil.move(scene_copy / "scene.gsm", tmp_path / "alone.gsm")
+    shutil.rmtree(scene_copy)
+    outcome = run("compact", kept, *PLAIN, code=0)
+    assert outcome.out.count("\n") == 1
+    assert "groups ->" in outcome.out
+    assert len(gsmerge.read_ply(tmp_path / "alone.compact.ply").gaussians) > 100
+
+
+def test_the_same_batch_gives_the_same_bytes(state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    again = tmp_path / "again.gsm"
+    assert run("extend", again, made_scene, *SMALL, "--threads", 1).code == 0
+    assert again.read_bytes() == state.read_bytes()
+
+
+def test_a_budget_is_met(state: Path, tmp_path: Path, run: Run) -> None:
+    groups = len(gsmerge.Compactor.load(state))
+    outcome = run("compact", state, *PLAIN, "--budget", groups + 100, "-o", tmp_path / "a.ply", "--json")
+    document = json.loads(outcome.out)
+    assert document["budget"] == str(groups + 100)
+    assert groups <= document["output"]["num_gaussians"] <= groups + 100
+
+
+def test_the_reports(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    kept, out = tmp_path / "scene.gsm", tmp_path / "out.ply"
+    (document,) = json.loads(run("extend", kept, made_scene, *SMALL, "--json").out)["batches"]
+    digest = hashlib.sha256((made_scene / "scene.ply").read_bytes()).hexdigest()
+    assert document["num_input"] == 30_720
+    assert document["state"]["bytes"] == kept.stat().st_size
+    document = json.loads(run("compact", kept, *PLAIN, "--k", 2, "-o", out, "--json").out)
+    assert document["input"]["num_gaussians"] == 30_720
+    assert document["input"]["state"]["source"]["sha256"] == digest
+    assert document["input"]["state"]["source"]["name"] == "scene.ply"
+    assert document["output"]["bytes"] == out.stat().st_size
+    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
+    assert set(document["seconds"]) == {"import", "read", "decode", "write"}
+
+
+def test_no_folder_of_this_machine_is_in_the_file(state: Path, made_scene: Path) -> None:
+    assert str(made_scene.parent).encode() not in state.read_bytes()
+
+
+def test_half_a_file_is_refused_and_nothing_is_lost(state: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "scene.gsm").write_bytes(state.read_bytes()[:-100])
+    (tmp_path / "out.ply").write_text("precious")
+    outcome = run("compact", tmp_path / "scene.gsm", "-o", tmp_path / "out.ply", "--overwrite")
+    assert_refused(outcome, 3, tmp_path / "scene.gsm", "extend")
+    assert (tmp_path / "out.ply").read_text() == "precious"
+
+
+@pytest.mark.parametrize("words", [("scene.ply",), ("--help",), ()], ids=str)
+def test_commands_of_0_1_say_what_to_type(words: tuple[str, ...], run: Run) -> None:
+    assert_refused(run("encode", *words), 2, "", "encode", "gsmerge extend room.gsm SCENE")
+    assert_refused(run("decode", *words), 2, "", "decode", "gsmerge compact room.gsm --k 2")
+
+
+def test_comments_of_the_source_are_copied_as_by_compact(state: Path, tmp_path: Path, run: Run) -> None:
+    """How to render the Gaussians, and nothing else: neither cameras nor megabytes."""
+    path, out = Path(shutil.copy(state, tmp_path / "scene.gsm")), tmp_path / "out.ply"
+    long = [f"SplatRenderMode: {i:01000}" for i in range(2000)]
+    cameras = ["gsmerge cameras: AAAA", "of no use", 5, None, "SplatRenderMode: mip\nelement vertex 1"]
+    with_about(source={"comments": [*long, *cameras, "SplatRenderMode: mip"]})(path)
+    run("compact", path, *PLAIN, "-o", out, code=0)
+    assert gsmerge.read_ply(out).info.comments == ("gsmerge result", "SplatRenderMode: mip")
+    run("check", out, code=0)
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat", ".glb"])
+def test_other_formats_by_name(ending: str, state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    one, other = tmp_path / f"one{ending}", tmp_path / f"other{ending}"
+    assert run("compact", state, *PLAIN, "-o", one).code == 0
+    document = json.loads(run("compact", made_scene, "--fit", "none", *SMALL, "-o", other, "--json").out)
+    assert one.read_bytes() == other.read_bytes()
+    assert document["output"]["bytes"] == other.stat().st_size
+    assert not one.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment opacity")
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".spz", ".sog", ".splat"])
+def test_results_are_read_in_any_format(ending: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / f"a{ending}"
+    assert run("compact", made_scene, "--fit", "none", *SMALL, "-o", out).code == 0
+    inspected = json.loads(run("inspect", out, "--json").out)
+    assert inspected["bytes"] == out.stat().st_size
+    assert run("render", made_scene, out, "-o", tmp_path / "a.png").code == 0
+    table = run("evaluate", made_scene, out, "--lpips", "none").out
+    assert f"a{ending}" in table
+
+
+@pytest.mark.parametrize("ending", [".spz", ".splat"])
+def test_one_per_pixel_in_other_formats(ending: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    whole, out = tmp_path / f"whole{ending}", tmp_path / "out.ply"
+    gsmerge.write_gaussians(whole, gsmerge.read_scene(made_scene).gaussians)
+    places = ("--cameras", made_scene / "transforms.json", "--images", made_scene / "images")
+    outcome = run("compact", whole, *places, "--fit", "none", *SMALL, "-o", out, "--json", code=0)
+    assert json.loads(outcome.out)["output"]["num_gaussians"] > 10
+
+
+def test_no_normals(state: Path, tmp_path: Path, run: Run) -> None:
+    sizes = []
+    for name, extra in {"a": (), "b": ("--set", "normals=false")}.items():
+        assert run("compact", state, *PLAIN, "-o", tmp_path / f"{name}.ply", *extra).code == 0
+        sizes.append(gsmerge.read_ply(tmp_path / f"{name}.ply").info)
+    assert sizes[0].bytes_by_attribute["normals"] == 12 * sizes[0].count
+    assert "normals" not in sizes[1].bytes_by_attribute
+    assert sizes[1].count == sizes[0].count

@@ -1,0 +1,210 @@
+"""A state of one batch is what compacting gives without a fit, to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import motions
+import pytest
+import scenes
+from messages import names, refuses
+from network_fixtures import noisy, written
+from unaligned_scenes import far_behind, shuffled, voxels
+from view_batches import decoded, one_batch
+
+from gsmerge import Gaussians, Scene, compact
+from gsmerge.errors import UsageError
+from gsmerge.states.decode import DecodePlan, plan_decode
+from gsmerge.states.state import DividedGroups, State
+from gsmerge.states.state_file import load_state, save_state
+
+SHARE = "10%"
+
+
+@pytest.fixture(scope="module")
+def pixels() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4))
+
+
+@pytest.fixture(scope="module")
+def bare(pixels: Scene) -> Scene:
+    return replace(pixels, images=None)
+
+
+@pytest.fixture(scope="module")
+def state(pixels: Scene) -> State:
+    return one_batch(pixels, superpixels=SHARE)
+
+
+@pytest.fixture(scope="module")
+def bare_state(bare: Scene) -> State:
+    return one_batch(bare, superpixels=SHARE)
+
+
+def plan_of(state: State, **wish: Any) -> DecodePlan:
+    return plan_decode(state, groups_of(state), **wish)
+
+
+def groups_of(state: State) -> DividedGroups:
+    assert isinstance(state.groups, DividedGroups)
+    return state.groups
+
+
+def most_of(state: State) -> int:
+    """The largest number of Gaussians that a state is decoded to."""
+    return len(state) + groups_of(state).division.num_splits + state.num_kept
+
+
+def unfitted(scene: Scene, **settings: Any) -> Gaussians:
+    return compact(scene, **{"superpixels": SHARE, "fit": "none", **settings}).gaussians
+
+
+def test_views_that_disagree_stay_where_batches_will_be() -> None:
+    wrong = motions.disagreeing(scenes.make_scene(scenes.room(), scenes.arc(5, 160, 120)))
+    found = decoded(one_batch(wrong, superpixels="2%"))
+    assert scenes.identical(found, unfitted(wrong, superpixels="2%", poses="fixed"))
+    assert not scenes.identical(found, unfitted(wrong, superpixels="2%"))
+
+
+def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
+    """What is decoded by default."""
+    actual = decoded(one_batch(scene, **{"superpixels": SHARE, **settings}))
+    assert scenes.identical(actual, unfitted(scene, **settings))
+    assert len(actual) > 10
+    return actual
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4])
+def test_one_state_gives_every_k(k: int, pixels: Scene, state: State) -> None:
+    assert scenes.identical(decoded(state, k=k), unfitted(pixels, k=k))
+
+
+def test_tensors_too(pixels: Scene, state: State) -> None:
+    given = replace(pixels, gaussians=pixels.gaussians.to("cpu"), cameras=pixels.cameras.to("cpu"))
+    actual = one_batch(given, superpixels=SHARE)
+    assert scenes.identical(decoded(actual), decoded(state))
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_one_state_gives_every_k_without_photos(k: int, bare: Scene, bare_state: State) -> None:
+    assert scenes.identical(decoded(bare_state, k=k), unfitted(bare, k=k))
+
+
+def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: Scene) -> None:
+    state = one_batch(pixels, superpixels=SHARE, min_contribution=0.2)
+    actual = decoded(state, k=4)
+    everything = replace(state, settings=replace(state.settings, min_contribution=0.0))
+    assert len(actual) < len(decoded(everything, k=4))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"budget": "5%"},
+        {"budget": 300, "k": 2},
+        {"budget": "20KB"},
+        {"k": 5},
+        {"k": 8},
+        {"budget": 500, "k": 7},
+        {"budget": "auto"},
+        {"effort": "draft", "k": 2},
+        {"match": "aabb", "k": 2},
+        {"min_opacity": 0.3, "k": 2},
+        {"min_contribution": 0.2},
+    ],
+    ids=str,
+)
+def test_the_same_settings_give_the_same_gaussians(settings: dict[str, Any], pixels: Scene) -> None:
+    assert_equal_to_compact(pixels, **settings)
+
+
+@pytest.mark.parametrize("settings", [{"budget": "6%"}, {"budget": "auto"}, {"budget": "quest3", "k": 2}], ids=str)
+def test_the_same_without_photos(settings: dict[str, Any], bare: Scene) -> None:
+    assert_equal_to_compact(bare, **settings)
+
+
+@pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"k": 4}, {"budget": "7%"}], ids=str)
+def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Scene, tmp_path: Path) -> None:
+    checkpoint = written(tmp_path / "networks.safetensors", noisy())
+    actual = assert_equal_to_compact(pixels, checkpoint=str(checkpoint), **settings)
+    assert not scenes.identical(actual, unfitted(pixels, **settings))
+    kept = one_batch(pixels, superpixels=SHARE, checkpoint=str(checkpoint), **settings)
+    checkpoint.unlink()
+    save_state(tmp_path / "scene.gsm", kept)
+    assert scenes.identical(decoded(load_state(tmp_path / "scene.gsm")), actual)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_scenes_in_no_order(k: int, pixels: Scene) -> None:
+    unaligned = voxels(pixels, 0.05)
+    actual = one_batch(unaligned, superpixels="20%")
+    assert actual.settings.num_slots is not None
+    assert actual.settings.max_k == 8
+    assert scenes.identical(decoded(actual, k=k), unfitted(unaligned, k=k, superpixels="20%"))
+
+
+def test_shuffled_rows_and_a_budget(pixels: Scene) -> None:
+    assert_equal_to_compact(shuffled(pixels), budget="4%")
+
+
+@pytest.mark.parametrize("settings", [{"k": 1}, {"k": 2}, {"budget": "5%"}], ids=str)
+def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: Scene) -> None:
+    unaligned = shuffled(pixels)
+    hidden = far_behind(unaligned.gaussians, 200)
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, hidden]))
+    actual = one_batch(both, superpixels=SHARE, unseen="keep", **settings)
+    assert actual.num_kept > 0
+    assert scenes.identical(decoded(actual), unfitted(both, unseen="keep", **settings))
+
+
+def test_a_budget_of_the_decoder_is_met_and_dealt_where_it_helps(state: State) -> None:
+    groups = len(state)
+    counts = plan_of(state, budget=groups + 50).counts
+    assert counts.sum() == groups + 50
+    more = plan_of(state, budget=groups + 80).counts
+    assert (more >= counts).all()
+    share = plan_of(state, budget="10%").counts.sum()
+    assert share == state.settings.num_input // 10
+
+
+def test_more_than_there_is_to_divide_is_told(state: State) -> None:
+    plan = plan_of(state, budget=state.settings.num_input)
+    assert plan.counts.sum() == most_of(state) - state.num_kept
+    assert len(plan.notes) == 1
+    assert names(plan.notes[0], most_of(state))
+    assert len(decoded(state, budget=state.settings.num_input)) <= most_of(state)
+
+
+def test_auto_takes_what_compact_would_without_photos(bare: Scene, bare_state: State) -> None:
+    expected = len(unfitted(bare, budget="auto"))
+    assert bare_state.settings.knee_count == expected
+    plan = plan_of(bare_state, budget="auto")
+    assert plan.counts.sum() == max(expected, len(bare_state))
+    fewer = replace(bare_state, settings=replace(bare_state.settings, knee_count=len(bare_state) - 1))
+    plan = plan_of(fewer, budget="auto")
+    assert plan.counts.tolist() == [1] * len(bare_state)
+    assert names(plan.notes[0], "fewer", "groups")
+
+
+def test_the_result_does_not_depend_on_the_threads(pixels: Scene, state: State) -> None:
+    one = decoded(one_batch(pixels, superpixels=SHARE, threads=1), k=2, threads=1)
+    assert scenes.identical(one, decoded(state, k=2, threads=2))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "found"),
+    [("k", 0, "1 to 4"), ("k", "many", "1 to 4"), ("budget", 10, "begin"), ("budget", "0%", "one Gaussian")],
+)
+def test_wishes_that_cannot_be_met(name: str, value: Any, found: str, state: State) -> None:
+    with refuses(UsageError, name, found, value):
+        decoded(state, **{name: value})
+
+
+def test_fewer_children_take_less_space(pixels: Scene, state: State) -> None:
+    small = one_batch(pixels, superpixels=SHARE, max_k=1)
+    assert len(groups_of(small).division.children) == 0
+    assert scenes.identical(decoded(small), decoded(state, k=1))
+    with refuses(UsageError, "k", "1 to 1", 2):
+        decoded(small, k=2)

@@ -1,0 +1,141 @@
+"""The file of several batches: what comes back, and every kind of damage."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hostile.gsm_files import (
+    GSM_HEADERS,
+    UNREADABLE,
+    WILD_NUMBERS,
+    Spoil,
+    assert_refused_in_one_line,
+    filled,
+    header,
+    of_arrays,
+    with_about,
+    with_array,
+    with_header,
+    with_settings,
+    with_text,
+    without,
+)
+from messages import refuses
+from safetensors.numpy import load_file, save_file
+from unaligned_scenes import far_behind, shuffled
+from view_batches import fed, parts_of, room, same_state, state_of
+
+from gsmerge import Compactor, Gaussians
+from gsmerge.errors import SceneError
+from gsmerge.states.gsm_file import STATE
+from gsmerge.states.state import State
+from gsmerge.states.state_file import load_state, save_state
+
+
+@pytest.fixture(scope="module")
+def state() -> State:
+    return state_of(fed(parts_of(room(4, degree=1), 2)))
+
+
+@pytest.fixture
+def path(state: State, tmp_path: Path) -> Path:
+    save_state(tmp_path / "state.gsm", state)
+    return tmp_path / "state.gsm"
+
+
+ARRAYS = (
+    *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
+    *("features.sh0", "features.shN", "features.views", "features.fitted_sh0", "features.color_precision"),
+    *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
+    *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
+)
+FLOATS = [name for name in ARRAYS if name.split(".")[1] not in ("views", "counts", "images")]
+FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.means")]  # nothing is in those
+DAMAGED: dict[str, Spoil] = {
+    **UNREADABLE,
+    **GSM_HEADERS,
+    "of 0.1's encode by its name": with_text("{}", "gsmerge-encoded"),
+    "views of another size": with_header(width=35),
+    "no about": without("about"),
+    "about without options": with_header(about={"batches": []}),
+    "about without batches": with_header(about={"options": {}}),
+    "options in a list": with_header(about={"options": [], "batches": []}),
+    "batches by number": with_header(about={"options": {}, "batches": {"0": 1}}),
+    "options of words": with_about(options={"k": "many"}),
+    "a crop by number": with_about(options={"crop": 5}),
+    "latents without networks": with_array("features.latents", lambda a: np.zeros((len(a), 4), np.float32)),
+    "most of fewer than there are": with_settings(max_k=1),
+    "a negative number": with_settings(num_input=-1),
+    "a group without children": with_array("children.counts", filled(0)),
+    "a group with too many": with_array("children.counts", filled(9)),
+    "children of nobody": with_array("children.counts", lambda a: a.clip(max=1)),
+    "fewer children": with_array("children.means", lambda a: a[1:]),
+    "harmonics of another degree": with_array("children.shN", lambda a: a[:, :0]),
+    "views beyond": with_array("replay.views", lambda a: a + 3),
+    "views before": with_array("replay.views", lambda a: a - 1),
+    "views twice": with_array("replay.views", np.zeros_like),
+    "views in no order": with_array("replay.views", lambda a: a[::-1]),
+    "fewer photos": with_array("replay.images", lambda a: a[1:]),
+    "photos of another size": with_array("replay.images", lambda a: a[:, 1:]),
+    **of_arrays(ARRAYS, FLOATS),
+    **WILD_NUMBERS,
+}
+
+
+def test_everything_comes_back(path: Path, state: State) -> None:
+    same_state(load_state(path), state)
+
+
+def test_the_same_state_gives_the_same_bytes(path: Path, state: State, tmp_path: Path) -> None:
+    save_state(tmp_path / "again.gsm", state)
+    save_state(tmp_path / "loaded.gsm", load_state(path))
+    assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
+    assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("settings", [{}, {"fit": "none", "replay": 2}, {"max_k": 1, "k": 1, "tolerance": 0}], ids=str)
+def test_saved_between_batches_is_kept_in_memory(settings: dict[str, Any], tmp_path: Path) -> None:
+    """Bit for bit, in everything."""
+    batches = parts_of(room(6), 2)
+    kept = fed(batches, **settings)
+    stored = fed(batches[:1], **settings)
+    for number, batch in enumerate(batches[1:]):
+        stored.save(tmp_path / f"{number}.gsm")
+        stored = Compactor.load(tmp_path / f"{number}.gsm")
+        stored.extend(batch)
+    same_state(state_of(stored), state_of(kept))
+    assert stored.batches == kept.batches
+
+
+def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
+    unaligned = shuffled(room(2))
+    both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, far_behind(unaligned.gaussians, 200)]))
+    state = state_of(fed([both], unseen="keep", fit="none"))
+    save_state(tmp_path / "a.gsm", state)
+    same_state(load_state(tmp_path / "a.gsm"), state)
+
+
+def test_what_is_not_known_is_not_looked_at(path: Path, state: State) -> None:
+    said, arrays = header(path), load_file(path)
+    arrays["features.moods"], arrays["division.moods"] = np.full(7, np.nan), np.zeros(3)
+    said |= {"minor": 7, "moods": ["good"]}
+    said["settings"]["mood"] = "better"
+    save_file(arrays, path, {STATE: json.dumps(said), "mood": "best"})
+    same_state(load_state(path), state)
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGED))
+def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
+    DAMAGED[damage](path)
+    assert_refused_in_one_line(load_state, path)
+
+
+def test_a_newer_schema_says_what_to_do(path: Path) -> None:
+    DAMAGED["a newer schema"](path)
+    with refuses(SceneError, path, 2, 3, 9.9):
+        load_state(path)
