@@ -65,7 +65,7 @@ def test_one_encoding_gives_every_k(k: int, pixels: Scene, encoded: Encoded) -> 
     assert scenes.identical(decode_scene(encoded, k=k), unfitted(pixels, k=k))
 
 
-def test_tensors_too(pixels: Scene, encoded: Encoded) -> None:
+def test_tensors_too(pixels: Scene, encoded: Encoded, torch: Any) -> None:
     given = replace(pixels, gaussians=pixels.gaussians.to("cpu"), cameras=pixels.cameras.to("cpu"))
     actual = encode_scene(given, superpixels=SHARE)
     assert scenes.identical(decode_scene(actual), decode_scene(encoded))
