@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from messages import refuses
 from scripts import load_script
+from sweeps import sweep
 
 from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
@@ -21,7 +22,7 @@ PLATFORMS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("tag", PLATFORMS)
+@sweep("tag", PLATFORMS)
 def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
     where = find_platform(tag)
     paths = build(tmp_path, platform=tag)
