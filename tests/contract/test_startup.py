@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 from sweeps import sweep
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
@@ -27,10 +26,11 @@ def loaded_after(code: str) -> set[str]:
     return set(listing.splitlines()[-1].split()) & set(HEAVY)
 
 
-@pytest.mark.parametrize(
+@sweep(
     "arguments",
     [["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)],
     ids=" ".join,
+    often=4,
 )
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()

@@ -36,6 +36,7 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
         assert [path.read_bytes() for path in build(tmp_path / "again", platform=tag)] == [paths[0].read_bytes()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")
 def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")
