@@ -13,7 +13,7 @@ from gsmerge.states.options import SUFFIX
 
 # Arguments and options of ``compact`` that say something about a state, too
 ALLOWED = (
-    "scenes", "k", "budget", "fit", "effort", "device", "set", "output", "overwrite", "dry_run", "json", "quiet",
+    "scenes", "k", "budget", "fit", "effort", "set", "output", "overwrite", "dry_run", "json", "quiet",
     "seed", "threads",
 )  # fmt: skip
 
@@ -38,7 +38,7 @@ def compact_state(args: opt.Args, start: float) -> None:
     left = {"viewer_cameras": False, "columns": "needed"}  # a state has no names of views
     wanted, writing = args.make(FitOptions, FileOptions, **left)
     check_format(out, writing)
-    run = args.given(("effort", "device", "seed", "threads"))
+    run = args.given(("effort", "seed", "threads"))
     with opt.usage_errors():
         settings = replace(CompactOptions(fit=wanted), **run)
     before = {"import": perf_counter() - start}

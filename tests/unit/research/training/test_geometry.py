@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, Made, made
 from scenes import arc, make_scene, room
+from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
 from gsmerge.moments import feature_to_gaussians
@@ -147,8 +148,8 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("fixed_choices")
-@pytest.mark.parametrize(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
-@pytest.mark.parametrize("k", [1, 2, 4])
+@sweep(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
+@sweep("k", [1, 2, 4])
 def test_gradients_are_central_differences(example: Example, outputs: str, start: str, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
     options = replace(TINY, outputs=outputs, merger_start=start)
