@@ -129,7 +129,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     cuts = options.method == OURS and size.num_views > 0  # views into superpixels
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
-            checkpoint = load_networks(options, photos=reference.of_views, aligned=size.aligned)
+            checkpoint = load_networks(options, size)
         asked, options = options, resolve_budget(options, scene)
         segment = _resolve_superpixels(options.segment, scene, EFFORTS[options.effort])
         clean_options = options.clean
@@ -201,16 +201,16 @@ def plan_whole(
     share = limits.share if fit.share is None else fit.share
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    networks = choose_networks(options, photos=scene.photos, aligned=scene.aligned)
+    networks = choose_networks(options, scene)
     return WholePlan(choose_blocks(scene, options), decode, limits, match, networks, fit)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if the scene cannot be cut into as many as asked."""
     problems = blocks_problems(scene, options)
-    asked = wanted_blocks(options, *((scene.num_gaussians, scene.num_views) if scene.aligned else (0, 0)))
+    asked = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
-        asked = min(scene.num_views, asked)
+        asked = 1 if problems else min(scene.num_views, asked)
     if asked <= 1:
         return 1
     if problems:
@@ -264,26 +264,24 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
 
 
-def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
+def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    The shipped networks improve scenes with one Gaussian per pixel (``aligned``), and others that have photos, if no
-    fit follows; a fit takes more from its steps (docs/laboratory/networks.md). ``photos``: whether there are any to fit
-    to that are not drawings of the scene itself.
+    If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
+    fit gains more by further steps (docs/laboratory/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    unfitted = options.fit.fit == "none"
-    return "shipped" if (aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
+    photos, unfitted = size.photos and not size.drawn, options.fit.fit == "none"
+    return "shipped" if (size.aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
-def load_networks(options: CompactOptions, *, photos: bool, aligned: bool) -> Checkpoint | None:
+def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
     """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
 
-    ``photos``, ``aligned``: see :func:`choose_networks`. SceneError if it is required and cannot be used, UsageError if
-    it does not fit.
+    SceneError if it is required and cannot be used, UsageError if it does not fit.
     """
-    name = choose_networks(options, photos=photos, aligned=aligned)
+    name = choose_networks(options, size)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint

@@ -145,8 +145,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
         if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
-            size = measure_size(scene)
-            load_networks(settings, photos=size.photos, aligned=size.aligned)
+            load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
     return {

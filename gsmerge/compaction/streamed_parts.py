@@ -16,7 +16,7 @@ from gsmerge.measure.level_errors import level_errors
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.sky import sky
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Gaussians, PicturedScene, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,22 +39,20 @@ def split_levels(
 ) -> StreamedParts:
     """Split the levels of a result into parts; the photos of its ``scene`` say where the sky is."""
     levels, cameras = [level.gaussians.numpy() for level in (result, *result.coarser)], result.cameras.numpy()
-    seen = [Scene(level, cameras, scene.images, None, scene.names) for level in levels]
     kept, environment = levels, None
     if scene.images is not None and "sky" not in options.clean.drops:
-        masks = [_sky(view) for view in seen]
+        masks = [_sky(PicturedScene(level, cameras, scene.images, None, scene.names)) for level in levels]
         left = [level[~mask] for level, mask in zip(levels, masks, strict=True)]
         if masks[0].any() and all(map(len, left)) and _fits(left, levels[0][masks[0]], options):
             kept, environment = left, levels[0][masks[0]]
-    near = near_plane(seen[0]) if len(cameras) else 1.0
+    near = near_plane(Scene(levels[0], cameras, None, None, scene.names)) if len(cameras) else 1.0
     return StreamedParts(
         kept, environment, level_errors(kept, cameras, near, environment, progress or (lambda *_: None))
     )
 
 
-def _sky(scene: Scene) -> np.ndarray:
+def _sky(scene: PicturedScene) -> np.ndarray:
     """Return a mask ``[n]`` of the Gaussians that show the sky of the scene's photos."""
-    assert scene.images is not None, "photos say where the sky is"
     frame = scene_frame(scene)
     wide = replace(scene.gaussians, means=scene.gaussians.means.astype(np.float64))
     return sky(frame.enter(wide), frame.enter_cameras(scene.cameras), scene.images)

@@ -58,7 +58,7 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
 def largest_scale(scene: Scene) -> float:
     """Return the size of the photos as a multiple of the views' size, at least 1."""
     large = scene.large_photos
-    if large is None or scene.images is None or len(scene) == 0:
+    if large is None or len(scene) == 0:
         return 1.0
     focals = (0, 1), (0, 1)
     return max(1.0, float((large.Ks[0][focals] / scene.cameras.Ks[0][focals]).min()))

@@ -14,7 +14,7 @@ from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.estimate import estimate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
-from gsmerge.facts.scene_size import measure_size
+from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, plan_whole, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES
@@ -93,7 +93,8 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    assert choose_networks(options_of(**settings), photos=photos, aligned=aligned) == name
+    size = SceneSize(768, 1, 24, 32, aligned=aligned, photos=photos)
+    assert choose_networks(options_of(**settings), size) == name
 
 
 def test_a_plan_has_networks_or_none(scene: Scene) -> None:
