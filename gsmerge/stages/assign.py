@@ -15,7 +15,7 @@ from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
 from gsmerge.kernels.gaussians.fronts import weigh_centres
 from gsmerge.kernels.raster.contribution import dominant_labels
-from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
+from gsmerge.pooling import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import ViewPlan
 from gsmerge.raster.images import ONE_AT_A_TIME, plan_views
 from gsmerge.raster.photos import NEAR

@@ -17,8 +17,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import COLOR
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import (
     TrainingScene,

@@ -12,7 +12,7 @@ from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.moments import Members, scene_members
+from gsmerge.pooling import Members, scene_members
 from gsmerge.raster import composite, plan_view, prepare
 from gsmerge.raster.photos import NEAR, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map

@@ -15,7 +15,7 @@ from view_batches import fed, random_gaussians, room, same_group, state_of
 from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
-from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
+from gsmerge.pooling import feature_to_gaussians, scene_members, unaligned_members
 from gsmerge.raster import contributions, plan_view, prepare
 from gsmerge.raster.photos import Photos, photos_of, scene_photos
 from gsmerge.raster.weights import apply
