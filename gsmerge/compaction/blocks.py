@@ -38,11 +38,11 @@ from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
 from gsmerge.plan import Plan, WholePlan, make_plan
-from gsmerge.raster import contributions, plan_view
+from gsmerge.raster import contributions, tile_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
-from gsmerge.raster.view_plan import Splats
+from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, make_array, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
@@ -279,7 +279,7 @@ def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, 
         photos = blank_photos(part.prepared.scene.cameras[places], 2)
 
         def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
-            return contributions(plan_view(splats, **photos.camera(view)))[0]
+            return contributions(tile_view(splats, **photos.camera(view)))[0]
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
             yield number, place, weights

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.raster import composite, plan_view, prepare
+from gsmerge.raster import composite, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -38,8 +38,8 @@ def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
-        plan = plan_view(splats, **photos.camera(view))
-        return view_weights(plan), composite(plan)[0]
+        tiled = tile_view(splats, **photos.camera(view))
+        return view_weights(tiled), composite(tiled)[0]
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
     return Drawn(list(views), list(images))

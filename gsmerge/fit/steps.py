@@ -14,11 +14,11 @@ from gsmerge.fit.prepared_step import StepTables, is_prepared
 from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.raster import plan_view
+from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos
-from gsmerge.raster.view_plan import camera_numbers
+from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -49,7 +49,7 @@ class Optimiser:
         if error is not None:
             return error / max(3 * float(weight.sum()), 1)
         camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
-        drawn = plan_view(state.splats, **camera, opacities=opacities)
+        drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
         image, transmittance = blend(drawn, colors, step.background)

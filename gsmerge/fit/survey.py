@@ -9,7 +9,7 @@ import numpy as np
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.schedule import FitPlan
 from gsmerge.fit.scores import score_images
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
@@ -46,7 +46,7 @@ def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
     colors = state.view_colors()
 
     def one_view(view: int) -> tuple[np.ndarray, ...]:
-        drawn = plan_view(state.splats, **half.camera(view))
+        drawn = tile_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
@@ -73,8 +73,8 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        plan = plan_view(splats, **photos.camera(view))
-        return plan.ids, contributions(plan)[1]
+        tiled = tile_view(splats, **photos.camera(view))
+        return tiled.ids, contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
     for ids, peaks in in_turn(one_view, range(len(photos))):

@@ -26,7 +26,7 @@ from gsmerge.fit.schedule import (
 from gsmerge.fit.scores import score_state
 from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.fit.survey import survey_photos
-from gsmerge.raster import plan_view, splat_adjoint
+from gsmerge.raster import splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 
@@ -79,7 +79,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
     assert box_shares.max() == 1
     np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
     whole = np.ones((alone[1].height, alone[1].width, 1))
-    shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
+    shown = splat_adjoint(tile_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
     np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
 
 

@@ -16,7 +16,7 @@ from gsmerge.fit.poses import start_poses
 from gsmerge.fit.schedule import DROPOUT, FEW_VIEWS, MANY_STEPS, Schedule, plan_run
 from gsmerge.fit.steps import make_optimiser
 from gsmerge.geometry import motion_matrices, motion_vectors, project_points
-from gsmerge.raster import plan_view
+from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import gradients_of
 from gsmerge.raster.photos import Photos
@@ -107,7 +107,7 @@ def spoil(photos: Pair, size: float = 0.01) -> Pair:
 
 def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, np.ndarray]:
     """Of a view, and its gradient by the viewmat."""
-    drawn = plan_view(start_state(truth).splats, **photos.camera(view))
+    drawn = tile_view(start_state(truth).splats, **photos.camera(view))
     colors = view_colors(drawn)
     image, left = blend(drawn, colors, np.zeros(3, np.float32))
     residual = image - photos.images[view]

@@ -22,7 +22,7 @@ from gsmerge.fit.outside import (
 )
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_centres
-from gsmerge.raster import composite, plan_view, prepare
+from gsmerge.raster import composite, prepare, tile_view
 from gsmerge.raster.photos import Photos, render_photos
 from gsmerge.runtime.record import record_run
 
@@ -80,8 +80,8 @@ def test_gradients_are_those_of_the_weighted_opacity(outside: Photos, truth: Gau
 
     def loss(change: float) -> float:
         changed = replace(spoilt, opacities=np.append(spoilt.opacities[:-1], np.float32(0.3 + change)))
-        plan = plan_view(prepare(changed), **outside.camera(view))
-        return float((outside.weights[view] * (1 - composite(plan)[1])).mean(dtype=np.float64))
+        tiled = tile_view(prepare(changed), **outside.camera(view))
+        return float((outside.weights[view] * (1 - composite(tiled)[1])).mean(dtype=np.float64))
 
     assert g.ids[-1] == len(truth)
     assert g.opacities[-1] == pytest.approx((loss(step) - loss(-step)) / (2 * step), rel=1e-3)

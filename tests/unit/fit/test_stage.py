@@ -16,7 +16,7 @@ from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.scores import score_images
 from gsmerge.fit.survey import survey_photos, visible_mask
-from gsmerge.raster import composite, contributions, plan_view, prepare
+from gsmerge.raster import composite, contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
 
@@ -103,7 +103,7 @@ def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
     np.testing.assert_array_equal(survey.visible(1 / 255), visible_mask(truth, half, 1 / 255))
     sums = np.zeros((len(half), len(truth)))
     for view in range(len(half)):
-        drawn = plan_view(state.splats, **half.camera(view))
+        drawn = tile_view(state.splats, **half.camera(view))
         pictures.append(composite(drawn, state.colors)[0])
         sums[view] = contributions(drawn)[0]
     assert survey.score == score_images(pictures, plan, half)
