@@ -14,7 +14,7 @@ from gsmerge.fit.growth import grow_to
 from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
-from gsmerge.fit.schedule import FitJob, plan_run
+from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.scores import photo_error
 from gsmerge.fit.survey import survey_photos
 from gsmerge.raster import prepare
@@ -67,14 +67,14 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a job with its views from outside."""
-    options, plan = job.options, plan_run(job)
-    survey = survey_photos(gaussians, plan)
+    options, run = job.options, prepare_fit(job)
+    survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
     if options.fit == "none":
         return kept, None
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, plan, survey[keep], fixed), CLOSE)
+    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gsmerge.fit.fit_state import start_state
-from gsmerge.fit.schedule import FitPlan
+from gsmerge.fit.schedule import FitRun
 from gsmerge.fit.scores import score_images
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
@@ -36,12 +36,12 @@ class Survey:
         return Survey(self.score, **columns)
 
 
-def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
-    """Draw Gaussians into the half-size photos of a planned fit, and collect what they show of each.
+def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
+    """Draw Gaussians into the half-size photos of a fit, and collect what they show of each.
 
     The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
     """
-    photos = plan.job.photos
+    photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
@@ -59,7 +59,7 @@ def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(score_images(images, plan, half), inside, peaks, sums, squares, pixels)
+    return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:

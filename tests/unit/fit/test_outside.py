@@ -102,7 +102,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
     start = scenes.spoil(truth)
     whole = replace(outside, weights=np.sign(outside.weights))
-    fitted, without = (fit_full(start, scenes.plan_for(shown, LONG, outside=views))[0] for views in (whole, None))
+    fitted, without = (fit_full(start, scenes.run_for(shown, LONG, outside=views))[0] for views in (whole, None))
     kept, grown = score_fog(prepare(fitted), outside), score_fog(prepare(without), outside)
     assert kept < 0.02
     assert grown > 4 * kept
