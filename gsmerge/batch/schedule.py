@@ -13,7 +13,7 @@ from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import RecordIndex
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.plan import plan_whole
+from gsmerge.plan import choose_for_scene
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.threads import available_threads
@@ -70,7 +70,7 @@ def estimate_seconds(jobs: Sequence[Job], schedule: Schedule) -> float:
         settings = job.call.settings
         size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
         with suppress(UsageError):  # the run says so
-            whole = plan_whole(size, settings)
+            whole = choose_for_scene(size, settings)
             seconds = work_seconds(
                 job.num_gaussians, size.width, whole.settings(settings), photos=True, fit_steps=whole.fit.steps
             )
