@@ -31,8 +31,8 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    The result is the fitted Gaussians if they beat the start on held-out blocks after the half-size steps, otherwise it
-    is the start. The full-size steps then use every block. ``survey``: of the Gaussians, if made already; ``fixed``:
+    The result is the fitted Gaussians if they beat the start on held-out patches after the half-size steps, else it
+    is the start. The full-size steps then use every patch. ``survey``: of the Gaussians, if made already; ``fixed``:
     mask ``[n]`` of Gaussians that stay as they are.
     """
     job, options, schedule, tail = run.job, run.job.options, Schedule(run), TailMean()
@@ -68,7 +68,7 @@ def fit_full(
     if not judged:
         after = score_state(state, run, half)
     if options.judged and after <= before:
-        why = f"held-out parts of the photos were no better after {step} steps"
+        why = f"held-out patches of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
     if grows and len(state.x) < job.count:  # a time budget may end before the growth
         state = grow_to(state, half, job.count)

@@ -63,11 +63,11 @@ class FitRun:
     """A full fit as it was prepared: weights of the pixels, dropout, and the share of steps at half size."""
 
     job: FitJob
-    # [h,w] float32 of each photo at half size: 0 on held-out blocks, if the fit is judged by them, `HIDDEN`
+    # [h,w] float32 of each photo at half size: 0 on held-out patches, if the fit is judged by them, `HIDDEN`
     # on pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
     # The same as a step uses them, at every size: 0 on hidden pixels; at full size 1 on held-out
-    # blocks, too, and larger photos count everywhere
+    # patches, too, and larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps, the first ones, on half-size photos
@@ -99,7 +99,7 @@ class FitRun:
 
 
 def prepare_fit(job: FitJob) -> FitRun:
-    """Prepare a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
+    """Prepare a fit: held-out patches, pixels outside masks, and dropout where there are few views."""
     photos, options = job.photos, job.options
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))

@@ -1,4 +1,4 @@
-"""Scores of a fit: PSNR on held-out blocks, and errors of whole photos."""
+"""Scores of a fit: PSNR on held-out patches, and errors of whole photos."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsmerge.types import Gaussians
 
 
 def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders on the held-out blocks of the half-size photos; NaN if nothing is held out."""
+    """Return the PSNR (dB) of renders on the held-out patches of the half-size photos; NaN if nothing is held out."""
     options = run.job.options
     if options.fit == "none" or not options.judged:
         return float("nan")
@@ -22,7 +22,7 @@ def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> flo
 
 
 def score_state(state: State, run: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of a state on the held-out blocks of the half-size photos; see :func:`score_images`."""
+    """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
     return score_images(render_photos(state.splats, half, colors=state.view_colors()), run, half)
 
 

@@ -23,7 +23,7 @@ from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
+CLOSE = 1.0  # dB that the held-out patches must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
@@ -51,7 +51,7 @@ def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], opti
 def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Leave out Gaussians that no photo shows, and fit the rest to the photos; without a fit in a draft, keep all.
 
-    Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
+    Where the full fit does not make held-out patches of the photos better, the colour fit is tried.
     Views from outside are added to the job. The report is None if nothing was asked for.
     """
     options = job.options
@@ -100,7 +100,7 @@ def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
-    """Return the fitted Gaussians, or their start if held-out blocks hardly gained and whole photos lost.
+    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos lost.
 
     Gaussians that were fitted already are where steps of the default size only scatter. After a
     gain of ``close`` dB or more the photos are not compared.

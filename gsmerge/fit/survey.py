@@ -20,7 +20,7 @@ from gsmerge.types import Gaussians
 class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
-    score: float  # PSNR (dB) of the held-out blocks of these pictures
+    score: float  # PSNR (dB) of the held-out patches of these pictures
     inside: np.ndarray  # [n] bool, whether some photo's frustum may hold it
     peaks: np.ndarray  # [n] float32 largest blending weight
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels

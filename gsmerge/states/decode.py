@@ -169,7 +169,7 @@ def decode_state(
             gaussians, report = fit(gaussians, job)
         notes = *notes, *record.notes
         if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
-            note = "the fit was not accepted: held-out parts of the photos did not get better"
+            note = "the fit was not accepted: held-out patches of the photos did not get better"
             groups, notes = divide_groups(share(state)), (*notes, note)
             gaussians = decode_counts(state, groups, count_children(state, groups, k=k, budget=budget))
     return DecodeResult(state.frame.leave(gaussians), report, notes)

@@ -284,7 +284,7 @@ def run_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **j
 
 
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
-    """Photos of noise: nothing that is learned of one block holds in another."""
+    """Photos of noise: nothing that is learned of one patch holds in another."""
     rng = np.random.default_rng(0)
     made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
     return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])

@@ -51,7 +51,7 @@ def fit_targets(
     """Compute the targets for every K of ``options.levels`` by fitting analytic Feature Gaussians to photos.
 
     ``name`` is the scene's, for errors; ``progress`` is called with (step, steps) of the fits. A SceneError if the fit
-    does not improve held-out parts of the photos.
+    does not improve held-out patches of the photos.
     """
     masks, (full, half) = covered_pixels(coverage(training)), (training.photos(), training.photos(2))
     masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts

@@ -212,7 +212,7 @@ def test_perfect_start_is_not_spoilt(scene: Scene, truth: Gaussians, photos: Pai
     assert np.abs(actual - expected).mean() < 0.01
 
 
-def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
