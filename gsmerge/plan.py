@@ -35,7 +35,7 @@ from gsmerge.settings.stages import (
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.clean import clean
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
+from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, scene_tree
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ EFFORTS = {
 class Plan:
     """All decisions about a run, made before the first superpixel is cut."""
 
-    superpixels: SuperpixelPlan  # How each view is cut, and into how many
+    superpixels: SuperpixelChoices  # How each view is cut, and into how many
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -142,16 +142,18 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        whole = plan_whole(size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen))
-        limits = whole.limits
-        fit = _fit_photos(prepared, options, whole.fit)
+        choices = choose_for_scene(
+            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen)
+        )
+        limits = choices.limits
+        fit = _fit_photos(prepared, options, choices.fit)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
-        superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
-        match=replace(options.match, match=whole.match),
+        superpixels=SuperpixelChoices(segment, limits, start_share(fit), tree),
+        match=replace(options.match, match=choices.match),
         decode=options.decode,
         fit=fit,
         clean=clean_options,
@@ -169,7 +171,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 @dataclass(frozen=True)
-class WholePlan:
+class SceneChoices:
     """Decisions about a whole scene that cost no computation; a run, its estimate and its blocks share them."""
 
     blocks: int  # Parts in which the scene is compacted; at most, where many views alone ask for them
@@ -184,9 +186,9 @@ class WholePlan:
         return options.to_dict() | {"k": self.decode.k, "match": self.match, "checkpoint": self.checkpoint}
 
 
-def plan_whole(
+def choose_for_scene(
     scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
-) -> WholePlan:
+) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
@@ -202,7 +204,7 @@ def plan_whole(
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    return WholePlan(choose_blocks(scene, options), decode, limits, match, networks, fit)
+    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:

@@ -161,8 +161,8 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
         first = start + length + left // 2
         unsure = left // 2 + length
     width, height = grid.transform.width, grid.transform.height
-    blocks = tuple(range(len(grid.views)))
-    return Layout("", "pruned", "view-major", width, height, blocks, tuple(rows), tuple(pixels))
+    views = tuple(range(len(grid.views)))
+    return Layout("", "pruned", "view-major", width, height, views, tuple(rows), tuple(pixels))
 
 
 def _agreeing(stretches: np.ndarray) -> np.ndarray:

@@ -142,7 +142,7 @@ def _refine(inputs: AlignmentInput, reading: Reading) -> Reading:
 
 
 def _differs(layout: Layout, other: Layout) -> bool:
-    """Return whether two layouts put rows to different pixels, judged by some rows of each block."""
+    """Return whether two layouts put rows to different pixels, judged by some rows of each part."""
     if layout.views != other.views or [r.size for r in layout.rows] != [r.size for r in other.rows]:
         return True
     a, b = subsample(layout, 200), subsample(other, 200)

@@ -85,8 +85,8 @@ def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
 def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
     limit = max(_SEEN_LIMITS * pixel_limit(layout.width, layout.height), _SEEN_SHARE * min(layout.width, layout.height))
     count = len(layout.views)
-    for block in sorted({0, count // 2, count - 1}):
-        part = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
+    for i in sorted({0, count // 2, count - 1}):
+        part = replace(layout, views=(0,), rows=layout.rows[i : i + 1], pixels=layout.pixels[i : i + 1])
         pairs = inputs.pairs(subsample(part, _SEEN_SAMPLES))
         if projective_error(pairs.points, pairs.pixels) <= limit:
             return True
@@ -139,14 +139,14 @@ def best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int
 
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | None:
-    """Find for each block the camera into whose pixels it projects best; None where two choose the same."""
+    """Find for each part the camera into whose pixels it projects best; None where two choose the same."""
     pairs = inputs.pairs(subsample(layout, 300))
     chosen = []
-    for block in range(len(layout.views)):
-        block_pairs = pairs.select(pairs.blocks == block)
-        if not len(block_pairs.rows):
+    for part in range(len(layout.views)):
+        part_pairs = pairs.select(pairs.parts == part)
+        if not len(part_pairs.rows):
             return None
-        views = (np.full(len(block_pairs.rows), view) for view in range(len(inputs.cameras)))
-        errors = [median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
+        views = (np.full(len(part_pairs.rows), view) for view in range(len(inputs.cameras)))
+        errors = [median(pixel_errors(replace(part_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
         chosen.append(int(np.argmin(errors)))
     return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None

@@ -47,8 +47,8 @@ _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 class AlignmentResult:
     """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
 
-    # ``[n]`` int64, the pixel ``(block·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
-    # A block is a view, or one layer of a view with several Gaussians per pixel
+    # ``[n]`` int64, the pixel ``(part·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
+    # A part is a view, or one layer of a view with several Gaussians per pixel
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
     images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
@@ -61,12 +61,12 @@ class AlignmentResult:
 
     @property
     def layout(self) -> Layout | None:
-        """Pixel of each row, block by block; None for rows without pixels."""
+        """Pixel of each row, part by part; None for rows without pixels."""
         return None if self.recovery is None else self.recovery.best.layout
 
     @property
     def views(self) -> tuple[int, ...]:
-        """Camera of each block; for rows without pixels, all cameras."""
+        """Camera of each part; for rows without pixels, all cameras."""
         return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, check_folder, record
-from gsmerge.batch.schedule import make_schedule
+from gsmerge.batch.workload import choose_concurrency
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
@@ -46,15 +46,15 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray is not
     installed.
     """
-    schedule = make_schedule(jobs, options)
-    run = Run(folder, check_folder(folder), schedule.threads, options.overwrite)
+    concurrency = choose_concurrency(jobs, options)
+    run = Run(folder, check_folder(folder), concurrency.threads, options.overwrite)
     active: dict[str, Job] = {}
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
-        pool: Pool = ProcessPool(schedule.jobs, schedule.threads)
+        pool: Pool = ProcessPool(concurrency.jobs, concurrency.threads)
         if options.engine == "ray":
             cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
-            pool = RayPool(cluster, schedule.threads, jobs=schedule.jobs)
+            pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)
         stack.enter_context(closing(pool))
 
         def each_call(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:

@@ -108,10 +108,10 @@ def damage_notes(index: RecordIndex) -> list[str]:
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     """Compact all scenes, report each, and sum up."""
-    from gsmerge.batch.schedule import make_schedule
+    from gsmerge.batch.workload import choose_concurrency
 
-    totals, stdout, schedule = Totals(len(jobs)), sys.stdout, make_schedule(jobs, options)
-    at_once = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
+    totals, stdout, concurrency = Totals(len(jobs)), sys.stdout, choose_concurrency(jobs, options)
+    at_once = f"{concurrency.jobs or 'all it has room for'} at once, {concurrency.threads} thread(s) each"
     say(f"{len(jobs):,} scenes, {at_once}", quiet=args.silent)
 
     def add(record: dict[str, Any]) -> None:
@@ -244,20 +244,20 @@ def print_plan(
     unit: str = "scenes",
 ) -> None:
     """Print what a run would do and how long it would take; ``unit``: word for the jobs."""
-    from gsmerge.batch.schedule import estimate_memory, estimate_seconds, make_schedule, pending_jobs
+    from gsmerge.batch.workload import choose_concurrency, estimate_memory, estimate_seconds, pending_jobs
     from gsmerge.report import document_head, human_bytes
 
-    out, pending, schedule = args.output, pending_jobs(jobs, args.output, options), make_schedule(jobs, options)
+    out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
     left = {job.output for job in pending}
-    seconds, memory = estimate_seconds(pending, schedule), estimate_memory(jobs, schedule)
+    seconds, memory = estimate_seconds(pending, concurrency), estimate_memory(jobs, concurrency)
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
         f"num_{unit}": len(jobs),
         "num_pending": len(pending),
-        "jobs": schedule.jobs,
-        "threads": schedule.threads,
+        "jobs": concurrency.jobs,
+        "threads": concurrency.threads,
         "estimate": {"seconds": round(seconds, 1), "memory_bytes": memory},
         unit: [
             {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output not in left}
@@ -269,7 +269,7 @@ def print_plan(
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do")
-    at_once = schedule.jobs or "as many as the cluster has room for"
-    lines.append(f"at once     {at_once}, {schedule.threads} thread(s) each")
+    at_once = concurrency.jobs or "as many as the cluster has room for"
+    lines.append(f"at once     {at_once}, {concurrency.threads} thread(s) each")
     lines.append(f"estimate    about {duration(seconds)}, {human_bytes(memory)} of memory")
     print_document(document, lines, as_json=args.json)

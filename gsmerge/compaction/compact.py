@@ -18,7 +18,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
+from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
@@ -55,12 +55,12 @@ def compact(
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
         size = measure_size(scene)
-        whole = plan_whole(size, options)  # what needs no work to decide
-        note_engine(size, options, whole.blocks)
-        if whole.blocks > 1:
-            blocks, covisibility = cut_views(scene, options, whole.blocks)
+        choices = choose_for_scene(size, options)  # what needs no work to decide
+        note_engine(size, options, choices.blocks)
+        if choices.blocks > 1:
+            blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
-                return compact_in_blocks(scene, options, whole, blocks, covisibility)
+                return compact_in_blocks(scene, options, choices, blocks, covisibility)
         return compact_piece(scene, options)
 
 

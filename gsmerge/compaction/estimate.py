@@ -12,7 +12,7 @@ from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import plan_whole, resolve_budget, stands_alone
+from gsmerge.plan import choose_for_scene, resolve_budget, stands_alone
 from gsmerge.report import human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.threads import available_threads
@@ -36,16 +36,16 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     size = measure_size(scene)
     if options.budget.auto and scene.aligned:
         options = resolve_budget(options, canonicalise(scene)[0])
-    whole = plan_whole(size, options)
-    limits, settings = whole.limits, whole.settings(options)
+    choices = choose_for_scene(size, options)
+    limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
     most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
     count = min(scene.num_gaussians or pixels, most)
-    at_once, num_rest = gaussians_at_once(pixels, whole.blocks), 3 * scene.gaussians.shN.shape[1]
+    at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     seconds = wall_seconds(
-        at_once * whole.blocks, len(scene), settings, threads=options.threads or available_threads(),
-        photos=size.photos, fit_steps=whole.fit.steps,
+        at_once * choices.blocks, len(scene), settings, threads=options.threads or available_threads(),
+        photos=size.photos, fit_steps=choices.fit.steps,
         num_drawn=drawn * float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
     )  # fmt: skip
     memory = memory_bytes(at_once, photos=size.photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
@@ -54,12 +54,12 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "num_gaussians": count,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        "blocks": whole.blocks,
+        "blocks": choices.blocks,
         "method": options.method,
         "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings, photos=size.photos),
-        "fit_steps": whole.fit.steps,
+        "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),

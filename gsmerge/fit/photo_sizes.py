@@ -18,7 +18,7 @@ from gsmerge.types import Scene
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
 MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
 ALIKE = 0.01  # of the scale: the rounding of sizes
-BLOCK = 32  # pixels, at most
+PATCH = 32  # pixels, at most
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 
 
@@ -86,19 +86,19 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Return training weights ``[h,w]`` float32 per view: 0 on held-out blocks, the photo's weights elsewhere.
+    """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
     Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
     """
-    size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
+    size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
 
     def one_view(view: int) -> np.ndarray:
         rows, columns = -(-photos.height // size), -(-photos.width // size)
         random = np.random.default_rng([seed, view])
-        blocks = random.random((rows, columns)) < share
-        if not blocks.any():
-            blocks[random.integers(rows), random.integers(columns)] = rows * columns > 1
-        full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
+        patches = random.random((rows, columns)) < share
+        if not patches.any():
+            patches[random.integers(rows), random.integers(columns)] = rows * columns > 1
+        full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
         if photos.weights is None:
             return full.astype(np.float32)
         weights = photos.weights[view]
@@ -113,7 +113,7 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 
 
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
-    """Return the PSNR (dB) of renders on the held-out blocks, where ``weights [h,w]`` are 0.
+    """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
     Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
     """

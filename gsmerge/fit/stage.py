@@ -14,7 +14,7 @@ from gsmerge.fit.growth import grow_to
 from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
-from gsmerge.fit.schedule import FitJob, plan_run
+from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.scores import photo_error
 from gsmerge.fit.survey import survey_photos
 from gsmerge.raster import prepare
@@ -23,7 +23,7 @@ from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
+CLOSE = 1.0  # dB that the held-out patches must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
@@ -51,7 +51,7 @@ def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], opti
 def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Leave out Gaussians that no photo shows, and fit the rest to the photos; without a fit in a draft, keep all.
 
-    Where the full fit does not make held-out parts of the photos better, the colour fit is tried.
+    Where the full fit does not make held-out patches of the photos better, the colour fit is tried.
     Views from outside are added to the job. The report is None if nothing was asked for.
     """
     options = job.options
@@ -67,14 +67,14 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a job with its views from outside."""
-    options, plan = job.options, plan_run(job)
-    survey = survey_photos(gaussians, plan)
+    options, run = job.options, prepare_fit(job)
+    survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
     if options.fit == "none":
         return kept, None
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, plan, survey[keep], fixed), CLOSE)
+    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])
@@ -100,7 +100,7 @@ def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
-    """Return the fitted Gaussians, or their start if held-out blocks hardly gained and whole photos lost.
+    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos lost.
 
     Gaussians that were fitted already are where steps of the default size only scatter. After a
     gain of ``close`` dB or more the photos are not compared.

@@ -11,14 +11,14 @@ from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import fog_gradients
 from gsmerge.fit.poses import PoseState, start_poses
 from gsmerge.fit.prepared_step import StepTables, is_prepared
-from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
+from gsmerge.fit.schedule import FitRun, Step, loss_weights, step_sizes
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.raster import plan_view
+from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos
-from gsmerge.raster.view_plan import camera_numbers
+from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
@@ -28,8 +28,8 @@ ROWS = 16384  # Gaussians per piece of an optimiser step
 class Optimiser:
     """Optimiser of a full fit: takes its steps, and moves cameras where the options ask for it."""
 
-    plan: FitPlan
-    photos: tuple[Photos, ...]  # Those of the plan's job, at the poses of the moment
+    run: FitRun
+    photos: tuple[Photos, ...]  # Those of the run's job, at the poses of the moment
     poses: PoseState | None  # The motions of the cameras; None where they are fixed
     tables: StepTables | None = None  # Of the state that took the last prepared step
 
@@ -41,19 +41,19 @@ class Optimiser:
     def step(self, state: State, step: Step) -> float:
         """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
         photos, mode, opacities = self.photos[step.mode.size], step.mode, None
-        weight = self.plan.step_weights[mode.size][step.view]
+        weight = self.run.step_weights[mode.size][step.view]
         if step.kept is not None:
-            fuller = state.splats.opacities / np.float32(1 - self.plan.dropout)
+            fuller = state.splats.opacities / np.float32(1 - self.run.dropout)
             opacities = step.kept * np.minimum(fuller, MAX_ALPHA)
         error = self._take_prepared(state, step, weight, opacities)
         if error is not None:
             return error / max(3 * float(weight.sum()), 1)
         camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
-        drawn = plan_view(state.splats, **camera, opacities=opacities)
+        drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
         image, transmittance = blend(drawn, colors, step.background)
-        rates = self.plan.job.options.tuning
+        rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
         gradient, error = image_gradient(image, photos.image(step.view), weight, *weights)
         with_viewmat = self.poses is not None
@@ -75,7 +75,7 @@ class Optimiser:
                 tables = self.tables = StepTables(state, threads)
             mode, photos = step.mode, self.photos[step.mode.size]
             camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
-            rates = self.plan.job.options.tuning
+            rates = self.run.job.options.tuning
             numbers = self._constants(state, step) | {
                 "camera": camera_numbers(**camera),
                 "background": step.background,
@@ -88,7 +88,7 @@ class Optimiser:
 
     def _constants(self, state: State, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""
-        options, count = self.plan.job.options, max(len(state.x), 1)
+        options, count = self.run.job.options, max(len(state.x), 1)
         rates = options.tuning
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
@@ -99,8 +99,8 @@ class Optimiser:
 
     def clear_fog(self, state: State, step: Step, view: int) -> None:
         """Take one Adam step against fog: opacity that a view from outside shows where the start was empty."""
-        assert self.plan.job.outside is not None
-        self._move(state, fog_gradients(state.splats, self.plan.job.outside, view), step)
+        assert self.run.job.outside is not None
+        self._move(state, fog_gradients(state.splats, self.run.job.outside, view), step)
 
     def _move(self, state: State, g: Gradients, step: Step) -> None:
         """Take one Adam step along gradients."""
@@ -120,10 +120,10 @@ class Optimiser:
         parallel_map(update, range(0, len(g.ids), ROWS))
 
 
-def make_optimiser(plan: FitPlan) -> Optimiser:
-    """Return the optimiser of a planned fit; its cameras are where the photos were taken."""
-    photos = plan.job.photos
-    if not plan.job.options.move_cameras:
-        return Optimiser(plan, photos, None)
+def make_optimiser(run: FitRun) -> Optimiser:
+    """Return the optimiser of a fit; its cameras are where the photos were taken."""
+    photos = run.job.photos
+    if not run.job.options.move_cameras:
+        return Optimiser(run, photos, None)
     poses, moving = start_poses(photos)
-    return Optimiser(plan, moving, poses)
+    return Optimiser(run, moving, poses)

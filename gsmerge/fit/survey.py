@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from gsmerge.fit.fit_state import start_state
-from gsmerge.fit.schedule import FitPlan
+from gsmerge.fit.schedule import FitRun
 from gsmerge.fit.scores import score_images
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
@@ -20,7 +20,7 @@ from gsmerge.types import Gaussians
 class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
-    score: float  # PSNR (dB) of the held-out blocks of these pictures
+    score: float  # PSNR (dB) of the held-out patches of these pictures
     inside: np.ndarray  # [n] bool, whether some photo's frustum may hold it
     peaks: np.ndarray  # [n] float32 largest blending weight
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
@@ -36,17 +36,17 @@ class Survey:
         return Survey(self.score, **columns)
 
 
-def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
-    """Draw Gaussians into the half-size photos of a planned fit, and collect what they show of each.
+def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
+    """Draw Gaussians into the half-size photos of a fit, and collect what they show of each.
 
     The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
     """
-    photos = plan.job.photos
+    photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
     def one_view(view: int) -> tuple[np.ndarray, ...]:
-        drawn = plan_view(state.splats, **half.camera(view))
+        drawn = tile_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
@@ -59,7 +59,7 @@ def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(score_images(images, plan, half), inside, peaks, sums, squares, pixels)
+    return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
@@ -73,8 +73,8 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        plan = plan_view(splats, **photos.camera(view))
-        return plan.ids, contributions(plan)[1]
+        tiled = tile_view(splats, **photos.camera(view))
+        return tiled.ids, contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
     for ids, peaks in in_turn(one_view, range(len(photos))):

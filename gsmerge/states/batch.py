@@ -14,9 +14,9 @@ from gsmerge.fit import FitReport
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrector import Corrector
 from gsmerge.plan import Plan
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, photo_errors, photos_of
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
@@ -103,7 +103,7 @@ class BatchFeatures:
 
 @dataclass(frozen=True)
 class StateKind:
-    """The functions and constants that differ between states of moments and of latents."""
+    """The functions and constants that differ between states of decoded groups and of latents."""
 
     reach: float  # Standard deviations of a group, to where a view touches it
     encode: Callable[[State | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians

@@ -31,8 +31,8 @@ from gsmerge.states.batch import (
     rows_in_view,
     update_replay,
 )
+from gsmerge.states.extend_decoded import DECODED
 from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
-from gsmerge.states.extend_moments import MOMENTS
 from gsmerge.states.groups import select_groups, share, share_groups
 from gsmerge.states.options import ExtendOptions
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, State, StoredSettings, no_photos
@@ -90,7 +90,7 @@ def extend(
         has_latents = keeps_latents(plan) if state is None else state.networks is not None
         if keeps_latents(plan) and not has_latents:
             note("the state holds no latents: groups of this batch are decoded when they enter")
-        batch, kind = make_batch(state, prepared, plan, extend_options), LATENTS if has_latents else MOMENTS
+        batch, kind = make_batch(state, prepared, plan, extend_options), LATENTS if has_latents else DECODED
         if not batch.is_new.all():
             note(
                 f"views with the cameras of earlier ones, which count once: {sum(~batch.is_new)} of {len(batch.is_new)}"

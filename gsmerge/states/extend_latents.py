@@ -13,12 +13,12 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with_group_features, find_neighbors
 from gsmerge.networks.checkpoint import IN_PACKAGE, Checkpoint, load_checkpoint
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.plan import Plan
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import MatchOptions

@@ -8,8 +8,8 @@ import numpy as np
 
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
-from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.networks.corrector import Corrector
+from gsmerge.pooling import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.states.division import divide_all, divide_by_heads, pick_children
@@ -25,7 +25,7 @@ def without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def bake(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> GroupSet:
-    """Decode groups into moments and children, so that gains, latents and decoder heads are no longer needed."""
+    """Decode groups into pooled Gaussians and children, so that neither gains, latents nor heads are needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -155,7 +155,7 @@ def _undecoded_children(groups: DividedGroups, counts: np.ndarray) -> tuple[Gaus
 
 
 def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSet:
-    """Return groups that other batches can join: as moments with up to ``max_k`` children, or with their latents."""
+    """Return groups that other batches can join: decoded, with up to ``max_k`` children, or with their latents."""
     most = np.full(len(groups), max_k)
     if groups.learned is not None and groups.heads is not None:
         children, parents = _undecoded_children(groups, most)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.facts.prepare import Frame
 from gsmerge.facts.views import resize_cameras
-from gsmerge.moments import Members
+from gsmerge.pooling import Members
 from gsmerge.stages.merge import take
 from gsmerge.states.division import Division
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians

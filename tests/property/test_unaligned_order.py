@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from sweeps import sweep
 
 from gsmerge import Scene, compact
-from gsmerge.moments import unaligned_members
+from gsmerge.pooling import unaligned_members
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment

@@ -24,9 +24,9 @@ from gsmerge.io.cameras.npz_files import (
     array_shape,
     holds_poses,
     read_da3,
+    read_depth_frame,
     read_depths,
     read_dump,
-    read_frame,
 )
 from gsmerge.io.cameras.pose_lines import FRAMES, POSES, list_frames, pose_of_frame
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, to_stored
@@ -101,10 +101,10 @@ def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
 
 def read_images(frames: Sequence[Path]) -> Photos:
     """Read the images of DA3-Streaming's frames; many are read at each use."""
-    width, height = read_frame(frames[0]).size
+    width, height = read_depth_frame(frames[0]).size
 
     def read(view: int) -> np.ndarray:
-        frame = read_frame(frames[view])
+        frame = read_depth_frame(frames[view])
         if frame.size != (width, height):
             problem = f"expected a depth map of {width} x {height} pixels as in {frames[0].name}"
             raise SceneError(frames[view], f"{problem}, found {frame.size[0]} x {frame.size[1]}")
@@ -116,7 +116,7 @@ def read_images(frames: Sequence[Path]) -> Photos:
 
 def _read_frame(path: Path) -> tuple[np.ndarray, CameraFile]:
     """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image."""
-    frame = read_frame(path)
+    frame = read_depth_frame(path)
     view = View(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
     return frame.depth[None], make_camera_file(path, "", C2W_OPENCV, [view], frame.image[None])
 

@@ -84,7 +84,7 @@ def chart(args: opt.Args) -> None:
         _draw(args, [], 0)
         return
     from gsmerge.batch.records import RecordIndex
-    from gsmerge.batch.schedule import pending_jobs
+    from gsmerge.batch.workload import pending_jobs
 
     jobs, options, notes = _make_jobs(args, scenes)
     notes += damage_notes(RecordIndex(out).read_on())

@@ -15,8 +15,8 @@ from view_batches import fed, random_gaussians, room, same_group, state_of
 from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
-from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.pooling import feature_to_gaussians, scene_members, unaligned_members
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos, photos_of, scene_photos
 from gsmerge.raster.weights import apply
 from gsmerge.states.batch import (
@@ -91,8 +91,8 @@ def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: t
     photos = photos_of(black, cameras, level)
     splats = prepare(gaussians)
     for view in range(2):
-        plan = plan_view(splats, **photos.camera(view))
-        peaks = contributions(plan)[1]
+        tiled = tile_view(splats, **photos.camera(view))
+        peaks = contributions(tiled)[1]
         drawn = np.flatnonzero(peaks > 0)
         assert len(drawn) > 0
         missed = drawn[~actual[view][drawn]]

@@ -10,7 +10,7 @@ import scenes
 from view_batches import fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.settings.stages import MatchOptions
-from gsmerge.states.extend_moments import find_partners, merge_into
+from gsmerge.states.extend_decoded import find_partners, merge_into
 from gsmerge.states.groups import limit_children, select_groups, share
 from gsmerge.states.state import GroupSet
 

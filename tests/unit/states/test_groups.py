@@ -14,9 +14,9 @@ from view_batches import decoded, group, one_batch, random_gaussians, same_group
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
-from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
 from gsmerge.networks.corrector import ANALYTIC
+from gsmerge.pooling import feature_to_gaussians, gaussian_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.states.groups import (

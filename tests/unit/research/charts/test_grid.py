@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from messages import noted, refuses
 
-from gsmerge.batch.schedule import Schedule, estimate_seconds
+from gsmerge.batch.workload import Concurrency, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.grid import (
@@ -244,7 +244,7 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
 
 def estimate(scene: Path, grid: Grid | None = None) -> float:
     jobs, _ = make_jobs(sources(scene), grid or Grid(), EvaluateOptions(()))
-    return estimate_seconds(jobs[1:], Schedule(1, 2))
+    return estimate_seconds(jobs[1:], Concurrency(1, 2))
 
 
 def test_estimates_grow_with_the_work(made_scene: Path) -> None:

@@ -12,12 +12,12 @@ from scenes import arc, make_scene, room
 from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import FEATURE
 from gsmerge.networks.tensors import quat_to_rotmat
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.research.training import Example, make_example, make_training_scene
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import (

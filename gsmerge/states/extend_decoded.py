@@ -1,4 +1,4 @@
-"""Batches for a state whose groups are decoded: they enter as moments, which add up, and children."""
+"""Batches for a state whose groups are decoded as they enter: as pooled Gaussians, which add up, and children."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.fit import visible_mask
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.pipeline import merge_views
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
@@ -72,7 +72,7 @@ def _join(
         return concat_groups([groups, alone]), counts
 
 
-MOMENTS = StateKind(REACH, _encode, _decode, _divide, _join)
+DECODED = StateKind(REACH, _encode, _decode, _divide, _join)
 
 
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:

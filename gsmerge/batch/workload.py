@@ -13,7 +13,7 @@ from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import RecordIndex
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.plan import plan_whole
+from gsmerge.plan import choose_for_scene
 from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.threads import available_threads
@@ -23,25 +23,25 @@ FREE_MEMORY_SHARE = 0.8  # of the free memory that scenes at once may take, wher
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Concurrency:
     """How many scenes are compacted at once, each on how many threads."""
 
     jobs: int  # 0: as many as the cluster has processors for
     threads: int
 
 
-def make_schedule(jobs: Sequence[Job], options: BatchOptions) -> Schedule:
+def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
     """Divide the processors among scenes: a thread for each, as far as there are scenes and free memory."""
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
-        return Schedule(options.jobs or 0, threads or 1)
+        return Concurrency(options.jobs or 0, threads or 1)
     count, free = options.jobs, free_memory()
     if count is None:
         count = processors // (threads or 1)
         sums = accumulate(nlargest(count, (job.memory for job in jobs)))
         count = count if free is None else sum(total <= FREE_MEMORY_SHARE * free for total in sums)
     count = max(1, min(count, len(jobs)))
-    return Schedule(count, threads or max(1, processors // count))
+    return Concurrency(count, threads or max(1, processors // count))
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[Job]:
@@ -58,7 +58,7 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
     return [job for job in jobs if options.overwrite or not is_done(job)]
 
 
-def estimate_seconds(jobs: Sequence[Job], schedule: Schedule) -> float:
+def estimate_seconds(jobs: Sequence[Job], concurrency: Concurrency) -> float:
     """Estimate the wall time of all jobs in seconds, within a factor of about two."""
     total = 0.0
     for job in (job for job in jobs if job.num_gaussians):  # the run says what cannot be read
@@ -70,14 +70,14 @@ def estimate_seconds(jobs: Sequence[Job], schedule: Schedule) -> float:
         settings = job.call.settings
         size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
         with suppress(UsageError):  # the run says so
-            whole = plan_whole(size, settings)
+            whole = choose_for_scene(size, settings)
             seconds = work_seconds(
                 job.num_gaussians, size.width, whole.settings(settings), photos=True, fit_steps=whole.fit.steps
             )
-            total += seconds / min(schedule.threads, views)
-    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(schedule.jobs, len(jobs)))
+            total += seconds / min(concurrency.threads, views)
+    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(concurrency.jobs, len(jobs)))
 
 
-def estimate_memory(jobs: Sequence[Job], schedule: Schedule) -> int:
+def estimate_memory(jobs: Sequence[Job], concurrency: Concurrency) -> int:
     """Estimate the bytes that the largest scenes take together, within a factor of about two."""
-    return sum(nlargest(schedule.jobs or 1, (job.memory for job in jobs)))
+    return sum(nlargest(concurrency.jobs or 1, (job.memory for job in jobs)))
