@@ -26,7 +26,7 @@ from gsmerge.cli.paths import (
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
-from gsmerge.states.options import SUFFIX
+from gsmerge.settings.extend import SUFFIX
 
 if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
@@ -124,12 +124,13 @@ def compact(args: opt.Args) -> None:
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
     """Return the settings with the engine that was asked for; UsageError where it is not installed."""
-    from gsmerge.runtime.work import require_ray
     from gsmerge.settings.stages import Engine
 
     with opt.usage_errors():
         engine = Engine(args.engine, args.address)
     if engine.name == "ray" and not args.dry_run:
+        from gsmerge.runtime.work import require_ray
+
         require_ray()
     return replace(settings, blocks=replace(settings.blocks, engine=engine))
 
@@ -166,7 +167,8 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print an estimate of what ``compact`` would make of a scene."""
-    from gsmerge.compaction.files import Outputs, plan_files, plan_lines, read_input
+    from gsmerge.compaction.estimate import plan_files, plan_lines
+    from gsmerge.compaction.files import Outputs, read_input
 
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():

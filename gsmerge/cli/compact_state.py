@@ -9,7 +9,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, default_output
 from gsmerge.errors import UsageError
-from gsmerge.states.options import SUFFIX
+from gsmerge.settings.extend import SUFFIX
 
 # Arguments and options of ``compact`` that say something about a state, too
 ALLOWED = (

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import array_names
+from gsmerge.io.cameras.read import array_names
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import may_hold_gaussians
 
