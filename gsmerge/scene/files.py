@@ -23,12 +23,13 @@ from gsmerge.io.cameras.read import (
     read_sharp_camera,
 )
 from gsmerge.io.formats.ply import header_content, header_counts
-from gsmerge.io.formats.table import DEPTHS, FRAMES, POSES, is_frame
+from gsmerge.io.formats.table import DEPTHS, FRAMES, POSES, SEVERAL_USES, is_frame
 from gsmerge.io.image_names import list_images
 from gsmerge.runtime.plugins import LazyFunction
-from gsmerge.scene.no_gaussians import check_scene_file, no_gaussians
 from gsmerge.types import StrPath
 
+_CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file")
+_NO_GAUSSIANS = LazyFunction("gsmerge.scene.no_gaussians", "no_gaussians")
 _FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
 # The first that exists and is no result wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
@@ -113,7 +114,8 @@ def find_scene_files(
         raise SceneError(path, problem, f"name {path.parent}")
     for part in plys:
         check_file(part)
-        check_scene_file(part)
+        if part.suffix.lower() in SEVERAL_USES:
+            _CHECK_SCENE_FILE(part)
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
@@ -171,7 +173,7 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     if len(plys) == 1:
         return plys
     if not plys:
-        raise no_gaussians(folder)
+        raise _NO_GAUSSIANS(folder)
     places = {path.parent for path in plys}
     if is_frame(plys[0]):
         return plys

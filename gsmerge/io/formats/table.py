@@ -94,6 +94,7 @@ DEPTHS = Format(
     ".npz", "depth maps with images and cameras: a Gaussian for each pixel", _lazy("depth_maps.read_rows"), None, -1,
     holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
 )  # fmt: skip
+SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS)
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FILES))
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
