@@ -33,7 +33,6 @@ from gsmerge.settings.stages import (
     SegmentOptions,
 )
 from gsmerge.stages.assign import merge_unseen
-from gsmerge.stages.clean import clean
 from gsmerge.stages.encode import measured_share
 from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, scene_tree
 from gsmerge.types import Gaussians, Scene
@@ -353,7 +352,11 @@ def _merge_unseen(
     if count == 0:
         return unseen[:0], num_input
     merged = merge_unseen(visible, scene, count)
-    return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
+    if clean_options.asked:
+        from gsmerge.stages.clean import clean
+
+        merged, _ = clean(merged, clean_options, scene, prepared.frame.leave)
+    return merged, num_input
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:

@@ -14,7 +14,17 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.alignment.calibration import calibrate
-from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
+from gsmerge.alignment.layouts import (
+    DEPTH_SHARE,
+    ESTIMATED,
+    WITH_PHOTOS,
+    Layout,
+    da3_box,
+    every_nth,
+    exact_layouts,
+    patch_grids,
+    subsample,
+)
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
 from gsmerge.alignment.stretches import UNIQUE, base_colors, byte_colors, place_stretch, shown_colors
@@ -22,9 +32,7 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_ca
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
 from gsmerge.types import Cameras, Gaussians
 
-ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
-WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
 _STRETCH = 96  # rows that are compared with a photo
 _STRETCHES = 60  # of a view
 _PER_STRETCH = 12  # rows of each that cameras are estimated from

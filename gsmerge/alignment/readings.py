@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.incomplete import read_incomplete
 from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
@@ -61,6 +60,8 @@ def _tiers(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Readi
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
     if not exact_frames:
+        from gsmerge.alignment.incomplete import read_incomplete  # of the few files that lack rows
+
         yield from ([reading] for reading in read_incomplete(inputs))
 
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.cameras import describe_reading, max_pixels, move_cameras, other_conventions
-from gsmerge.alignment.estimate import ESTIMATED, WITH_PHOTOS
-from gsmerge.alignment.explain import explain_count
 from gsmerge.alignment.judge import Fit, Recovery, accept_reading, choose_fit
 from gsmerge.alignment.layouts import (
+    ESTIMATED,
     MAY_BE_UNALIGNED,
+    WITH_PHOTOS,
     GridFit,
     Layout,
     check_photo_size,
@@ -28,8 +28,6 @@ from gsmerge.alignment.layouts import (
 )
 from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
 from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
-from gsmerge.alignment.unaligned import check_cameras, choose_cameras
-from gsmerge.alignment.upright import solve_upright, upright_error, upright_rotation
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -167,6 +165,10 @@ def align(
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
     """Choose cameras that see rows without pixels; SceneError where none do, or the rows should have pixels."""
+    from gsmerge.alignment.explain import explain_count
+    from gsmerge.alignment.unaligned import choose_cameras
+    from gsmerge.alignment.upright import upright_rotation
+
     info, camera_file = source.ply.info, source.camera_file
     if source.order not in MAY_BE_UNALIGNED:
         check_photo_size(info, camera_file, photo_size(source.photos))
@@ -185,6 +187,8 @@ def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequenc
 
 def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
+    from gsmerge.alignment.upright import solve_upright, upright_error
+
     for fitted in (grid, *square_grids(grid)) if len(source.photos) else ():
         inputs = source.inputs(fitted)
         frame = solve_upright(inputs, rotation)
@@ -226,6 +230,8 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
         yield _fit_moved(source, grid)
     if not large:
         yield next(other_sizes, [])
+    from gsmerge.alignment.unaligned import check_cameras  # few files come here
+
     rows = source.ply.gaussians, source.ply.valid
     grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
     yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)

@@ -39,21 +39,25 @@ def default_output(ply: Path) -> Path:
 
 def output_file(output: Path) -> Path:
     """Return the file that an output names: of a folder called ``colmap`` that of a COLMAP model's points."""
-    from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
+    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
 
     return output / PLACE / POINTS if output.name == FOLDER else output
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
     """List the files that belong to an output if that is a COLMAP model; SceneError if it is another program's."""
-    from gsmerge.io.cameras.colmap_model import POINTS, files_beside
+    from gsmerge.io.formats.table import POINTS
 
-    return files_beside(output) if output.name == POINTS else ()
+    if output.name != POINTS:
+        return ()
+    from gsmerge.io.cameras.colmap_model import files_beside
+
+    return files_beside(output)
 
 
 def is_index(output: Path) -> bool:
     """Return whether an output is the index of a Streamed SOG, whose folder is made if missing."""
-    from gsmerge.io.formats.streamed import INDEX
+    from gsmerge.io.formats.table import INDEX
 
     return output.name == INDEX
 
@@ -105,7 +109,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
-    from gsmerge.io.cameras.colmap_model import MODEL_NAMES
+    from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:

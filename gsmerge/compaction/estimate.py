@@ -1,22 +1,29 @@
-"""Estimate the size, time and memory of a run without running it."""
+"""Estimate the size, time and memory of a run without running it, as ``inspect`` and ``--dry-run`` show it."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsmerge.compaction.files import Outputs, check_saved_cameras, sized
+from gsmerge.compaction.methods import check_method
 from gsmerge.facts.partition import gaussians_at_once
-from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import choose_for_scene, resolve_budget, stands_alone
-from gsmerge.report import human_bytes
+from gsmerge.plan import choose_for_scene, load_networks, resolve_budget, stands_alone
+from gsmerge.report import document_head, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.scene.read import Loaded
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.stages.segment import largest_count
 from gsmerge.types import Scene
 
@@ -81,4 +88,40 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
         " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
         f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
         *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
+    ]
+
+
+def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
+    """Return as a document what :func:`compact_files` would make of a scene."""
+    scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
+    check_saved_cameras(scene, outputs)
+    _, unused = check_method(settings, scene)
+    notes = [*load.notes, *unused, *missing_notes(scene)]
+    if os.path.lexists(out) and not outputs.overwrite:
+        notes.append(f"{out} exists already: --overwrite would replace it")
+    with record_run() as record:
+        if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
+            load_networks(settings, measure_size(scene))
+        run = estimate(scene, settings)
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
+    return {
+        **document_head(),
+        "dry_run": True,
+        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
+        "output": {"path": str(out)},
+        "compact": run,
+        "options": settings.to_dict(),
+        "notes": [*notes, *record.notes],
+    }
+
+
+def plan_lines(document: Mapping[str, Any]) -> list[str]:
+    """Write the document of :func:`plan_files` as lines for people."""
+    scene, out = document["input"], document["output"]["path"]
+    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
+    return [
+        f"would read {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
+        f"would write {out}{levels}",
+        *estimate_lines(document["compact"]),
+        *(f"note       {note}" for note in document["notes"]),
     ]

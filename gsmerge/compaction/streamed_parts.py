@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +12,8 @@ from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import NEAR, measure_bytes
 from gsmerge.compaction.result import CompactResult
 from gsmerge.facts.prepare import scene_frame
-from gsmerge.io.formats.streamed import LeafErrors
+from gsmerge.io.atomic import AddOutput
+from gsmerge.io.formats.streamed import LeafErrors, add_levels, remove_unused_chunks
 from gsmerge.measure.evaluate import near_plane
 from gsmerge.measure.level_errors import level_errors
 from gsmerge.runtime.record import Progress
@@ -32,6 +35,17 @@ class StreamedParts:
         count = 0 if self.environment is None else len(self.environment)
         choices = {**result.report.choices, "streamed": {"errors": self.measure is not None, "environment": count}}
         return replace(result, report=replace(result.report, choices=choices))
+
+    def write(self, add: AddOutput, out: Path, first: Path, comments: Sequence[str]) -> dict[Path, list[Path]]:
+        """Write the index, whose file is ``first`` now, and its chunks: the present files of each level by its path."""
+        (_, finest), *coarser = add_levels(
+            add, out, first, self.levels, comments, environment=self.environment, measure=self.measure
+        )
+        return {out: [first, *finest], **dict(coarser)}
+
+    def remove_unused(self, out: Path) -> None:
+        """Remove the chunks of an index that was replaced."""
+        remove_unused_chunks(out)
 
 
 def split_levels(

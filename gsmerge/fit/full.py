@@ -16,9 +16,8 @@ from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.growth import grow_to
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.fit.schedule import GROWTH, PROBE, FitRun, Schedule, affordable_steps
-from gsmerge.fit.scores import score_state
 from gsmerge.fit.steps import make_optimiser
-from gsmerge.fit.survey import Survey, survey_photos
+from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels

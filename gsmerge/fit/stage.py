@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
@@ -15,8 +14,7 @@ from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
-from gsmerge.fit.scores import photo_error
-from gsmerge.fit.survey import survey_photos
+from gsmerge.fit.survey import photo_error, survey_photos
 from gsmerge.raster import prepare
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
@@ -95,6 +93,8 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport
 
 def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Fit base colours alone to the half-size photos."""
+    from gsmerge.fit.color import draw, fit_colors  # few fits come here
+
     half = job.photos[1]
     return fit_colors(gaussians, draw(gaussians, half), half, job.options, job.seed)
 

@@ -1,17 +1,18 @@
-"""Survey of the start of a fit: what the photos show of each Gaussian."""
+"""Look at the photos during a fit: what they show of each Gaussian, and how well Gaussians show them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
-from gsmerge.fit.fit_state import start_state
+from gsmerge.fit.fit_state import State, start_state
+from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
-from gsmerge.fit.scores import score_images
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
-from gsmerge.raster.photos import Photos
+from gsmerge.raster.photos import Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Gaussians
 
@@ -81,3 +82,25 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
     return peak, inside
+
+
+def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
+    """Return the PSNR (dB) of renders on the held-out blocks of the half-size photos; NaN if nothing is held out."""
+    options = plan.job.options
+    if options.fit == "none" or not options.judged:
+        return float("nan")
+    return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
+
+
+def score_state(state: State, plan: FitRun, half: Photos) -> float:
+    """Return the PSNR (dB) of a state on the held-out blocks of the half-size photos; see :func:`score_images`."""
+    return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
+
+
+def photo_error(gaussians: Gaussians, photos: Photos) -> float:
+    """Return the mean squared error of renders against whole photos."""
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+        return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
+
+    return float(np.mean(photo_errors(gaussians, photos, score)))

@@ -13,7 +13,6 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
-from gsmerge.kernels.gaussians.fronts import weigh_centres
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.pooling import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import TiledView
@@ -58,6 +57,8 @@ def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     view wins ties. A pixel's front is the Gaussian with the largest opacity x transmittance of those whose centres it
     sees, -1 without any.
     """
+    from gsmerge.kernels.gaussians.fronts import weigh_centres  # with networks alone
+
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))

@@ -20,9 +20,9 @@ from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, photo_errors, photos_of
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.states.groups import replace_groups, select_groups
-from gsmerge.states.options import ExtendOptions
 from gsmerge.states.state import DividedGroups, GroupSet, Replay, State, StateNetworks
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PicturedScene, Segmentation
 

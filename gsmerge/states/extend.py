@@ -17,6 +17,7 @@ from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MAX_CHILDREN, USUAL_K
 from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews, take
@@ -34,7 +35,6 @@ from gsmerge.states.batch import (
 from gsmerge.states.extend_decoded import DECODED
 from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
 from gsmerge.states.groups import select_groups, share, share_groups
-from gsmerge.states.options import ExtendOptions
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, State, StoredSettings, no_photos
 from gsmerge.types import Gaussians, Scene
 

@@ -29,11 +29,11 @@ from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import merge_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.states.decode import check_fit, count_children, decode_state
 from gsmerge.states.extend import extend
 from gsmerge.states.groups import divide_groups
-from gsmerge.states.options import merge_settings
 from gsmerge.states.state import State
 from gsmerge.states.state_file import load_state, save_state
 

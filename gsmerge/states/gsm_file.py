@@ -26,8 +26,8 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.stages import MAX_CHILDREN
-from gsmerge.states.options import SUFFIX
 from gsmerge.states.state import StoredSettings
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 

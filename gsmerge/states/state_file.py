@@ -11,11 +11,11 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.networks.options import CORRECTED, GROUP
+from gsmerge.settings.extend import merge_settings
 from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.states.division import Division
 from gsmerge.states.groups import with_child_rows, without_members
 from gsmerge.states.gsm_file import FEATURE_COLUMNS, GsmFile, float32, read_gsm, write_gsm
-from gsmerge.states.options import merge_settings
 from gsmerge.states.state import (
     Colors,
     DividedGroups,

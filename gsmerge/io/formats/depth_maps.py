@@ -28,14 +28,15 @@ from gsmerge.io.cameras.npz_files import (
     read_depths,
     read_dump,
 )
-from gsmerge.io.cameras.pose_lines import FRAMES, POSES, list_frames, pose_of_frame
+from gsmerge.io.cameras.pose_lines import list_frames, pose_of_frame
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, to_stored
+from gsmerge.io.formats.table import FRAMES as FRAMES
+from gsmerge.io.formats.table import POSES, is_frame
 from gsmerge.io.photo_files import PhotoReader, Photos, keep_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.runtime.threads import parallel_map
 
-SUFFIX = ".npz"
 PLACES = (  # in a folder, besides the frames
     "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "predictions.npz", "views.npz",
 )  # fmt: skip
@@ -52,16 +53,6 @@ def find_depth_maps(folder: Path) -> list[Path]:
     """
     whole = next((folder / place for place in PLACES if holds_depth_maps(folder / place)), None)
     return list_frames(folder) if whole is None else [whole]
-
-
-def is_frame(path: Path) -> bool:
-    """Return whether a file has one of DA3-Streaming's frames."""
-    return path.suffix == SUFFIX and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
-
-
-def own_cameras(path: Path) -> Path:
-    """Return the file of the cameras that depth maps are placed by."""
-    return path.parent.parent / POSES if is_frame(path) else path
 
 
 def holds_depth_maps(path: Path) -> bool:

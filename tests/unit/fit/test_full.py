@@ -23,9 +23,8 @@ from gsmerge.fit.schedule import (
     prepare_fit,
     step_sizes,
 )
-from gsmerge.fit.scores import score_state
 from gsmerge.fit.steps import Optimiser, make_optimiser
-from gsmerge.fit.survey import survey_photos
+from gsmerge.fit.survey import score_state, survey_photos
 from gsmerge.raster import splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning

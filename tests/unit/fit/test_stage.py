@@ -14,8 +14,7 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import outside_views, score_fog
-from gsmerge.fit.scores import score_images
-from gsmerge.fit.survey import survey_photos, visible_mask
+from gsmerge.fit.survey import score_images, survey_photos, visible_mask
 from gsmerge.raster import composite, contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
