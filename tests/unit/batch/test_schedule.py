@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from gsmerge.batch import BatchOptions, Job
 from gsmerge.batch import schedule as plans
 from gsmerge.batch.jobs import CompactCall
-from gsmerge.batch.schedule import Schedule, estimate_memory, estimate_seconds, make_schedule
+from gsmerge.batch.schedule import make_schedule
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.exporters import AUTO
 from gsmerge.settings.compact import CompactOptions
@@ -57,11 +56,3 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
     assert [count(3), count(2), count(1.9), count(0.5), count(None)] == [4, 2, 1, 1, 4]
     assert count(1, jobs=3) == 3  # who asks for it gets it
-    assert estimate_memory(scenes, Schedule(2, 1)) == 2 * need
-
-
-def test_estimates_grow_with_scenes_and_shrink_with_processors(made_scene: Path) -> None:
-    one = [Job(str(made_scene), ("a.ply",), CALL, 30_000)]
-    seconds = [estimate_seconds(one * count, Schedule(at_once, 1)) for count, at_once in
-               ((0, 1), (1, 1), (8, 1), (8, 4))]  # fmt: skip
-    assert seconds[0] == 0 < seconds[1] < seconds[3] < seconds[2]
