@@ -98,7 +98,7 @@ def decode_planned(state: State, groups: DividedGroups, plan: DecodePlan) -> Gau
         )
     if plan.min_contribution > 0:
         gaussians = gaussians[visible_mask(gaussians, blank_photos(cameras, 2), plan.min_contribution)]
-    return gaussians if state.kept is None else Gaussians.concat([gaussians, state.kept])
+    return Gaussians.concat([gaussians, state.kept])
 
 
 @dataclass(frozen=True)
