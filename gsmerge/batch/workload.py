@@ -1,9 +1,8 @@
-"""Plan a batch: how many scenes at once, which ones are left to do, and how long they take."""
+"""Plan a batch: how many scenes at once, and which ones are left to do."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from heapq import nlargest
 from itertools import accumulate
@@ -11,13 +10,9 @@ from pathlib import Path
 
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import RecordIndex
-from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.scene_size import SceneSize
-from gsmerge.plan import choose_for_scene
-from gsmerge.runtime.estimate import IMPORT_SECONDS, work_seconds
+from gsmerge.errors import SceneError
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.threads import available_threads
-from gsmerge.scene.content_hash import cameras_of
 
 FREE_MEMORY_SHARE = 0.8  # of the free memory that scenes at once may take, where their number is not given
 
@@ -28,6 +23,9 @@ class Concurrency:
 
     jobs: int  # 0: as many as the cluster has processors for
     threads: int
+
+    def __str__(self) -> str:
+        return f"{self.jobs or 'as many as the cluster has room for'} at once, {self.threads} thread(s) each"
 
 
 def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrency:
@@ -56,28 +54,3 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
             return False
 
     return [job for job in jobs if options.overwrite or not is_done(job)]
-
-
-def estimate_seconds(jobs: Sequence[Job], concurrency: Concurrency) -> float:
-    """Estimate the wall time of all jobs in seconds, within a factor of about two."""
-    total = 0.0
-    for job in (job for job in jobs if job.num_gaussians):  # the run says what cannot be read
-        views = 1  # where cameras cannot be read
-        with suppress(SceneError):
-            files = job.find_files()
-            cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
-            views = max(1, len(cameras or ()))
-        settings = job.call.settings
-        size = SceneSize(job.num_gaussians, views, 1, -(-job.num_gaussians // views), aligned=True, photos=True)
-        with suppress(UsageError):  # the run says so
-            whole = choose_for_scene(size, settings)
-            seconds = work_seconds(
-                job.num_gaussians, size.width, whole.settings(settings), photos=True, fit_steps=whole.fit.steps
-            )
-            total += seconds / min(concurrency.threads, views)
-    return IMPORT_SECONDS * bool(jobs) + total / max(1, min(concurrency.jobs, len(jobs)))
-
-
-def estimate_memory(jobs: Sequence[Job], concurrency: Concurrency) -> int:
-    """Estimate the bytes that the largest scenes take together, within a factor of about two."""
-    return sum(nlargest(concurrency.jobs or 1, (job.memory for job in jobs)))

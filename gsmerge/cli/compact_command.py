@@ -38,7 +38,7 @@ STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there a
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that say something about a state, too
 OF_STATES = (
-    "scenes", "k", "budget", "fit", "effort", "device", "set", "output", "overwrite", "dry_run", "json", "quiet",
+    "scenes", "k", "budget", "fit", "effort", "set", "output", "overwrite", "dry_run", "json", "quiet",
     "seed", "threads",
 )  # fmt: skip
 
@@ -145,7 +145,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     left = {"viewer_cameras": False, "columns": "needed"}  # a state has no names of views
     wanted, writing = args.make(FitOptions, FileOptions, **left)
     check_format(out, writing)
-    run = args.given(("effort", "device", "seed", "threads"))
+    run = args.given(("effort", "seed", "threads"))
     with opt.usage_errors():
         settings = replace(CompactOptions(fit=wanted), **run)
     before = {"import": perf_counter() - start}

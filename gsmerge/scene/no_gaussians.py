@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -63,6 +64,10 @@ POINTS_ONLY = (
 
 def no_gaussians(folder: Path) -> SceneError:
     """Make the error of a folder without a scene: what is there instead, and what to do."""
+    try:
+        os.scandir(folder).close()
+    except OSError as error:
+        return SceneError(folder, f"cannot be read ({error.strerror})")
     content, remedy = _content(folder) or ("", _NAME)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)

@@ -98,7 +98,7 @@ def decode_counts(state: State, groups: DividedGroups, wanted: DecodeCounts) -> 
         )
     if wanted.min_contribution > 0:
         gaussians = gaussians[visible_mask(gaussians, blank_photos(cameras, 2), wanted.min_contribution)]
-    return gaussians if state.kept is None else Gaussians.concat([gaussians, state.kept])
+    return Gaussians.concat([gaussians, state.kept])
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -167,9 +168,8 @@ def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatur
 
 def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     """Match, merge and refine the Feature Gaussians of a first batch, as for a scene of its views."""
-    context, networks = new.context, new.networks
+    context = new.context
     assert isinstance(context, NetworkContext)
-    assert networks is not None
     merged = merge(new.features, match(new.features, batch.plan.match, context), context)
     refined = refine(merged, context)
     with stage("decode"):
@@ -177,7 +177,7 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
         return DividedGroups(
             without_members(merged),
             divide_all(refined, new.members, max_k),
-            Heads(networks.weights, described.views, described.group),
+            Heads(cast("NetworkWeights", context.networks), described.views, described.group),
             learned=Learned(without_members(refined), described.views, np.diff(refined.starts)),
         )
 

@@ -173,7 +173,7 @@ class GsmFile:
         viewmats = self.array("cameras.viewmats", np.float64, None, 4, 4)
         Ks = self.array("cameras.Ks", np.float64, len(viewmats), 3, 3)
         cameras = self._cameras(viewmats, Ks, width, height)
-        return {"kept": kept if len(kept) else None, "frame": Frame(origin, unit), "cameras": cameras}
+        return {"kept": kept, "frame": Frame(origin, unit), "cameras": cameras}
 
     def _cameras(self, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Cameras:
         """Return the cameras, if they are plausible and of a size for which the file has the bytes."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gsmerge.batch import BatchOptions, Job, workload
 from gsmerge.batch.jobs import CompactCall
-from gsmerge.batch.workload import Concurrency, choose_concurrency, estimate_memory, estimate_seconds
+from gsmerge.batch.workload import choose_concurrency
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.exporters import AUTO
 from gsmerge.settings.compact import CompactOptions
@@ -56,11 +55,3 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
     assert [count(3), count(2), count(1.9), count(0.5), count(None)] == [4, 2, 1, 1, 4]
     assert count(1, jobs=3) == 3  # who asks for it gets it
-    assert estimate_memory(scenes, Concurrency(2, 1)) == 2 * need
-
-
-def test_estimates_grow_with_scenes_and_shrink_with_processors(made_scene: Path) -> None:
-    one = [Job(str(made_scene), ("a.ply",), CALL, 30_000)]
-    seconds = [estimate_seconds(one * count, Concurrency(at_once, 1)) for count, at_once in
-               ((0, 1), (1, 1), (8, 1), (8, 4))]  # fmt: skip
-    assert seconds[0] == 0 < seconds[1] < seconds[3] < seconds[2]
