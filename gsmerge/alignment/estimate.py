@@ -158,7 +158,7 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
             high = min(len(inside), start - first + unsure + dropped + _SLACK)
             if start >= 0 and low < high:
                 matches.append((start, *place_stretch(shown, colors[:, start : start + length], low, high)))
-        placed = _agreeing(np.array(matches, np.int64).reshape(-1, 4))
+        placed = _choose_agreeing(np.array(matches, np.int64).reshape(-1, 4))
         if not len(placed):
             return None
         within = np.linspace(0, length - 1, _PER_STRETCH).astype(int)
@@ -173,7 +173,7 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
     return Layout("", "pruned", "view-major", width, height, views, tuple(rows), tuple(pixels))
 
 
-def _agreeing(stretches: np.ndarray) -> np.ndarray:
+def _choose_agreeing(stretches: np.ndarray) -> np.ndarray:
     """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
 
     Their columns are row, place, sum and the next best sum.

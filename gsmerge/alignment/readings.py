@@ -42,15 +42,15 @@ def read_grid(inputs: AlignmentInput, *, exact_frames: bool = False) -> list[Rea
     ``exact_frames``: only try cameras in the frame of their file and files without missing pixels, which is quick.
     """
     readings: list[Reading] = []
-    for tier in _tiers(inputs, exact_frames=exact_frames):
-        readings += tier
+    for round_readings in _rounds(inputs, exact_frames=exact_frames):
+        readings += round_readings
         if any(reading.ok for reading in readings):
             return readings
     return []
 
 
-def _tiers(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
-    """Yield readings, those side by side that cost as much, the cheap first."""
+def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
+    """Yield rounds of readings that cost about as much, the cheap first."""
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return

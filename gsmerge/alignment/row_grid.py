@@ -90,10 +90,10 @@ def _spread(count: int, width: int, height: int) -> np.ndarray:
 
 def _layouts(count: int, width: int, height: int, by_column: bool) -> Iterator[Layout]:
     """Yield the layouts of grids of a size without borders."""
-    parts = count // (width * height)
+    num_parts = count // (width * height)
     for per_pixel in PER_PIXEL:
-        if parts % per_pixel == 0:
-            layouts = full_layouts(parts // per_pixel, per_pixel, width, height)
+        if num_parts % per_pixel == 0:
+            layouts = full_layouts(num_parts // per_pixel, per_pixel, width, height)
             yield from (layout for layout in layouts if by_column == (layout.order == "column-major"))
 
 

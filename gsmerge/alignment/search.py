@@ -36,7 +36,7 @@ from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_f
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
-_LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
+_MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
@@ -78,14 +78,14 @@ class _Source:
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
-    seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
+    seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`could_show`
 
     @cached_property
     def images(self) -> np.ndarray:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
         return as_floats(self.photos)
 
-    def may_be(self, grid: GridFit) -> bool:
+    def could_show(self, grid: GridFit) -> bool:
         """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
         if grid.size not in self.seen:
             inputs = self.inputs(grid, photos=False)
@@ -159,7 +159,7 @@ def align(
         if fit is None:
             raise
     else:
-        fit = source.choose(_fits(source, grid))
+        fit = source.choose(_fit_rounds(source, grid))
     return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
 
 
@@ -189,8 +189,8 @@ def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> Alig
     """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
-    for fitted in (grid, *square_grids(grid)) if len(source.photos) else ():
-        inputs = source.inputs(fitted)
+    for candidate in (grid, *square_grids(grid)) if len(source.photos) else ():
+        inputs = source.inputs(candidate)
         frame = solve_upright(inputs, rotation)
         if frame is not None:
             break
@@ -199,19 +199,19 @@ def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> Alig
     moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
     recovery = accept_reading(moved, read_grid(moved))
     if recovery is not None:
-        return _make_result(source, Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
+        return _make_result(source, Fit(candidate, replace(recovery, best=replace(recovery.best, frame=frame))))
     return AlignmentResult(
         None,
         moved.cameras,
         inputs.images,
         replace(source.camera_file, viewmats=moved.cameras.viewmats),
-        (*fitted.notes, f"the cameras are {frame.description}, as the photos' colours show"),
-        fitted.transform,
+        (*candidate.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        candidate.transform,
         problem="expected one Gaussian per pixel, found rows that were merged",
     )
 
 
-def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
+def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     """Yield rounds of fits that compete, the likely ones first.
 
     Grids are of the photos' size and of others; poses are as stored, moved, and in other conventions.
@@ -219,7 +219,7 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     if source.order == "none":
         return
     other_sizes = _fit_other_sizes(source)
-    large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
+    large = len(grid.cameras) * math.prod(grid.size) > _MANY_PIXELS * len(source.ply.gaussians)
     if large:
         yield next(other_sizes, [])
     fits = source.fit([grid])
@@ -272,8 +272,8 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
     if best is None or not best.worst_px <= max_pixels(*grid.size):
         return []
     for other in _conventions(source.camera_file):
-        posed = replace(inputs, cameras=_with_poses(grid, other).cameras)
-        if score_layout(posed, best.layout, IDENTITY).ok:
+        other_inputs = replace(inputs, cameras=_with_poses(grid, other).cameras)
+        if score_layout(other_inputs, best.layout, IDENTITY).ok:
             return []
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
     moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
@@ -292,7 +292,7 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
     guesses: list[GridFit] = []
     candidates = other_grids(source.ply.info, camera_file, photo_size(source.photos))
     for _, ranked in groupby(candidates, key=lambda grid: grid.rank):
-        grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
+        grids = [grid for grid in ranked if not grid.guessed or source.could_show(grid)]
         guesses += [grid for grid in grids if grid.guessed]
         exact = exact_frames or any(grid.guessed for grid in grids)
         fits = source.fit(grids, photos=False, exact_frames=exact)

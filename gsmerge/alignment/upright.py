@@ -142,7 +142,7 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
         rays = ray_directions(part, inputs.cameras)
         return solve_frame(part.points, rays, rotation.rotation, shifted=True)
 
-    def agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
+    def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
         if frame is None:
             return stretches[:0]
         errors = pixel_errors(pairs, frame.move(inputs.cameras))
@@ -152,11 +152,11 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
     for _ in range(_PAIRS):
         first = rng.choice(len(stretches))
         second = rng.choice(np.flatnonzero(views != views[first]))
-        best = max(best, agreeing(solve(stretches[[first, second]]), _NEAR * limit), key=len)
+        best = max(best, find_agreeing(solve(stretches[[first, second]]), _NEAR * limit), key=len)
     frame = None
     for _ in range(_ROUNDS):
         frame = solve(best) if len(best) else None
-        best = agreeing(frame, limit)
+        best = find_agreeing(frame, limit)
     counts = np.bincount(views[np.isin(stretches, best)], minlength=1)
     if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(stretches):
         return None

@@ -85,7 +85,7 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 
 def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders on the held-out blocks of the half-size photos; NaN if nothing is held out."""
+    """Return the PSNR (dB) of renders on the held-out patches of the half-size photos; NaN if nothing is held out."""
     options = plan.job.options
     if options.fit == "none" or not options.judged:
         return float("nan")
@@ -93,7 +93,7 @@ def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> fl
 
 
 def score_state(state: State, plan: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of a state on the held-out blocks of the half-size photos; see :func:`score_images`."""
+    """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
     return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
 
 

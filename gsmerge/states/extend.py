@@ -22,7 +22,11 @@ from gsmerge.settings.stages import MAX_CHILDREN, USUAL_K
 from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews, take
 from gsmerge.stages.segment import knee_count
-from gsmerge.states.batch import (
+from gsmerge.states.extend_decoded import DECODED
+from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
+from gsmerge.states.groups import select_groups, share, share_groups
+from gsmerge.states.state import DividedGroups, GroupSet, State, StoredSettings, no_photos
+from gsmerge.states.view_batch import (
     Batch,
     BatchFeatures,
     StateKind,
@@ -32,10 +36,6 @@ from gsmerge.states.batch import (
     rows_in_view,
     update_replay,
 )
-from gsmerge.states.extend_decoded import DECODED
-from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
-from gsmerge.states.groups import select_groups, share, share_groups
-from gsmerge.states.state import DividedGroups, GroupSet, State, StoredSettings, no_photos
 from gsmerge.types import Gaussians, Scene
 
 USUAL_MAX_K = 4  # children that are stored of a group, unless more are asked for, or a number of Gaussians is

@@ -15,7 +15,6 @@ from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
-from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.states.division import divide_all
 from gsmerge.states.groups import (
     bake,
@@ -27,6 +26,7 @@ from gsmerge.states.groups import (
     without_members,
 )
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, Heads, State
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 if TYPE_CHECKING:

@@ -29,7 +29,6 @@ from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.segment import segment_scene
-from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.states.division import divide_all
 from gsmerge.states.groups import concat_groups, limit_children, make_groups, select_groups, without_members
 from gsmerge.states.state import (
@@ -41,6 +40,7 @@ from gsmerge.states.state import (
     StateNetworks,
     ViewSamples,
 )
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border

@@ -19,7 +19,9 @@ from gsmerge.pooling import feature_to_gaussians, scene_members, unaligned_membe
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos, photos_of, scene_photos
 from gsmerge.raster.weights import apply
-from gsmerge.states.batch import (
+from gsmerge.states.groups import moments_of, share
+from gsmerge.states.state import GroupSet, Replay
+from gsmerge.states.view_batch import (
     MARGIN,
     REACH,
     BatchPhotos,
@@ -31,8 +33,6 @@ from gsmerge.states.batch import (
     update_replay,
     view_ids,
 )
-from gsmerge.states.groups import moments_of, share
-from gsmerge.states.state import GroupSet, Replay
 from gsmerge.types import SH_C0, FeatureGaussians
 
 
