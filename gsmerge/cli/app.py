@@ -58,7 +58,7 @@ BUDGET_WORDS = (
 )  # fmt: skip
 
 # Former option -> the one that does the same
-REPLACED = {"rerun": "overwrite", "max_memory": "jobs"}
+REPLACED_OPTIONS = {"rerun": "overwrite", "max_memory": "jobs"}
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
@@ -163,8 +163,8 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
-    if REPLACED.get(name) in names:
-        return f"{option} is no option: use --{REPLACED[name]}"
+    if REPLACED_OPTIONS.get(name) in names:
+        return f"{option} is no option: use --{REPLACED_OPTIONS[name]}"
     if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:
