@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import gsmerge
-from gsmerge import cli
 from gsmerge.io import read_gaussians
 from gsmerge.io.formats.read import read_level
 from gsmerge.io.formats.streamed import read_index
@@ -90,7 +89,7 @@ def test_a_run_that_fails_leaves_no_folder(
     monkeypatch.setattr("gsmerge.compaction.files.viewer_cameras", fail)  # when all chunks are written
     assert run("compact", small_scene, "-o", index, *QUICK).code == 3
     assert not index.parent.exists()
-    assert cli.main(["compact", str(small_scene), "-o", str(index.parent / "deep" / "lod-meta.json")]) == 3
+    assert run("compact", small_scene, "-o", index.parent / "deep" / "lod-meta.json", *QUICK).code == 3
 
 
 @pytest.mark.parametrize("kind", ["state", "batch"])
