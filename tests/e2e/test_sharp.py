@@ -14,7 +14,7 @@ from gsmerge import read_scene
 from .conftest import Run, assert_refused
 
 NAMES = ("IMG_0001", "IMG_0002", "IMG_0003")
-FIT = ("--set", "fit_steps=60", "--budget", "3000", "--threads", 1)
+FIT = ("--set", "fit_steps=30", "--budget", "3000", "--threads", 1)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from gsmerge.scene.read import load_scene
 
 from .conftest import Run
 
-FAST = ("--effort", "fast", "--json")
+FAST = ("--effort", "fast", "--set", "fit_steps=20", "--json")
 
 
 @pytest.fixture(scope="module")
