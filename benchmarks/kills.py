@@ -42,6 +42,8 @@ COMMANDS = {
     "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
     "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
 }
+# Imported before the commands are run, which would each do it anew
+MODULES = ("gsmerge.cli.app", "gsmerge.compaction.files", "gsmerge.networks.apply", "gsmerge.states.files")
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
 RECORDS = "batch.jsonl"  # of batches, for the next run
 # Faults to show that they would be reported: functions of ``os`` to replace
@@ -250,6 +252,8 @@ def main() -> int:
             env = {**os.environ, "LD_PRELOAD": library, "KILLS_LIBRARY": library}
             return subprocess.run([sys.executable, *sys.argv], env=env, check=False).returncode
     num_faults = 0
+    for module in MODULES:
+        importlib.import_module(module)
     with tempfile.TemporaryDirectory() as folder:
         scenes = make_scenes(Path(folder) / "scenes")
         for name in args.commands:

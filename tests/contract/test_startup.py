@@ -26,14 +26,11 @@ def loaded_after(code: str) -> set[str]:
     return set(listing.splitlines()[-1].split()) & set(HEAVY)
 
 
-@sweep(
-    "arguments",
-    [["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)],
-    ids=" ".join,
-    often=4,
-)
-def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
-    assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()
+def test_neither_import_nor_help_nor_mistyped_options_load_anything_heavy() -> None:
+    """One after the other in one process."""
+    told = ["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)
+    code = f"import gsmerge\nfrom gsmerge.cli import main\nfor words in {told!r}:\n    assert main(words) == 0\n"
+    assert loaded_after(f"{code}assert main(['generate', '-o', 'out', '--magic']) == 2") == set()
 
 
 def test_a_command_loads_no_other() -> None:
@@ -44,44 +41,27 @@ def test_a_command_loads_no_other() -> None:
     }
 
 
-def test_a_mistyped_option_loads_nothing_heavy() -> None:
-    code = "from gsmerge.cli import main\nassert main(['generate', '-o', 'out', '--magic']) == 2"
-    assert loaded_after(code) == set()
-
-
-def test_import_loads_nothing_heavy() -> None:
-    assert loaded_after("import gsmerge") == set()
-
-
 @sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join)
-def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
-    """Which take longer to load than a small scene takes to merge."""
-    arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply"), *settings]
-    code = f"from gsmerge.cli import main\nassert main({arguments!r}) == 0\nimport sys\n"
-    modules = set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split())
-    heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
-    assert modules.isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
-
-
-@sweep("settings", [[], ["--fit", "none"]], ids=" ".join)
-def test_compacting_needs_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
-    """As if they were not installed; the result is the same to the last bit."""
-    outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]
+def test_compacting_loads_and_needs_neither_torch_nor_scipy(
+    settings: list[str], small_scene: Path, tmp_path: Path
+) -> None:
+    """Which take longer to load than a small scene takes to merge; without them the result is the same bytes."""
+    outputs, loaded = [tmp_path / "with.ply", tmp_path / "without.ply"], []
     for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage")), strict=True):
         hide = f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n"
-        arguments = ["compact", str(made_scene), "-o", str(output), *settings]
-        run_python(f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0")
+        arguments = ["compact", str(small_scene), "-o", str(output), *settings]
+        code = f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0\n"
+        loaded.append(set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split()))
+    heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
+    assert loaded[0].isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 
 def test_submodule_imports_do_not_hide_functions() -> None:
     """Modules may share their names with public functions, but not at the top."""
-    print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)"
-    assert run_python(f"import gsmerge.raster, gsmerge.compaction.inspect\n{print_kinds}").split() == [
-        "function",
-        "function",
-    ]
-    assert run_python(f"import gsmerge.pipeline\n{print_kinds}").split() == ["function", "function"]
+    print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)\n"
+    code = f"import gsmerge.raster, gsmerge.compaction.inspect\n{print_kinds}import gsmerge.pipeline\n{print_kinds}"
+    assert run_python(code).split() == ["function"] * 4
 
 
 def test_a_damaged_opencv_names_the_remedy(tmp_path: Path, made_scene: Path) -> None:

@@ -16,6 +16,9 @@ from shared import make_once
 
 from gsmerge.cli import main
 
+CHART_TARGETS = ("--targets", "{parent}/targets/transforms.json")
+CHART_FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0", "--lpips", "none")
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -37,6 +40,12 @@ def smallest_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.Tem
     return folder
 
 
+@pytest.fixture
+def small_copy(small_scene: Path, tmp_path: Path) -> Path:
+    """A copy of the small scene that a test may change."""
+    return Path(shutil.copytree(small_scene, tmp_path / "scene"))
+
+
 @pytest.fixture(scope="session")
 def compacted_scene(made_scene: Path, shared: Path) -> Path:
     """``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
@@ -47,6 +56,18 @@ def compacted_scene(made_scene: Path, shared: Path) -> Path:
         assert main([str(word) for word in words]) == 0
 
     return make_once(shared / "compacted", make)
+
+
+@pytest.fixture(scope="session")
+def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
+    """A scene ``room``, and ``out`` with the charts of two merges and the input on it. Read only."""
+
+    def make(place: Path) -> None:
+        scene = make_scene(place / "room", num_views=3, width=64, height=48)
+        words = ("chart", scene, "--output", place / "out", *CHART_TARGETS, *CHART_FAST, "--proxy-views", "1", "-q")
+        assert main([str(word) for word in words]) == 0
+
+    return make_once(shared / "charted", make)
 
 
 @pytest.fixture(scope="module")

@@ -68,7 +68,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
 
 def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
     small = tmp_path / "small.ply"
-    run("compact", bare, "-o", small, code=0)
+    run("compact", bare, "-o", small, "--effort", "draft", code=0)
     quick = ("--superpixels", "40", "--checkpoint", "none")
     for words in (
         ("compact", bare, "--dry-run"), ("inspect", bare), ("render", bare, small, "-o", tmp_path / "p.png"),
@@ -82,7 +82,7 @@ def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
     folder = tmp_path / "scenes" / "first"
     folder.mkdir(parents=True)
     shutil.copy(bare, folder)
-    run("batch", tmp_path / "scenes", "-o", tmp_path / "out", code=0)
+    run("batch", tmp_path / "scenes", "-o", tmp_path / "out", "--effort", "draft", code=0)
     run("check", bare, code=0)
 
 

@@ -19,29 +19,13 @@ from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
 from gsmerge.settings.compact import CompactOptions
 
-from .conftest import Outcome, Run, listing
-
-TARGETS = ("--targets", "{parent}/targets/transforms.json")
-FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0", "--lpips", "none")
-
-
-@pytest.fixture(scope="module")
-def results(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a scene, and the results of two merges and the input on it."""
-    from gsmerge.cli import main
-
-    folder = tmp_path_factory.mktemp("grid")
-    scene = make_scene(folder / "room", num_views=3, width=64, height=48)
-    assert (
-        main(["chart", str(scene), "--output", str(folder / "out"), *TARGETS, *FAST, "--proxy-views", "1", "-q"]) == 0
-    )
-    return folder
+from .conftest import CHART_FAST, CHART_TARGETS, Outcome, Run, listing
 
 
 @pytest.fixture
-def copied(results: Path, tmp_path: Path) -> Path:
+def copied(charted_scene: Path, tmp_path: Path) -> Path:
     """A copy that a test may spoil."""
-    return Path(shutil.copytree(results, tmp_path / "grid"))
+    return Path(shutil.copytree(charted_scene, tmp_path / "grid"))
 
 
 @pytest.fixture(autouse=True)
@@ -76,11 +60,11 @@ def runs(folder: Path) -> dict[str, RunRecord]:
 
 
 def again(run: Run, folder: Path, *options: object) -> Outcome:
-    return run("chart", folder / "room", "--output", folder / "out", *TARGETS, *FAST, *options)
+    return run("chart", folder / "room", "--output", folder / "out", *CHART_TARGETS, *CHART_FAST, *options)
 
 
-def test_what_a_grid_leaves_behind(results: Path) -> None:
-    records = runs(results / "out")
+def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
+    records = runs(charted_scene / "out")
     expected = ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none", "superpixels, 1 views"]
     assert list(records) == expected
     first, one, two, proxies = records.values()
@@ -98,18 +82,18 @@ def test_what_a_grid_leaves_behind(results: Path) -> None:
     assert (first.ratio, one.count, two.count) == (1.0, pixels // 100, pixels // 50)
     assert first.seconds == 0
     assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
-    page = (results / "out" / "index.html").read_text()
+    page = (charted_scene / "out" / "index.html").read_text()
     assert "4 runs on 1 scene(s): room" in page
     assert page.count('<input type="range"') == 2
-    assert len((results / "out" / "runs.csv").read_text().splitlines()) == 1 + 4
-    names = {path.name for path in (results / "out" / "charts").iterdir()}
+    assert len((charted_scene / "out" / "runs.csv").read_text().splitlines()) == 1 + 4
+    names = {path.name for path in (charted_scene / "out" / "charts").iterdir()}
     assert {"quality-ratio.png", "quality-ratio.svg", "proxy.png", "break-even.svg", "stages.png"} <= names
-    assert not any(name.startswith(".") for name in listing(results / "out"))
+    assert not any(name.startswith(".") for name in listing(charted_scene / "out"))
 
 
-def test_the_bytes_are_those_of_the_file(results: Path, tmp_path: Path) -> None:
-    record = runs(results / "out")["gsmerge, budget 1%, fit none"]
-    result = gsmerge.compact(gsmerge.read_scene(results / "room"), budget="1%", fit="none")
+def test_the_bytes_are_those_of_the_file(charted_scene: Path, tmp_path: Path) -> None:
+    record = runs(charted_scene / "out")["gsmerge, budget 1%, fit none"]
+    result = gsmerge.compact(gsmerge.read_scene(charted_scene / "room"), budget="1%", fit="none")
     gsmerge.write_ply(tmp_path / "small.ply", result.gaussians)
     assert (tmp_path / "small.ply").stat().st_size == record.bytes
 
@@ -210,7 +194,9 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
 def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run: Run) -> None:
     bad = Path(shutil.copytree(copied / "room", copied / "bad"))
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
-    outcome = run("chart", bad, copied / "room", "--output", copied / "out", *TARGETS, *FAST, "--quiet", code=5)
+    outcome = run(
+        "chart", bad, copied / "room", "--output", copied / "out", *CHART_TARGETS, *CHART_FAST, "--quiet", code=5
+    )
     assert names(outcome.err, "3 of 3", "bad/input")
     assert outcome.err.count("\n") == 1
 
@@ -254,7 +240,7 @@ def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run
     grid = copied / "grid.json"
     grid.write_text('{"budgets": ["1%"], "superpixels": ["2%"], "fit": "none"}')
     options = ("--grid", grid, "--proxy-views", 0, "--lpips", "none", "--json")
-    outcome = run("chart", copied / "room", "--output", copied / "out", *TARGETS, *options, code=0)
+    outcome = run("chart", copied / "room", "--output", copied / "out", *CHART_TARGETS, *options, code=0)
     assert {settings.segment.superpixels for settings in merges} == {"2%"}
     assert json.loads(outcome.out)["num_done"] == 1
 

@@ -28,7 +28,7 @@ from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 from gsmerge.io.cameras.embedded import camera_comments
 
-COUNT, MANY = 6, 60  # mutations of a kind
+COUNT, MANY = 3, 60  # mutations of a kind
 LIMITS = Limits(1 << 30, 100)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")

@@ -28,7 +28,7 @@ from gsmerge.types import Cameras, Gaussians
 
 from .conftest import Run, assert_refused
 
-FORMATS = ("out.ply", "out.compressed.ply", "out.spz", "out.sog", "out.splat", "out.glb", "lod-meta.json")
+FORMATS = ("out.sog", "lod-meta.json", "out.ply", "out.compressed.ply", "out.spz", "out.splat", "out.glb")
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def read(path: Path) -> Gaussians:
     return gsmerge.read_gaussians(path).gaussians
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@sweep("name", FORMATS, often=3)
 def test_every_format_is_written_with_the_cameras(result: Path, tmp_path: Path, name: str) -> None:
     document = convert_files(ConvertOptions([result], tmp_path / "new" / name))
     written = read(tmp_path / "new" / name)

@@ -135,7 +135,7 @@ def test_every_number_that_can_be_decoded(states: list[Path], tmp_path: Path, ru
     said = ("--budget", groups + 40, "--fit", "none", "-o", tmp_path / "b.ply", "--json")
     document = json.loads(run("compact", states[1], *said).out)
     assert groups < document["output"]["num_gaussians"] <= groups + 40
-    assert document["fit"] is None
+    assert (document["budget"], document["fit"]) == (str(groups + 40), None)
     assert document["input"]["num_groups"] == groups
     assert document["input"]["num_gaussians"] == 7 * 48 * 32
 
@@ -228,8 +228,10 @@ def test_a_damaged_state_is_refused(
     spoil: Spoil, found: tuple[object, ...], command: str, state: Path, walks: list[Path], run: Run
 ) -> None:
     spoil(state)
+    (out := state.parent / "out.ply").write_text("precious")
     before = digests(state.parent)
-    assert_refused(run(command, state, *([walks[1]] if command == "extend" else [])), 3, state, *found)
+    more = (walks[1],) if command == "extend" else ("-o", out, "--overwrite")
+    assert_refused(run(command, state, *more), 3, state, *found)
     assert digests(state.parent) == before
 
 

@@ -17,6 +17,7 @@ import pytest
 from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_check, run_forked
 from hostile import CASES, MARKER
 from messages import ERROR, names
+from sweeps import sweep
 from tiny_scene import edited_json
 
 from .conftest import Run, listing
@@ -29,12 +30,21 @@ MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more 
 OPTIONS = {"-o", "--images"}  # what they name is nothing for ``check``
 FOR_OTHER_REASONS = ("nothing where the scene was", "the ply as cameras")  # sound files of another kind than expected
 SLOW = ("transforms.json: 3000 frames", "glb: nodes in one another")  # seconds of processor time
+FEW = 12  # of a kind, all of which are in the default run
 
 COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",
              "rotations 1e38")  # fmt: skip
 COMPACTED = tuple(f"ply: {name}" for name in COMPACTED)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
+
+
+def often() -> set[str]:
+    """Every third case of a kind that has many, and all others: the default run; the rest is in the sweep."""
+    kinds: dict[str, list[str]] = {}
+    for name in CASES:
+        kinds.setdefault(name.partition(": ")[0], []).append(name)
+    return {name for cases in kinds.values() for name in cases[:: 3 if len(cases) > FEW else 1]} - {*SLOW}
 
 
 def limits(num_bytes: int) -> Limits:
@@ -72,7 +82,7 @@ def within_budget(outcome: Outcome, num_bytes: int) -> None:
         one_line(outcome.error)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES])
+@sweep("name", sorted(CASES, key=lambda name: name not in often()), often=len(often()))
 def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, server: CommandServer) -> None:
     case = CASES[name]
     arguments = [str(argument) for argument in case.spoil(scene) or [scene]]
@@ -96,7 +106,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, se
         refused_by_check(outcome, check)
 
 
-@pytest.mark.parametrize("name", [*list(CASES)[::9], "ply: 600000 rows of one place"])
+@sweep("name", ["ply: 600000 rows of one place", *list(CASES)[::9]], often=10)
 def test_hostile_input_can_be_inspected(name: str, scene: Path, server: CommandServer) -> None:
     arguments = [str(argument) for argument in CASES[name].spoil(scene) or [scene]]
     num_bytes = size_of(scene.parent)
@@ -105,7 +115,7 @@ def test_hostile_input_can_be_inspected(name: str, scene: Path, server: CommandS
     assert not list(scene.parent.rglob(MARKER))
 
 
-@pytest.mark.parametrize("name", COMPACTED)
+@sweep("name", COMPACTED, often=2)
 def test_odd_values_are_compacted(name: str, scene: Path, run: Run) -> None:
     CASES[name].spoil(scene)
     outcome = run("compact", scene, "-o", scene / "small.ply", "--set", "fit_steps=2", "--quiet", code=0)

@@ -72,15 +72,15 @@ def test_the_program_may_be_on_the_path(
 
 @pytest.mark.parametrize("named", [None, "no/such/program"])
 def test_a_missing_program_is_one_line(
-    named: str | None, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    named: str | None, small_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
-    before = listing(scene_copy)
-    said = run("compact", scene_copy, "--method", "splat-transform")
+    before = listing(small_copy)
+    said = run("compact", small_copy, "--method", "splat-transform")
     found = f"GSMERGE_SPLAT_TRANSFORM={named}" if named else "GSMERGE_SPLAT_TRANSFORM"
     assert_refused(said, 2, "method splat-transform", found, "npm install -g @playcanvas/splat-transform")
-    assert listing(scene_copy) == before
+    assert listing(small_copy) == before
 
 
 @pytest.mark.parametrize(
@@ -88,31 +88,31 @@ def test_a_missing_program_is_one_line(
     [("#!{python}\nraise SystemExit('out of\\nmemory')\n", "code 1: out of memory"), ("#!{python}\n", "code 0")],
 )
 def test_a_failing_program_is_one_line(
-    text: str, found: str, scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    text: str, found: str, small_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
-    before = listing(scene_copy)
-    assert_refused(run("compact", scene_copy, "--method", "splat-transform", "--quiet"), 1, "", found)
-    assert listing(scene_copy) == before
+    before = listing(small_copy)
+    assert_refused(run("compact", small_copy, "--method", "splat-transform", "--quiet"), 1, "", found)
+    assert listing(small_copy) == before
 
 
-def test_missing_photos_are_one_line(scene_copy: Path, run: Run) -> None:
-    shutil.rmtree(scene_copy / "images")
-    said = run("compact", scene_copy, "--method", "unmerged-fit", "--hint", "order=none", "--quiet")
+def test_missing_photos_are_one_line(small_copy: Path, run: Run) -> None:
+    shutil.rmtree(small_copy / "images")
+    said = run("compact", small_copy, "--method", "unmerged-fit", "--hint", "order=none", "--quiet")
     assert_refused(said, 2, "method unmerged-fit", "photos", "--images")
 
 
 @pytest.mark.parametrize("method", method_names())
 def test_a_plan_names_the_method(
-    method: str, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    method: str, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
-    said = run("compact", made_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
+    said = run("compact", small_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
     assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
     assert ("merging" in said.out) == (method == "gsmerge")
-    document = json.loads(run("compact", made_scene, "--method", method, "--dry-run", "--json").out)
+    document = json.loads(run("compact", small_scene, "--method", method, "--dry-run", "--json").out)
     assert document["compact"]["method"] == method
     assert document["compact"]["seconds"] > 0
     assert document["notes"] == []
     kept = document["compact"]["num_gaussians"]
-    assert (kept == 5 * 96 * 64) == method.startswith("unmerged")
+    assert (kept == 5 * 48 * 32) == method.startswith("unmerged")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
 
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
@@ -13,15 +13,9 @@ FIRST = "document.querySelector('.compare')"
 
 
 @pytest.fixture(scope="module")
-def shown(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    from gsmerge.cli import main
-
-    folder = tmp_path_factory.mktemp("page")
-    scene = make_scene(folder / "room", num_views=3, width=64, height=48)
-    options = ["--budgets", "2%", "--fit", "none,full", "--proxy-views", "1", "--lpips", "none", "--quiet"]
-    assert main(["chart", str(scene), "--output", str(folder / "out"), *options]) == 0
-    with browser(CHROMIUM, folder / "profile") as opened:
-        opened.open(folder / "out" / "index.html")
+def shown(charted_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(CHROMIUM, tmp_path_factory.mktemp("page") / "profile") as opened:
+        opened.open(charted_scene / "out" / "index.html")
         yield opened
 
 

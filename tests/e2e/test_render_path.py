@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from bare_files import write_without_grid
 from messages import ERROR, names, says
+from sweeps import sweep
 from tiny_scene import edited_json
 
 import gsmerge
@@ -33,7 +34,7 @@ def error(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(float) - other).mean())
 
 
-@pytest.mark.parametrize(("kind", "name"), [("orbit", "walk.mp4"), ("orbit:45", "a.mp4"), ("spline", "walk.webm")])
+@sweep(("kind", "name"), [("orbit", "walk.mp4"), ("orbit:45", "a.mp4"), ("spline", "walk.webm")])
 def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     call = ("render", made_scene, "--path", kind, "--frames", 8)
     outcome = run(*call, "-o", tmp_path / name, "--fps", 4, code=0)

@@ -25,17 +25,17 @@ def test_table(scene_copy: Path, run: Run) -> None:
     assert names(document["cases"][0]["wanted"], "0.5 %", "0.2 dB")
 
 
-def test_json_and_quiet(scene_copy: Path, run: Run) -> None:
+def test_json_and_quiet(small_copy: Path, run: Run) -> None:
     quick = ("--set", "fit=none", "--cases", "unchanged,threads")
-    document = json.loads(run("stress", scene_copy, *quick, "--json").out)
+    document = json.loads(run("stress", small_copy, *quick, "--json").out)
     assert [case["case"] for case in document["cases"]] == ["unchanged", "threads"]
-    outcome = run("stress", scene_copy, *quick, "--quiet")
+    outcome = run("stress", small_copy, *quick, "--quiet")
     assert (outcome.out, outcome.err) == ("", "")
 
 
-def test_a_case_that_fails_is_a_target_not_met(scene_copy: Path, run: Run) -> None:
+def test_a_case_that_fails_is_a_target_not_met(small_copy: Path, run: Run) -> None:
     poor = ("--set", "fit=none", "--set", "superpixels=1%")
-    outcome = run("stress", scene_copy, *poor, "--cases", "order,views-1,unchanged")
+    outcome = run("stress", small_copy, *poor, "--cases", "order,views-1,unchanged")
     failed = [line for line in outcome.out.splitlines() if line.startswith("FAILED")]
     assert failed, "so few Gaussians without a fit must be worse than the input somewhere"
     assert outcome.code == 4

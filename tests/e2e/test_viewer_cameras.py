@@ -21,79 +21,79 @@ Run = Callable[..., Any]
 QUICK = ("--superpixels", 40, "--fit", "none", "--checkpoint", "none")
 
 
-def test_the_views_are_written_and_named(scene_copy: Path, run: Run) -> None:
-    done = run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK, code=0)
+def test_the_views_are_written_and_named(small_copy: Path, run: Run) -> None:
+    done = run("compact", small_copy, "-o", small_copy / "small.ply", *QUICK, code=0)
     assert done.out.splitlines()[-1].endswith(" small.cameras.json")
-    scene = gsmerge.read_scene(scene_copy)
-    entries = json.loads((scene_copy / "small.cameras.json").read_text())
+    scene = gsmerge.read_scene(small_copy)
+    entries = json.loads((small_copy / "small.cameras.json").read_text())
     assert [entry["img_name"] for entry in entries] == list(scene.names)
     assert list(entries[0]) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
     np.testing.assert_allclose([entry["position"] for entry in entries], scene.cameras.centres, atol=1e-9)
-    back = gsmerge.read_cameras(scene_copy / "small.cameras.json")
+    back = gsmerge.read_cameras(small_copy / "small.cameras.json")
     np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-9)
 
 
-def test_they_have_a_principal_point_that_is_not_in_the_middle(scene_copy: Path) -> None:
-    cameras = gsmerge.read_scene(scene_copy).cameras
+def test_they_have_a_principal_point_that_is_not_in_the_middle(small_copy: Path) -> None:
+    cameras = gsmerge.read_scene(small_copy).cameras
     Ks = cameras.Ks.copy()
     Ks[1, :2, 2] += (3.25, -2.5)
-    (scene_copy / "a.json").write_text(viewer_cameras(replace(cameras, Ks=Ks), ["a", "b", "c", "d", "e"]))
-    entries = json.loads((scene_copy / "a.json").read_text())
+    (small_copy / "a.json").write_text(viewer_cameras(replace(cameras, Ks=Ks), ["a", "b", "c", "d", "e"]))
+    entries = json.loads((small_copy / "a.json").read_text())
     assert ["cx" in entry for entry in entries] == [False, True, False, False, False]
-    np.testing.assert_allclose(gsmerge.read_cameras(scene_copy / "a.json").Ks, Ks, atol=1e-6)
+    np.testing.assert_allclose(gsmerge.read_cameras(small_copy / "a.json").Ks, Ks, atol=1e-6)
 
 
-def test_they_are_in_the_frame_of_the_gaussians(scene_copy: Path, run: Run) -> None:
-    path = scene_copy / "transforms.json"
+def test_they_are_in_the_frame_of_the_gaussians(small_copy: Path, run: Run) -> None:
+    path = small_copy / "transforms.json"
     with edited_json(path) as content:
         for frame in content["frames"]:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= 3
-    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK, "-q").code == 0
-    back = gsmerge.read_cameras(scene_copy / "small.cameras.json")
-    np.testing.assert_allclose(back.viewmats, gsmerge.read_scene(scene_copy).cameras.viewmats, atol=1e-9)
+    assert run("compact", small_copy, "-o", small_copy / "small.ply", *QUICK, "-q").code == 0
+    back = gsmerge.read_cameras(small_copy / "small.cameras.json")
+    np.testing.assert_allclose(back.viewmats, gsmerge.read_scene(small_copy).cameras.viewmats, atol=1e-9)
     assert np.abs(back.viewmats[:, :3, 3]).max() < 0.5 * np.abs(gsmerge.read_cameras(path).viewmats[:, :3, 3]).max()
 
 
-def test_none_are_written_unless_there_are_any(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_none_are_written_unless_there_are_any(small_copy: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    done = run("compact", scene_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json", code=0)
+    done = run("compact", small_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json", code=0)
     assert json.loads(done.out)["viewer_cameras"] is None
-    bare = write_without_grid(scene_copy / "scene.ply", out / "scene.ply")
+    bare = write_without_grid(small_copy / "scene.ply", out / "scene.ply")
     done = run("compact", bare, "-o", out / "b.ply", *QUICK, code=0)
     assert "viewers" not in done.out
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]
 
 
-def test_they_are_replaced_on_request_alone(scene_copy: Path, run: Run) -> None:
-    (scene_copy / "small.cameras.json").write_text("mine")
-    done = run("compact", scene_copy, "-o", scene_copy / "small.ply", *QUICK)
+def test_they_are_replaced_on_request_alone(small_copy: Path, run: Run) -> None:
+    (small_copy / "small.cameras.json").write_text("mine")
+    done = run("compact", small_copy, "-o", small_copy / "small.ply", *QUICK)
     assert (done.code, done.out) == (2, "")
     assert "small.cameras.json: exists" in done.err
-    assert not (scene_copy / "small.ply").exists()
-    assert (scene_copy / "small.cameras.json").read_text() == "mine"
-    assert run("compact", scene_copy, "-o", scene_copy / "small.ply", "--overwrite", *QUICK).code == 0
-    assert len(json.loads((scene_copy / "small.cameras.json").read_text())) == len(gsmerge.read_scene(scene_copy))
+    assert not (small_copy / "small.ply").exists()
+    assert (small_copy / "small.cameras.json").read_text() == "mine"
+    assert run("compact", small_copy, "-o", small_copy / "small.ply", "--overwrite", *QUICK).code == 0
+    assert len(json.loads((small_copy / "small.cameras.json").read_text())) == len(gsmerge.read_scene(small_copy))
 
 
-def test_a_second_format_shares_them(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_a_second_format_shares_them(small_copy: Path, run: Run, tmp_path: Path) -> None:
     """They are there, with the same content; those of other views are no result's own."""
     out = tmp_path / "out"
     out.mkdir()
-    run("compact", scene_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
+    run("compact", small_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
     before = (out / "a.cameras.json").read_bytes()
-    done = run("compact", scene_copy, "-o", out / "a.spz", *QUICK, code=0)
+    done = run("compact", small_copy, "-o", out / "a.spz", *QUICK, code=0)
     assert done.out.splitlines()[-1].endswith(" a.cameras.json")
     assert (out / "a.cameras.json").read_bytes() == before
-    run("compact", scene_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
+    run("compact", small_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
     entries = json.loads(before)
     for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}):
         (out / "a.cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
-        done = run("compact", scene_copy, "-o", out / "a.sog", *QUICK, code=2)
+        done = run("compact", small_copy, "-o", out / "a.sog", *QUICK, code=2)
         assert says(done.err.removeprefix(ERROR), "a.cameras.json", "cameras", "--overwrite")
     assert sorted(path.name for path in out.iterdir()) == ["a.cameras.json", "a.ply", "a.spz"]
-    run("compact", scene_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)
+    run("compact", small_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)
     assert (out / "a.cameras.json").read_bytes() == before
 
 
@@ -110,12 +110,12 @@ def test_their_name_is_made_of_the_result_s(output: str, expected: str) -> None:
     assert viewer_cameras_path(Path(output)) == Path(expected)
 
 
-def test_a_folder_with_a_result_and_its_cameras_needs_no_options(scene_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_a_folder_with_a_result_and_its_cameras_needs_no_options(small_copy: Path, run: Run, tmp_path: Path) -> None:
     """The output's folders are made; the cameras beside a result go before others in the folder."""
     out = tmp_path / "new" / "out"
-    run("compact", scene_copy, "-o", out / "small.ply", *QUICK, "-q", code=0)
+    run("compact", small_copy, "-o", out / "small.ply", *QUICK, "-q", code=0)
     assert sorted(path.name for path in out.iterdir()) == ["small.cameras.json", "small.ply"]
-    count = len(gsmerge.read_scene(scene_copy))
+    count = len(gsmerge.read_scene(small_copy))
     for place in (out, out / "small.ply"):
         facts = json.loads(run("inspect", place, "--json", code=0).out)
         assert (facts["cameras"], facts["num_views"]) == (str(out / "small.cameras.json"), count)
@@ -124,6 +124,6 @@ def test_a_folder_with_a_result_and_its_cameras_needs_no_options(scene_copy: Pat
     document = json.loads(run("evaluate", out, "--lpips", "none", "--json", code=0).out)
     assert document["num_views"]["context"] == count
     assert not says(run("view", out, "-o", tmp_path / "view.html", code=0).err, "placed")
-    (out / "transforms.json").write_bytes((scene_copy / "transforms.json").read_bytes())
+    (out / "transforms.json").write_bytes((small_copy / "transforms.json").read_bytes())
     facts = json.loads(run("inspect", out / "small.ply", "--json", code=0).out)
     assert facts["cameras"] == str(out / "small.cameras.json")

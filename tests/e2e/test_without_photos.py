@@ -62,14 +62,19 @@ def test_as_good_as_with_photos(
 
 
 def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "small.ply"
-    said = run("compact", bare, "-o", out, *QUICK, code=0)
+    out, report = tmp_path / "small.ply", tmp_path / "report.json"
+    said = run("compact", bare, "-o", out, *QUICK, "--report", report, code=0)
+    psnr = json.loads(report.read_text())["psnr_input_views"]
+    assert psnr["after"] > psnr["before"] + 1
     assert f"dB against {ROW_COLORS}" in said.out
     assert NO_PHOTOS in said.err
     assert NO_PHOTOS in run("inspect", bare, code=0).out
     planned = json.loads(run("compact", bare, *QUICK, "--dry-run", "--json", code=0).out)
-    assert NO_PHOTOS in planned["notes"]
+    assert planned["notes"].count(NO_PHOTOS) == 1
     assert planned["compact"]["fit"] == "full"
+    assert ROW_COLORS in run("evaluate", bare, out, "--lpips", "none", code=0).out
+    page = run("view", bare, out, "-o", tmp_path / "page.html", "--json", code=0)
+    assert ROW_COLORS in json.loads(page.out)["headline"]
 
 
 def test_states(bare: Path, tmp_path: Path, run: Run) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -155,11 +155,6 @@ def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01
         rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)) / 9,
     )
     return Gaussians(*(column.astype(np.float32) for column in columns))
-
-
-def repainted(scene: Scene, images: np.ndarray) -> Scene:
-    """The scene with other photos."""
-    return replace(scene, images=images.astype(np.float32))
 
 
 def counts(reports: Sequence[Any], name: str) -> list[int]:

@@ -98,7 +98,7 @@ def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:
         gsmerge.compact(scene, **PLAIN, checkpoint=str(path), require_checkpoint=True)
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
+@sweep("k", [1, 2, 4], often=2)
 def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path, k: int) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", scaled(noisy(), 100))

@@ -73,7 +73,7 @@ def test_flat_pictures(room: Scene, grey: float, segmentation: str) -> None:
     assert result.report.psnr_after > 25  # type: ignore[operator]
 
 
-@pytest.mark.parametrize("segmentation", ["rdseg", "bass-st"])
+@sweep("segmentation", ["rdseg", "bass-st"])
 def test_noise_does_not_explode(room: Scene, segmentation: str) -> None:
     noise = np.random.default_rng(0).random(room.images.shape, np.float32)
     result = scenes.compacted(painted(room, noise), segmentation=segmentation, superpixels=60)

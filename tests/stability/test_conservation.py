@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact
 
@@ -39,14 +40,14 @@ def coverage(gaussians: Gaussians, scene: Scene) -> tuple[float, float]:
 # 47: more children, more detail
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none", "checkpoint": "none"}], ids=str)
+@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=str)
 def test_more_children_show_more(scene: Scene, settings: dict) -> None:
     actual = [scenes.compacted(scene, superpixels="4.4%", k=k, **settings).gaussians for k in (1, 2, 4, 8)]
     assert (np.diff([len(g) for g in actual]) > 0).all()
     assert (np.diff([scenes.psnr_of(g, scene) for g in actual]) > -0.05).all()
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none", "checkpoint": "none"}], ids=str)
+@sweep("settings", [{"fit": "none", "checkpoint": "none"}, {}], ids=str)
 def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
     actual = [scenes.compacted(scene, superpixels=share, **settings).gaussians for share in ("1%", "3%", "10%")]
     assert (np.diff([len(g) for g in actual]) > 0).all()
@@ -56,7 +57,7 @@ def test_more_superpixels_show_more(scene: Scene, settings: dict) -> None:
 # 48: coverage and brightness
 
 
-@pytest.mark.parametrize("settings", [{}, {"k": 4}, {"match": "none"}], ids=str)
+@sweep("settings", [{}, {"k": 4}, {"match": "none"}], ids=str)
 def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> None:
     before = coverage(scene.gaussians, scene)
     after = coverage(scenes.compacted(scene, superpixels="4.4%", **settings).gaussians, scene)
@@ -69,7 +70,7 @@ def test_photos_keep_coverage_and_brightness(scene: Scene, settings: dict) -> No
 LOSSES = {(1, 1): 0.34, (1, 4): 0.16, (3, 1): 0.23, (3, 4): 0.08}
 
 
-@pytest.mark.parametrize(("views", "k"), list(LOSSES))
+@sweep(("views", "k"), list(LOSSES), often=2)
 def test_plain_merging_loses_a_known_part_of_coverage(clean: Scene, views: int, k: int) -> None:
     own = scenes.take_views(clean, list(range(views)))
     before = coverage(own.gaussians, own)
@@ -88,7 +89,7 @@ def test_merging_across_views_keeps_coverage(clean: Scene) -> None:
 # 55: glass
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none"}, {"match": "none"}], ids=str)
+@sweep("settings", [{"fit": "none"}, {}, {"match": "none"}], ids=str)
 def test_faint_scenes_are_not_pruned(scene: Scene, settings: dict) -> None:
     opacities = np.full_like(scene.gaussians.opacities, 0.05)
     faint = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities))

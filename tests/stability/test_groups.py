@@ -149,7 +149,7 @@ def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     scenes.assert_same_set(actual, others, atol=1e-4)
 
 
-@pytest.mark.parametrize("fit", ["none", "full"])
+@sweep("fit", ["full", "none"])
 @pytest.mark.parametrize("opacity", [0.0, 1e-5])
 def test_wholly_transparent_scene(room: Scene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))

@@ -21,7 +21,7 @@ def room() -> Scene:
 # 21: one view several times
 
 
-@pytest.mark.parametrize("times", [2, 3, 6])
+@sweep("times", [3, 2, 6])
 def test_repeated_view_counts_once_and_looks_the_same(room: Scene, times: int) -> None:
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * times)
     one, many = scenes.plain(single), scenes.plain(repeated)
@@ -85,8 +85,8 @@ def test_disjoint_views_are_merged_like_single_ones() -> None:
 # 25: order
 
 
-@pytest.mark.parametrize("order", [[2, 0, 1], [1, 0, 2]])
-@pytest.mark.parametrize("k", [1, 2])
+@sweep("order", [[2, 0, 1], [1, 0, 2]])
+@sweep("k", [2, 1])
 def test_order_of_views_does_not_matter(room: Scene, order: list[int], k: int) -> None:
     one, other = scenes.plain(room, k=k), scenes.plain(scenes.take_views(room, order), k=k)
     scenes.assert_same_set(one, other, atol=1e-4)

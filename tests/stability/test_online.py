@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 from view_batches import fed, parts_of, state_of
 
 from gsmerge import Compactor, Scene
@@ -65,7 +66,7 @@ def test_batches_fed_again_and_again(made: list[Scene]) -> None:
 # 53: batches in reverse
 
 
-@pytest.mark.parametrize("wishes", [[{"fit": "none"}], [FULL | {"fit_steps": n} for n in (30, 60, 200)]], ids=str)
+@sweep("wishes", [[{"fit": "none"}], [FULL | {"fit_steps": n} for n in (30, 60, 200)]], ids=str)
 def test_batches_in_reverse(wishes: list[dict[str, Any]], made: list[Scene], forward: list[Compactor]) -> None:
     """Within 0.2 dB on average over the scenes, 0.5 dB in each: tiny ones, of some 260 Gaussians.
 
@@ -83,7 +84,7 @@ def test_batches_in_reverse(wishes: list[dict[str, Any]], made: list[Scene], for
 # 53: batches of any size
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
+@sweep("size", [2, 1, 3])
 def test_batches_of_any_size(size: int, made: list[Scene], whole: list[Compactor]) -> None:
     """For as many Gaussians, no more than 0.3 dB below all views at once, on average over the scenes.
 

@@ -158,7 +158,7 @@ def random_gains(channels: int) -> np.ndarray:
     return np.exp(rng.uniform(np.log(0.6), np.log(1.5), (VIEWS, channels))) * np.ones(3)
 
 
-@pytest.mark.parametrize("channels", [1, 3], ids=["exposure", "white balance"])
+@sweep("channels", [3, 1], ids=["white balance", "exposure"])
 def test_exposures_are_brought_to_their_mean(room: Scene, sound: CompactResult, channels: int) -> None:
     scene = exposed(room, random_gains(channels))
     result, fixed = compact(scene, **FIT), compact(scene, **FIT, exposure="fixed")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import noted, says
+from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.compare_photos import odd_photos, show_photos
@@ -97,7 +98,7 @@ def novel_psnr(gaussians: Gaussians) -> float:
 
 
 @pytest.mark.parametrize("aligned", [True, False], ids=["aligned", "unaligned"])
-@pytest.mark.parametrize(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None))
+@sweep(("change", "odd"), SPOILT, ids=lambda case: getattr(case, "__name__", None), often=4)
 def test_odd_photos_are_recognised(
     room: Scene, change: Callable[[Photos], Photos], odd: list[int], aligned: bool
 ) -> None:
@@ -141,7 +142,7 @@ def test_a_view_given_twice_is_no_swap(room: Scene) -> None:
     assert odd_photos(show_photos(scenes.take_views(room, [0, 1, 1, 2, 3]))) == []
 
 
-@pytest.mark.parametrize("change", [swapped, one_black, one_of_noise, one_of_another_scene])
+@sweep("change", [swapped, one_black, one_of_noise, one_of_another_scene], often=2)
 def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change: Callable[[Photos], Photos]) -> None:
     """Nearly as good as with all photos, and as the input; the note and the report name them."""
     odd = dict(SPOILT)[change]
@@ -154,8 +155,8 @@ def test_the_fit_does_without_some(room: Scene, unspoilt: CompactResult, change:
     assert result.report.psnr_after == pytest.approx(unspoilt.report.psnr_after, abs=1)
 
 
-@pytest.mark.parametrize("change", [all_black, all_noise, moved_on, another_scene])
-@pytest.mark.parametrize("settings", [{}, {"budget": 500}, {"budget": "auto"}], ids=str)
+@sweep("change", [moved_on, all_black, all_noise, another_scene])
+@sweep("settings", [{}, {"budget": 500}, {"budget": "auto"}], ids=str)
 def test_none_is_used_where_most_are_wrong(
     room: Scene, change: Callable[[Photos], Photos], settings: dict[str, Any]
 ) -> None:

@@ -11,6 +11,7 @@ import pytest
 import scenes
 import unaligned_scenes
 from messages import noted, refuses
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactResult
@@ -37,7 +38,7 @@ SETTINGS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("settings", SETTINGS, ids=str)
+@sweep("settings", SETTINGS, ids=str, often=4)
 def test_every_setting(room: Scene, settings: dict, floor: Callable[..., None]) -> None:
     result = compacted(unaligned_scenes.shuffled(room), **settings)
     if settings.get("budget") == 150:
