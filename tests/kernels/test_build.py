@@ -16,9 +16,9 @@ from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
 
 HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
-PLATFORMS = (
-    "manylinux_2_17_x86_64", "manylinux_2_17_aarch64", "macosx_11_0_arm64", "macosx_10_13_x86_64", "win_amd64",
-    "win_arm64",
+PLATFORMS = (  # the first has one target alone, which takes the least time
+    "win_arm64", "manylinux_2_17_x86_64", "manylinux_2_17_aarch64", "macosx_11_0_arm64", "macosx_10_13_x86_64",
+    "win_amd64",
 )  # fmt: skip
 
 

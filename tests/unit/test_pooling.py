@@ -111,13 +111,6 @@ def test_paper_rule_by_hand() -> None:
     assert float(made.opacities[0]) == pytest.approx(0.8 / 3, rel=1e-5)
 
 
-@pytest.mark.parametrize("rule", ["depth", "paper"])
-def test_no_groups(rule: str) -> None:
-    m = pool_members(members(3), np.array([0]), np.zeros(0, np.int64), rule)
-    assert m.means.shape == (0, 3)
-    assert principal_axes(np.zeros((0, 3, 3)))[0].shape == (0, 3)
-
-
 def test_scales_have_a_floor() -> None:
     scales, quats = principal_axes(np.zeros((1, 3, 3)))
     assert (scales > 0).all()

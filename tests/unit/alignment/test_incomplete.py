@@ -210,11 +210,6 @@ def test_rows_pixel_by_pixel_at_another_scale(tmp_path: Path, nested: float) -> 
     assert np.mean(actual == kept) > 0.985
 
 
-def test_rows_in_no_order_stay_unaligned(tmp_path: Path, smooth: Smooth) -> None:
-    kept = np.random.default_rng(1).permutation(view_fastest(smooth, 0.3))
-    assert not load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept))).scene.aligned
-
-
 @sweep("size", [(96, 72), (64, 48)])
 @pytest.mark.parametrize("dropped", [0.1, 0.3, 0.4, "faint", "far"])
 @sweep("nested", [0.4, 1.0, 1.3])

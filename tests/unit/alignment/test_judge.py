@@ -107,14 +107,6 @@ def test_photos_that_agree_or_cannot_tell() -> None:
         assert "confirm" not in actual.description
 
 
-def test_a_note_says_that_photos_do_not_confirm(tmp_path: Path) -> None:
-    tiny = smooth_scene(48, 36)
-    index = np.arange(3 * 48 * 36).reshape(3, -1).T.reshape(-1)
-    strange = replace(tiny, images=make_tiny(48, 36).images)
-    notes = load_scene(save_export(tmp_path, strange, export_rows(tiny, index))).notes
-    assert any("view-fastest" in note and note.endswith("the photos' colours do not confirm it") for note in notes)
-
-
 def test_a_plain_file_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files in which the rows as they are leave a doubt are."""
     tiny, searched = smooth_scene(48, 36), []

@@ -44,21 +44,6 @@ def far_cut(tiny: Smooth, share: float = 0.9) -> np.ndarray:
     return index.transpose(1, 2, 0)[kept.transpose(1, 2, 0)]
 
 
-def fused(tiny: Smooth) -> np.ndarray:
-    """Rows of views that were fused: the rest of the first one, means of two views, the rest of the last one."""
-    size = HEIGHT * WIDTH
-    ids = np.arange(VIEWS * size).reshape(VIEWS, HEIGHT, WIDTH)
-    same = np.zeros((HEIGHT, WIDTH), bool)
-    same[20:-20, 70:] = True
-    rows = export_rows(tiny)
-    merged = rows[ids[0][same]].copy()
-    for name in rows.dtype.names:
-        merged[name] = (rows[name][ids[0][same]] + rows[name][ids[1][same]]) / 2
-    merged["x"] += 0.05
-    middle = ids[1][~same][::3]
-    return np.concatenate([rows[ids[0][~same]], merged, rows[middle], rows[ids[2].reshape(-1)]])
-
-
 def upright(tiny: Smooth, rows: np.ndarray, first: int = 0) -> tuple[np.ndarray, float, np.ndarray]:
     """Rows as pixelSplat's exporter leaves them; also its scale, and the centres of the cameras there."""
     means = np.stack([rows[name] for name in "xyz"], 1).astype(np.float64)
@@ -86,13 +71,6 @@ def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured
     assert len(wrong) <= 0.02 * len(kept)
     assert loaded.recovery.best.frame.kind == "upright"
     assert "mvsplat" in [exporter.name for exporter in loaded.exporters]
-
-
-def test_fused_views_are_seen_by_cameras_in_their_frame(tmp_path: Path, textured: Smooth) -> None:
-    rows, scale, centres = upright(textured, fused(textured))
-    loaded = load_scene(save_export(tmp_path, textured, rows))
-    assert not loaded.scene.aligned
-    check_centres(loaded, centres, scale)
 
 
 def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -> None:

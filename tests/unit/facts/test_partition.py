@@ -21,7 +21,6 @@ from gsmerge.facts.partition import (
     split_points,
     usual_blocks,
 )
-from gsmerge.settings.stages import BlockOptions
 from gsmerge.types import Cameras, Scene
 
 
@@ -183,9 +182,3 @@ def partition_of(*owns: list[int]) -> list:
     from gsmerge.facts.partition import Block
 
     return [Block(tuple(own), ()) for own in owns]
-
-
-@pytest.mark.parametrize("settings", [{"blocks": 0}, {"blocks": "some"}, {"blocks": True}])
-def test_bad_options(settings: dict) -> None:
-    with pytest.raises(ValueError, match=next(iter(settings))):
-        BlockOptions(**settings)

@@ -46,24 +46,11 @@ def test_opacity_is_clamped() -> None:
     assert float(rendering.alphas[0, 5, 10, 0]) == pytest.approx(0.99)
 
 
-def test_nearer_ones_hide_farther_ones_whatever_their_order() -> None:
-    rows = [(0, 0, 2, 1.0, 0.5, 0.0), (0, 0, 1, 0.5, 0.6, 1.0)]
-    for ordered in (rows, rows[::-1]):
-        rendering = render(balls(*ordered), camera(), 0.25)
-        assert value(rendering.images, 10, 5) == pytest.approx(0.6 + 0.4 * 0.5 * 0.25, abs=1e-5)
-        assert value(rendering.alphas, 10, 5) == pytest.approx(0.8, abs=1e-5)
-
-
 def test_a_pixel_stops_before_it_is_too_dark() -> None:
     # 0.1^3 = 1e-3 stays; the fourth would reach 1e-4 and is left out
     rows = [(0, 0, 1 + i, 5.0 * (1 + i), 0.9001, 0.0) for i in range(4)]
     rendering = render(balls(*rows), camera(), 1.0)
     assert value(rendering.images, 10, 5) == pytest.approx(0.0999**3, rel=1e-4)
-
-
-def test_depth_is_the_mean_of_what_was_blended() -> None:
-    rendering = render(balls((0, 0, 1, 0.5, 0.5, 1.0), (0, 0, 3, 1.5, 0.5, 1.0)), camera(), with_depths=True)
-    assert value(rendering.depths, 10, 5) == pytest.approx((0.5 * 1 + 0.25 * 3) / 0.75, abs=1e-4)
 
 
 def test_no_gaussians_leave_the_background() -> None:
@@ -79,22 +66,6 @@ def test_what_is_behind_or_too_faint_is_not_seen() -> None:
     tiled = tile_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
     assert len(tiled.ids) == 0
     assert len(tiled.flatten_ids) == 0
-
-
-def test_antialiasing_dims_what_is_small() -> None:
-    # 0.1 px wide: the dilation spreads it over 0.3 px^2 more
-    gaussians = balls((0, 0, 1, 0.001, 0.8, 1.0))
-    dimmed = value(render(gaussians, camera(), antialiased=True).images, 10, 5)
-    assert dimmed == pytest.approx(0.8 * 0.01 / 0.31, rel=1e-4)
-
-
-def test_colours_depend_on_the_viewing_direction() -> None:
-    gaussians = balls((0, 0, 1, 0.02, 0.8, 0.5))
-    shN = np.zeros((1, 3, 3), np.float32)
-    shN[0, 1, 0] = 1  # along z
-    turned = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh0, shN)
-    image = render(turned, camera()).images
-    assert image[0, 5, 10].tolist() == pytest.approx([0.8 * (0.5 + 0.48860251), 0.4, 0.4], abs=1e-5)
 
 
 def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:

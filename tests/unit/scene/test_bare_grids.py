@@ -67,6 +67,8 @@ def test_the_views_of_a_grid(tmp_path: Path, order: str, size: tuple[int, int]) 
     home = tiny.gaussians[ids[views, trim : height - trim, trim : width - trim].reshape(-1)]
     assert np.array_equal(scene.gaussians.means, home.means)
     assert scene.names == tuple(f"view {view}" for view in range(len(views)))
+    assert loaded.cameras is not None
+    assert loaded.cameras.source == "estimated from the grid"
     assert noted(loaded.notes, "no", "cameras", "grid")
 
 
@@ -144,19 +146,18 @@ def write_photos(folder: Path, tiny: Smooth, larger: int, margin: int, names: st
         cv2.imwrite(str(folder / names.format(i)), whole[..., ::-1])
 
 
-@sweep("trim", [0, 8])
-@sweep("margin", [0, 10])
-def test_photos_of_another_size(tmp_path: Path, trim: int, margin: int) -> None:
+@sweep(("larger", "margin", "trim"), [(3, 0, 0), (1, 0, 0), (3, 10, 0), (3, 0, 8), (3, 10, 8)], often=2)
+def test_photos_of_any_size(tmp_path: Path, larger: int, margin: int, trim: int) -> None:
     tiny = made()
     ids = np.arange(3 * WIDTH * HEIGHT).reshape(3, HEIGHT, WIDTH)[:, trim : HEIGHT - trim, trim : WIDTH - trim]
-    write_photos(tmp_path / "images", tiny, 3, margin)
+    write_photos(tmp_path / "images", tiny, larger, margin)
     scene = read_bare(tmp_path, tiny, ids).pixel_scene()
     assert scene.images is not None
     assert scene.images.shape == tiny.images.shape
     assert np.abs(scene.images * 255.0 - tiny.images).mean() < 2
     assert int(scene.valid.sum()) == ids.size
     assert scene.names == ("0.png", "1.png", "2.png")
-    assert scene.large_photos is not None
+    assert (scene.large_photos is not None) == (larger > 1)
 
 
 def test_photos_are_told_by_their_colors(tmp_path: Path) -> None:

@@ -16,12 +16,12 @@ from exports import (
     save_export,
     smooth_scene,
     turned,
-    with_intrinsics,
     with_surface_rotations,
 )
 from messages import noted, refuses
 from plyfile import PlyData, PlyElement
 from scripts import load_script
+from sweeps import sweep
 from tiny_scene import Tiny, make_tiny, rotation, write_npz
 
 from gsmerge.errors import SceneError
@@ -118,13 +118,12 @@ def test_views_in_reverse(tmp_path: Path, smooth: Tiny) -> None:
     assert np.array_equal((scene.images * 255).round(), smooth.images[::-1])
 
 
-def test_some_of_the_views(tmp_path: Path, smooth: Tiny) -> None:
+@sweep("views", [(0, 2), (0, 1), (1, 2), (2,)])
+def test_some_of_the_views(tmp_path: Path, smooth: Tiny, views: tuple[int, ...]) -> None:
     size = smooth.height * smooth.width
-    for views in ((0, 1), (1, 2), (0, 2), (2,)):
-        index = np.concatenate([np.arange(size) + view * size for view in views])
-        folder = tmp_path / str(views)
-        scene = load_scene(save_export(folder, smooth, export_rows(smooth, index))).pixel_scene()
-        assert scene.names == tuple(f"images/{smooth.names[view]}" for view in views)
+    index = np.concatenate([np.arange(size) + view * size for view in views])
+    scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).pixel_scene()
+    assert scene.names == tuple(f"images/{smooth.names[view]}" for view in views)
 
 
 @pytest.mark.parametrize("layers_first", [False, True])
@@ -306,20 +305,3 @@ def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
         read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"))
     with refuses(SceneError, "views.npz", "[v,4,4]", (3, 4, 4)):
         read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K))
-
-
-@pytest.mark.parametrize("fastest", [False, True])
-def test_cameras_from_the_grid_alone(tmp_path: Path, fastest: bool) -> None:
-    tiny = smooth_scene(96, 72)
-    K = np.array([[110.0, 0, 48], [0, 110, 36], [0, 0, 1]])
-    tiny = with_intrinsics(tiny, K)
-    index = np.arange(3 * 96 * 72).reshape(3, -1)
-    save_export(tmp_path, tiny, export_rows(tiny, (index.T if fastest else index).reshape(-1)))
-    (tmp_path / "transforms.json").unlink()
-    loaded = load_scene(tmp_path)
-    scene = loaded.pixel_scene()
-    assert home(scene, tiny) == 1
-    assert loaded.cameras.source == "estimated from the grid"
-    assert noted(loaded.notes, "no", "cameras")
-    assert scene.cameras.Ks[0, 0, 0].item() == pytest.approx(110, rel=0.02)
-    assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.1)

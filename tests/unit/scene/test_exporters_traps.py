@@ -156,15 +156,6 @@ def test_resplat(tmp_path: Path) -> None:
     assert [d.name for d in loaded.exporters] == ["resplat"]
 
 
-def test_rows_sorted_by_opacity(tmp_path: Path) -> None:
-    """VicaSplat's and Long-LRM's pruning leaves no order: nothing is guessed, and nothing is lost but what was cut."""
-    order = np.argsort(-SMOOTH.gaussians.opacities, kind="stable")[:4000]
-    loaded = load_scene(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, order, rest=72)))
-    assert not loaded.scene.aligned
-    assert np.array_equal(loaded.scene.gaussians.means, SMOOTH.gaussians.means[order])
-    assert "vicasplat" in [d.name for d in loaded.exporters]
-
-
 def test_two_layers_one_after_the_other(tmp_path: Path) -> None:
     """Flash3D: one photo, activated opacities, a recentred and upright world."""
     one = replace(SMOOTH, c2w=SMOOTH.c2w[:1], images=SMOOTH.images[:1], names=SMOOTH.names[:1])

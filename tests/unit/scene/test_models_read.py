@@ -45,12 +45,6 @@ def test_squeezed_photos_beside_the_right_ones(tmp_path: Path) -> None:
     check_cameras(loaded.scene, export)
 
 
-def test_dropped_pixels_are_put_back_by_cameras_and_photos(tmp_path: Path) -> None:
-    loaded, export = load(f"{DA3}, colmap-gs_ply", tmp_path)
-    assert loaded.scene.valid.all()
-    check_pixels(loaded.scene, export)
-
-
 # Cameras from the rows
 
 

@@ -49,7 +49,7 @@ def test_loading_reports_files_layout_and_alignment(tiny_folder: Path) -> None:
     assert loaded.info.layout == "17-column export"
     assert loaded.files.images == tiny_folder / "images"
     assert loaded.cameras.source == "transforms.json"
-    assert loaded.notes == ()
+    assert (loaded.notes, tuple(loaded.moves)) == ((), ())
 
 
 def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
@@ -155,10 +155,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     strange = tiny.c2w.copy()
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
-    with refuses(SceneError, "transforms.json", "median", "100 %", "convention"):
-        read_scene(tiny_folder)
-    rewrite(tiny_folder / "transforms.json", lambda data: data.update(frames_of(tiny), cx=data["cx"] + 5))
-    with refuses(SceneError, "transforms.json", "median", "100 %"):
+    with refuses(SceneError, "transforms.json", "median", "1.5 px", "100 %", "convention"):
         read_scene(tiny_folder)
 
 

@@ -6,7 +6,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
@@ -130,12 +129,6 @@ def test_faint_ones_are_left_out(scene: Scene, k: int) -> None:
     actual = decode(features, own, DecodeOptions(k=k))
     assert len(actual) == COUNT * k
     assert (actual.opacities >= 1 / 255).all()
-
-
-@pytest.mark.parametrize("k", [0, -1, 9])
-def test_k_out_of_range(features: FeatureGaussians, members: Members, k: int) -> None:
-    with refuses(ValueError, "k", "1 to 8", k):
-        decode(features, members, DecodeOptions(k=k))
 
 
 def faint_division(counts: np.ndarray) -> Gaussians:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from messages import refuses
 from scenes import make_features
 
 from gsmerge.settings.stages import MatchOptions
@@ -135,14 +134,3 @@ def test_far_twins_are_found_among_many(method: str) -> None:
     means = rng.uniform(0, 10, (300, 3))
     features = make_features(np.concatenate([means, means[::-1]]), views=[0] * 300 + [1] * 300)
     assert sets(features, match=method) == {frozenset([i, 599 - i]) for i in range(300)}
-
-
-@pytest.mark.parametrize("setting", [{"iou": 1.1}, {"similarity": -1.1}, {"overlap": float("nan")}])
-def test_thresholds_out_of_range_are_refused(setting: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(setting))}: expected"):
-        MatchOptions(**setting)
-
-
-def test_unknown_method_is_refused() -> None:
-    with refuses(ValueError, "match", "'iou'"):
-        match(make_features(np.zeros((2, 3))), MatchOptions(match="iou"))

@@ -362,17 +362,6 @@ def test_a_state_without_latents_goes_on_without(scene: Scene, absolute: dict[st
 # the file
 
 
-@pytest.fixture(scope="module", params=OUTPUTS)
-def state(request: pytest.FixtureRequest, scene: Scene, checkpoints: dict[str, str]) -> State:
-    return state_of(fed(parts_of(scene, 2), **PLAIN, checkpoint=checkpoints[request.param]))
-
-
-@pytest.fixture
-def path(state: State, tmp_path: Path) -> Path:
-    save_state(tmp_path / "state.gsm", state)
-    return tmp_path / "state.gsm"
-
-
 ARRAYS = (
     *(f"refined.{name}" for name in ("means", "covars", "masses", "extinctions", "sh0", "latents")),
     *("heads.views", "heads.num_members", "samples.means", "samples.opacities", "samples.sh0", "features.latents"),
@@ -391,11 +380,14 @@ DAMAGED: dict[str, Spoil] = {
 }
 
 
-def test_everything_comes_back(path: Path, state: State, tmp_path: Path) -> None:
-    loaded = load_state(path)
+@pytest.mark.parametrize("outputs", OUTPUTS)
+def test_everything_comes_back(outputs: str, scene: Scene, checkpoints: dict[str, str], tmp_path: Path) -> None:
+    state = state_of(fed(parts_of(scene, 2), **PLAIN, checkpoint=checkpoints[outputs]))
+    save_state(tmp_path / "state.gsm", state)
+    loaded = load_state(tmp_path / "state.gsm")
     same_state(loaded, state)
     save_state(tmp_path / "again.gsm", loaded)
-    assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
+    assert (tmp_path / "again.gsm").read_bytes() == (tmp_path / "state.gsm").read_bytes()
 
 
 def test_saved_between_batches_is_kept_in_memory(
@@ -418,6 +410,8 @@ def test_parts_that_are_not_there_are_not_written(scene: Scene, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
-def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
+def test_damage_is_told_in_one_line(damage: str, pairs: Compactor, tmp_path: Path) -> None:
+    path = tmp_path / "state.gsm"
+    pairs.save(path)
     DAMAGED[damage](path)
     assert_refused_in_one_line(load_state, path)

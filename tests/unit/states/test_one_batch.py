@@ -81,12 +81,6 @@ def test_one_state_gives_every_k(k: int, pixels: Scene, state: State) -> None:
     assert scenes.identical(decoded(state, k=k), unfitted(pixels, k=k))
 
 
-def test_tensors_too(pixels: Scene, state: State) -> None:
-    given = replace(pixels, gaussians=pixels.gaussians.to("cpu"), cameras=pixels.cameras.to("cpu"))
-    actual = one_batch(given, superpixels=SHARE)
-    assert scenes.identical(decoded(actual), decoded(state))
-
-
 @pytest.mark.parametrize("k", [1, 2, 4])
 def test_one_state_gives_every_k_without_photos(k: int, bare: Scene, bare_state: State) -> None:
     assert scenes.identical(decoded(bare_state, k=k), unfitted(bare, k=k))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from hostile.gsm_files import (
     Spoil,
     assert_refused_in_one_line,
     filled,
-    header,
     of_arrays,
     with_about,
     with_array,
@@ -25,14 +23,10 @@ from hostile.gsm_files import (
     with_text,
     without,
 )
-from messages import refuses
-from safetensors.numpy import load_file, save_file
 from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Gaussians
-from gsmerge.errors import SceneError
-from gsmerge.states.gsm_file import STATE
 from gsmerge.states.state import State
 from gsmerge.states.state_file import load_state, save_state
 
@@ -120,22 +114,7 @@ def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
     same_state(load_state(tmp_path / "a.gsm"), state)
 
 
-def test_what_is_not_known_is_not_looked_at(path: Path, state: State) -> None:
-    said, arrays = header(path), load_file(path)
-    arrays["features.moods"], arrays["division.moods"] = np.full(7, np.nan), np.zeros(3)
-    said |= {"minor": 7, "moods": ["good"]}
-    said["settings"]["mood"] = "better"
-    save_file(arrays, path, {STATE: json.dumps(said), "mood": "best"})
-    same_state(load_state(path), state)
-
-
 @pytest.mark.parametrize("damage", sorted(DAMAGED))
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
     assert_refused_in_one_line(load_state, path)
-
-
-def test_a_newer_schema_says_what_to_do(path: Path) -> None:
-    DAMAGED["a newer schema"](path)
-    with refuses(SceneError, path, 2, 3, 9.9):
-        load_state(path)

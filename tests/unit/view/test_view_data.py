@@ -41,6 +41,11 @@ def half(scene: Scene) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
+def small() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.05)
+
+
+@pytest.fixture(scope="module")
 def held_out() -> Views:
     other = scenes.make_scene(scenes.room(), scenes.arc(2, 180, 108))
     return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
@@ -94,14 +99,14 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
     assert replace(actual, views=(*inputs.views, best)).start == 3
 
 
-def test_one_scene_alone(scene: Scene) -> None:
-    alone = collect("room", scene, {}, (300,))
+def test_one_scene_alone(small: Scene) -> None:
+    alone = collect("room", small, {}, (300,))
     assert [side.name for side in alone.sides] == ["input"]
     assert alone.notes == ()
     values = [view.scores[0].psnr or 0 for view in alone.views]
     assert values == sorted(values)
     assert alone.scored
-    assert not collect("room", replace(scene, images=None, pixel_ids=None), {}, (300,)).scored
+    assert not collect("room", replace(small, images=None, pixel_ids=None), {}, (300,)).scored
 
 
 def test_the_worst_view_comes_first(actual: ViewData) -> None:
@@ -148,9 +153,10 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
     assert view.distance == pytest.approx(np.median(ours[:, 2]), rel=0.3)
 
 
-def test_too_many_gaussians_are_left_out(scene: Scene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    half = small.gaussians[::2]
     monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
-    actual = collect("room", scene, {"half": half}, (2, 1))
+    actual = collect("room", small, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
     assert actual.sides[1].splats is not None
     assert noted(actual.notes, "stills")
@@ -165,12 +171,13 @@ def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: py
     assert len(unpacked(content)) < 45 * len(half)
 
 
-def test_harmonics_of_zeros_are_left_out(scene: Scene, half: Gaussians) -> None:
+def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
+    half = small.gaussians[::2]
     flat = np.zeros((len(half), 15, 3), np.float32)
     flat[:, :3] = 0.1
     assert pack_splats(replace(half, shN=flat))[1] == 1
     assert pack_splats(replace(half, shN=0 * flat)) == pack_splats(half)
-    actual = collect("room", scene, {"half": replace(half, shN=flat)}, (2, 1))
+    actual = collect("room", small, {"half": replace(half, shN=flat)}, (2, 1))
     assert not any("harmonics" in note for note in actual.notes)
 
 
@@ -209,29 +216,29 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
     assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
 
 
-def test_superpixels_as_asked_for(scene: Scene, half: Gaussians) -> None:
-    asked = collect("room", scene, {"half": half}, (2, 1), segmentation=SegmentOptions(superpixels=50))
+def test_superpixels_as_asked_for(small: Scene) -> None:
+    asked = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), segmentation=SegmentOptions(superpixels=50))
     assert asked.num_superpixels == (50, 50)
-    none = collect("room", replace(scene, images=None, pixel_ids=None), {"half": half}, (2, 1))
+    none = collect("room", replace(small, images=None, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}
 
 
-def test_many_views_are_thinned(scene: Scene, half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data, "MAX_VIEWS", 1)
-    actual = collect("room", scene, {"half": half}, (2, 1))
-    everything = evaluate(scene, {"half": half}, None, EvaluateOptions(lpips=())).results[1].scores
+    actual = collect("room", small, {"half": small.gaussians[::2]}, (2, 1))
+    everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores
     assert 1 <= len(actual.views) <= 2
     assert actual.views[0].scores[1].psnr == min(score.masked.psnr or 0 for score in everything)
     assert noted(actual.notes, f"{len(actual.views)} of 3")
 
 
-def test_without_photos_results_are_compared_with_the_input(scene: Scene, half: Gaussians) -> None:
-    bare = replace(scene, images=None)
-    actual = collect("room", replace(bare, pixel_ids=None), {"half": half}, (2, 1))
+def test_without_photos_results_are_compared_with_the_input(small: Scene) -> None:
+    bare = replace(small, images=None)
+    actual = collect("room", replace(bare, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
     assert [view.photo for view in actual.views] == [None] * 3
     assert actual.reference == "renders of the input"
-    colored = collect("room", bare, {"half": half}, (2, 1))
+    colored = collect("room", bare, {"half": small.gaussians[::2]}, (2, 1))
     assert all(view.photo is not None for view in colored.views)
     assert colored.reference == ROW_COLORS
 
@@ -255,9 +262,11 @@ def test_a_still_keeps_red_red() -> None:
     assert psnr(decoded(encode_still(to_picture(red))), red) > 30
 
 
-def test_stills_of_a_result_are_from_its_own_cameras(scene: Scene, half: Gaussians) -> None:
-    own = replace(scene.cameras, viewmats=motions.random_motions(len(scene), 2.0, 0.1) @ scene.cameras.viewmats)
-    given, moved = (collect("room", scene, {"half": half}, (2, 1), cameras=one) for one in (None, {"half": own}))
+def test_stills_of_a_result_are_from_its_own_cameras(small: Scene) -> None:
+    own = replace(small.cameras, viewmats=motions.random_motions(len(small), 2.0, 0.1) @ small.cameras.viewmats)
+    given, moved = (
+        collect("room", small, {"half": small.gaussians[::2]}, (2, 1), cameras=one) for one in (None, {"half": own})
+    )
     for before, after in zip(*(sorted(one.views, key=attrgetter("place")) for one in (given, moved)), strict=True):
         assert before.stills[0] == after.stills[0]
         assert before.stills[1] != after.stills[1]

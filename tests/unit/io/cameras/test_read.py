@@ -64,12 +64,6 @@ def test_poses_and_intrinsics_are_read(tmp_path: Path, write: Callable[[Path], P
     np.testing.assert_allclose(actual.Ks, np.stack([K] * VIEWS), atol=1e-9)
 
 
-@pytest.mark.parametrize("write", [write_world_mirror, write_trajectory])
-def test_they_are_recognised_in_a_folder(tmp_path: Path, write: Callable[[Path], Path]) -> None:
-    path = write(tmp_path)
-    assert read_cameras(tmp_path).path == str(path)
-
-
 @pytest.mark.parametrize(
     ("cx", "cy", "size"), [(24, 18, (48, 36)), (24.3, 18, (0, 0)), (-24, 18, (0, 0)), (float("nan"), 18, None)]
 )
@@ -102,14 +96,6 @@ def test_long_lrm_s_world_is_the_gaussians(tmp_path: Path) -> None:
         seen, truly = (viewmat @ moved)[:3], (np.linalg.inv(C2W)[view] @ point)[:3]
         np.testing.assert_allclose(seen, 1.35 * truly, atol=1e-9)
     assert actual.names == ("view_002", "view_000")
-
-
-def test_a_list_of_poses_alone(tmp_path: Path) -> None:
-    path = write_trajectory(tmp_path)
-    path.with_name("intrinsic.txt").unlink()
-    actual = read_cameras(path)
-    np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)
-    assert actual.focal is None
 
 
 def other_intrinsics(path: Path) -> None:

@@ -107,11 +107,6 @@ def test_files_that_hold_no_grid(text: str, named: tuple[object, ...], tmp_path:
         read_grid(grid)
 
 
-def test_a_missing_file_is_told(tmp_path: Path) -> None:
-    with refuses(SceneError, "grid.toml", "no such file"):
-        read_grid(tmp_path / "grid.toml")
-
-
 def test_fixed_settings_are_those_of_ours_alone() -> None:
     grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "iterations=3"))
     combinations, _ = list_settings(grid)
@@ -209,8 +204,6 @@ def test_results_beside_targets_do_not_count(scene_copy: Path) -> None:
     (scene_copy / "targets" / "charts").mkdir()
     (scene_copy / "targets" / "charts" / "batch.jsonl").write_text("{}")
     assert sources(scene_copy, targets="{scene}/targets")[0].sha256 == before
-    (scene_copy / "targets" / "transforms.json").write_text("{}")
-    assert sources(scene_copy, targets="{scene}/targets")[0].sha256 != before
 
 
 def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:

@@ -114,7 +114,7 @@ def test_axes_turn_with_their_covariance() -> None:
 @pytest.fixture(scope="module")
 def example() -> Example:
     """Two views in which every cluster is known, so that no step changes a choice."""
-    whole = make_example(make_training_scene(make_scene(room(), arc(2, 40, 30)), range(2)), PAPER, 0.1, "room")
+    whole = make_example(make_training_scene(make_scene(room(), arc(2, 24, 18)), range(2)), PAPER, 0.1, "room")
     matches = match_crop(whole_photo(whole, 0).crop, whole.features, replace(PAPER, geometry="analytic"))
     assert matches.count < len(whole.features)
     return replace(whole, matches=matches)

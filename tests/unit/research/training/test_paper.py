@@ -102,7 +102,7 @@ def test_the_preset_s_examples_have_clusters(example: Example) -> None:
 def test_every_network_gets_a_gradient(example: Example) -> None:
     networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()
-    for window in windows(example, 12):
+    for window in windows(example, 4):
         loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0)).total
         names, parameters = zip(*networks.named_parameters(), strict=True)
         for name, part in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
@@ -113,7 +113,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
 
 def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Path) -> None:
     """Beyond what weight decay does: the last layer begins at zero, which decay leaves there."""
-    options = replace(PAPER, steps=12, save_every=12, decay=0.0, average=0.0)
+    options = replace(PAPER, steps=6, save_every=6, decay=0.0, average=0.0)
     done = train([written(example, tmp_path)], [], tmp_path / "run", options)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(options.seed)
