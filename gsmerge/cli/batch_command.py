@@ -19,7 +19,7 @@ from gsmerge.errors import BatchError, TargetError, UsageError
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
-MAX_LISTED = 20  # failures, and results that are worse than their input
+MAX_LISTED = 20  # results in the table, failures, and results that are worse than their input
 
 
 def parse_jobs(text: str) -> int:
@@ -164,6 +164,7 @@ class Totals:
     num_input: int = 0  # Gaussians in the scenes that were done
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
+    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
@@ -180,12 +181,18 @@ class Totals:
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
             self.unmet += bool(report["unmet"])
+            if len(self.rows) < MAX_LISTED:
+                self.rows.append(_row(record["output"], report))
 
     def lines(self) -> list[str]:
-        """Say what is worse, what failed, and the totals."""
+        """Write a table of the results, what is worse, what failed, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
+        from gsmerge.report import text_table
 
-        lines: list[str] = []
+        header = ("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")
+        lines = text_table([header, *sorted(self.rows)]) if self.rows else []
+        if self.counts[DONE] > len(self.rows):
+            lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
         for status, reasons in (("worse", self.worse), (FAILED, self.failed)):
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
@@ -198,6 +205,13 @@ class Totals:
         line += f"; {self.unmet:,} missed the target" if self.unmet else ""
         line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
         return [*lines, line]
+
+
+def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
+    psnr = report["psnr_input_views"]
+    quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
+    counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
+    return output, *counts, f"{100 * report['ratio']:.2f} %", *quality, f"{report['total_seconds']:.1f}"
 
 
 def print_plan(

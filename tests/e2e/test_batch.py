@@ -120,17 +120,21 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert not (out.parent / "new").exists()
 
 
-def test_the_lines_at_the_end_list_the_first_failures() -> None:
+def test_the_table_at_the_end_has_the_first_results() -> None:
     totals = Totals(1000)
-    report = {"input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "unmet": None, "worse": None}
+    report = {
+        "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
+        "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None,
+    }  # fmt: skip
     for number in range(300):
         totals.add(record("done", f"{number}", f"{number}.ply", report=report))
         totals.add(record("failed", f"{number}", f"{number}.ply", error="no"))
         totals.add(record("skipped", f"{number}", f"{number}.ply"))
     totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few"}))
-    *failures, more, last = totals.lines()
-    assert failures == [f"failed: {number}: no" for number in range(20)]
-    assert more == "... and 280 more failed"
+    *table, last = totals.lines()
+    assert table[0].split() == ["result", "Gaussians", "of", "kept", "dB", "before", "after", "seconds"]
+    assert len(table) == 1 + 20 + 1 + 20 + 1
+    assert [line for line in table if "more" in line] == ["... and 281 more", "... and 280 more failed"]
     counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
