@@ -33,7 +33,7 @@ SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
 def scene_plys(scene: Path) -> list[Path]:
-    """List the files of a scene, which is one of them or their folder; none of a folder that reading it refuses."""
+    """List the files of a scene, given one of them or their folder; empty if the folder cannot be read as a scene."""
     with suppress(SceneError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
@@ -54,9 +54,9 @@ def find_scenes(
 ) -> Iterator[Path]:
     """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
 
-    ``unreadable`` receives the errors of folders inside the arguments that cannot be read; without
-    it, the first of them is raised. SceneError if an argument does not exist, has no scene or too
-    many folders without one, UsageError if it is the output folder.
+    ``unreadable`` collects the errors of folders inside the arguments that cannot be read; without it, the first error
+    is raised. SceneError if an argument does not exist, has no scene, or has too many folders without a scene;
+    UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
@@ -109,7 +109,7 @@ class _Search:
     num_empty: int = 0  # folders without a scene
 
     def walk(self, folder: Path) -> Iterator[Path]:
-        """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
+        """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
         for inside, names, folders in self.folders(folder):
             if _is_scene(inside, names):
                 folders[:] = [name for name in folders if name not in SCENE_PARTS]
@@ -120,7 +120,7 @@ class _Search:
             yield from scenes
 
     def folders(self, first: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-        """Yield a folder and those below it, with the names in each, and a list of its folders' names.
+        """Yield a folder and its sub-folders, with the names in each and a list of the sub-folders' names.
 
         The caller may remove names from that list: those folders are not entered.
         """
@@ -158,7 +158,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _is_scene(folder: Path, names: list[str]) -> bool:
-    """Return whether a folder with these names in it is a scene."""
+    """Return whether a folder that contains these names is a scene."""
     try:
         if SCENE_NAMES.isdisjoint(names) and folder.name != depth_maps.FRAMES:
             return False
@@ -198,7 +198,7 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
 
 
 def _listed(file: Path, search: _Search) -> Iterator[Path]:
-    """Yield the scenes of a list, relative to its folder; a missing one fails when it is read."""
+    """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):
         if "\0" in line:

@@ -75,7 +75,7 @@ class SceneCall(Protocol):
 
     @property
     def settings(self) -> CompactOptions:
-        """Settings from which the time is estimated."""
+        """Settings that the time estimate depends on."""
 
     def key(self, files: SceneFiles) -> str:
         """Return a digest of everything that the result depends on."""
@@ -150,8 +150,8 @@ def find_jobs(
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
     line. ``results`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
-    sub-folders that cannot be read; without it they are raised. SceneError if something does not exist or has no scene;
-    UsageError if two scenes would be written to one file, or one over another.
+    sub-folders that cannot be read; without it they are raised. SceneError if an argument does not exist or has no
+    scene; UsageError if two scenes have the same output file, or an output is an input.
     """
     call = CompactCall(options.settings, options.opacity, options.hints)
     jobs: list[Job] = []

@@ -42,9 +42,9 @@ class Run:
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
     """Make the results of all jobs in a folder, several at once; yield the record of each as it ends.
 
-    What is done already is yielded as skipped. Several runs may share a folder: what another one works on comes last.
-    Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray is not
-    installed.
+    Jobs that are done already are yielded as skipped. Several runs may share a folder; jobs that another run works on
+    come last. Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray
+    is not installed.
     """
     schedule = make_schedule(jobs, options)
     run = Run(folder, check_folder(folder), schedule.threads, options.overwrite)
@@ -76,9 +76,10 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
 
 
 def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
-    """Make a result, unless it is done, and record how that ended; return the record.
+    """Make a result unless it is done, record the outcome, and return the record.
 
-    ``wait``: for another process that works on it; otherwise None is returned. SceneError if nothing can be recorded.
+    ``wait``: wait for another process that works on the result; otherwise return None. SceneError if nothing can be
+    recorded.
     """
     with lock_result(run.folder, job.output, wait=wait) as lock:
         if lock is None:
@@ -124,12 +125,12 @@ def _make(job: Job, run: Run, lock: ResultLock) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def read_index(folder: Path, start: int) -> RecordIndex:
-    """Return the index of a folder's records, which a process keeps between the calls of a run."""
+    """Return the index of a folder's records, which each process keeps between the calls of a run."""
     return RecordIndex(folder)
 
 
 def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
-    """Record the failure of a job whose process died; None if another process works on it by now."""
+    """Record the failure of a job whose process died; None if another process works on it now."""
     with lock_result(run.folder, job.output, wait=False) as lock:
         if lock is None:
             return None
@@ -140,7 +141,7 @@ def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
-    """Remove what is left of jobs whose processes were ended on purpose."""
+    """Remove the unfinished files of jobs whose processes were ended on purpose."""
     for job in jobs:
         with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as lock:
             if lock is not None:
@@ -148,7 +149,7 @@ def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
 
 
 def _clean(job: Job, run: Run, lock: ResultLock) -> None:
-    """Remove the files that a killed process left, except the lock of a result that may be without a record."""
+    """Remove the files of a killed process, except the lock of a result that may have no record yet."""
     if lock.is_left:
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
@@ -164,7 +165,7 @@ class ResultLock:
     is_left: bool  # whether a process has left it; whether this one leaves it
 
     def leave_if_killed(self) -> None:
-        """Say in the file which process works on the result, so that it is known to be of a batch."""
+        """Write the process number into the lock file, so that a kill leaves proof that a batch made the result."""
         self.file.write(f"{os.getpid()}\n".encode())
         os.fsync(self.file.fileno())  # on the disk before the result
         self.is_left = True
@@ -174,7 +175,7 @@ class ResultLock:
 def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[ResultLock | None]:
     """Lock a result against other processes in the block; SceneError if that fails.
 
-    ``wait``: for a process that has locked it; otherwise None is yielded.
+    ``wait``: wait until another process releases it; otherwise yield None.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     path = folder / f".batch-{name}.lock"

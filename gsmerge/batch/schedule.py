@@ -31,7 +31,7 @@ class Schedule:
 
 
 def make_schedule(jobs: Sequence[Job], options: BatchOptions) -> Schedule:
-    """Divide the processors among scenes: a thread for each, as far as there are scenes and free memory."""
+    """Divide the processors among scenes: one thread each, as far as scenes and free memory allow."""
     threads, processors = options.settings.threads, available_threads()
     if options.engine == "ray":
         return Schedule(options.jobs or 0, threads or 1)
@@ -45,7 +45,7 @@ def make_schedule(jobs: Sequence[Job], options: BatchOptions) -> Schedule:
 
 
 def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[Job]:
-    """List the jobs whose result is not done; all where they are to be done again."""
+    """List the jobs whose result is not done, or all jobs if they are to be done again."""
     results = RecordIndex(folder).read_on().results
 
     def is_done(job: Job) -> bool:

@@ -148,7 +148,7 @@ def run_jobs(
     add: Callable[[dict[str, Any]], None],
     name: str = "scene",
 ) -> None:
-    """Run jobs, show progress, and hand each record to ``add``; ``name``: key of a record that names the job."""
+    """Run jobs, show progress, and pass each record to ``add``; ``name``: key in a record with the name of its job."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED
 
@@ -207,7 +207,7 @@ class Totals:
                 self.rows.append(_row(record["output"], report))
 
     def lines(self) -> list[str]:
-        """Write a table of the results, what is worse, what failed, and a line of totals."""
+        """Write a table of the results, results worse than their input, failures, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.report import text_table
 

@@ -123,7 +123,7 @@ def compact(args: opt.Args) -> None:
 
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
-    """Return the settings with the engine that was asked for; UsageError where it is not installed."""
+    """Return the settings with the requested engine; UsageError if it is not installed."""
     from gsmerge.runtime.work import require_ray
     from gsmerge.settings.stages import Engine
 
@@ -135,7 +135,7 @@ def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
 
 
 def _check_scenes(args: opt.Args) -> None:
-    """Refuse several scenes with cameras for all, one that is missing, or is named twice."""
+    """Raise an error for several scenes with one ``--cameras``, a missing scene, or a scene given twice."""
     if len(args.scenes) == 1:
         return
     if args.cameras is not None:
@@ -150,7 +150,7 @@ def _check_scenes(args: opt.Args) -> None:
 
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
-    """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
+    """Warn before reading if the scene is not likely to fit into memory; not if it is compacted in blocks."""
     from gsmerge.facts.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks

@@ -136,7 +136,7 @@ def compact_files(
 
 
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return as a document what :func:`compact_files` would make of a scene."""
+    """Return a document of what :func:`compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
     check_saved_cameras(scene, outputs)
     _, unused = check_method(settings, scene)
@@ -161,7 +161,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
 
 
 def plan_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the document of :func:`plan_files` as lines for people."""
+    """Write the document of :func:`plan_files` as lines of text."""
     scene, out = document["input"], document["output"]["path"]
     levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
     return [
@@ -182,11 +182,10 @@ def _write_results(
     photos: Sequence[str],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
-    """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
+    """Write a result into the file ``first``, and its coarser levels, each with its header comments.
 
-    A COLMAP model has the ``cameras``, and the names of their ``photos``, as well; ``parts`` are those of a
-    ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
-    renamed.
+    A COLMAP model also needs the ``cameras`` and the names of their ``photos``; ``parts`` are the parts of a
+    ``lod-meta.json``. Returns the path of each result, with the temporary files that are renamed to it at the end.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
@@ -210,13 +209,13 @@ def _write_results(
 
 
 def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Say in the settings whose bytes a budget counts."""
+    """Set in the settings the format whose bytes a budget counts."""
     budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
     return replace(settings, budget=budget)
 
 
 def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
-    """Move a result, its levels and its cameras into the frame in which they are written, with all their columns."""
+    """Move a result, its levels and its cameras into the output frame, and add columns that are written as zeros."""
     options = outputs.placement
     frame = find_placement(options, result.cameras if len(result.cameras) else None)
 
@@ -229,14 +228,14 @@ def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
 
 
 def _views_once(scene: Scene) -> list[int]:
-    """Return the views without further layers of a view, which have its name and camera."""
+    """Return the views without further layers, which have the name and camera of an earlier view."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
 def _other_cameras(path: Path) -> UsageError:
-    """Make the error of a file of cameras for viewers that belongs to another result."""
+    """Make the error for an existing camera file for viewers that belongs to another result."""
     remedy = "pass --overwrite to replace it, or name another with --output"
     return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
@@ -264,7 +263,7 @@ def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:
 
 
 def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
-    """Return a note if the scene is a result of gsmerge, by its header or with far fewer Gaussians than pixels."""
+    """Return a note if the scene is a result of gsmerge, by its header or by its small number of Gaussians."""
     scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     few = is_from_gsmerge(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2

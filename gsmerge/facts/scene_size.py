@@ -30,7 +30,8 @@ class SceneSize:
 def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
     """Return the sizes of a scene.
 
-    ``photos``: whether there are any to fit to; None: whether the scene has images, or pixels whose colours stand in.
+    ``photos``: whether there are photos to fit to; None: whether the scene has images, or pixels whose colours replace
+    them.
     """
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(

@@ -55,9 +55,9 @@ def fit_colors(
 ) -> FitResult:
     """Fit base colours to the photos, and keep them only if held-out blocks get better.
 
-    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out blocks.
-    ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
-    to. Geometry, opacities and higher harmonics stay.
+    ``drawn`` are the Gaussians drawn into the photos, see :func:`draw`; ``seed`` chooses the held-out blocks.
+    ``color_precision [n]`` is the weight of each present colour as a prior, from the pixels of earlier photos.
+    Geometry, opacities and higher harmonics stay unchanged.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
@@ -88,7 +88,7 @@ class ColorSystem:
         return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
 
     def score(self, x: np.ndarray | None = None) -> float:
-        """Return the PSNR (dB) of the held-out blocks; None: with the colours before the fit."""
+        """Return the PSNR (dB) of the held-out blocks; None: with the colours from before the fit."""
         images = self.drawn.images if x is None else self._images(x)
         return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
 
@@ -139,8 +139,8 @@ class ColorSystem:
 def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) -> tuple[np.ndarray, FitReport]:
     """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out blocks get worse.
 
-    A third of the steps with plain weights; then pixels that still fit badly count less, exposure
-    is compensated, and another third follows. The last ones are on all pixels.
+    The first third of the steps uses equal weights. In the second third, badly fitting pixels count less and exposure
+    is compensated. The last third uses all pixels, including the held-out blocks.
     """
     steps = options.tuning.iterations
     third = steps // 3

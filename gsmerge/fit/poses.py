@@ -30,7 +30,7 @@ class PoseState:
     pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
 
     def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
-        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
+        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; step sizes fall to zero at the end."""
         turns = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
         (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
         slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
@@ -45,7 +45,7 @@ class PoseState:
 
 
 def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
-    """Return motions of zero for the photos' cameras, and the photos with viewmats that the motions update."""
+    """Start the poses at zero motion, and return photos whose viewmats the motions update."""
     start = photos[0].viewmats.astype(np.float64)
     zero, shared = np.zeros((len(start), 6)), start.copy()
     pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())

@@ -73,7 +73,7 @@ class FitPlan:
     half_part: float  # Share of the steps, the first ones, on half-size photos
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
+        """Return the index of the view from outside to fit after step ``step`` (from 1); None: no view."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -82,8 +82,8 @@ class FitPlan:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        Half-size photos come first, then full-size ones, drawn in turn in the ways of different viewers. Larger photos
-        in between show what an enlarged view shows.
+        Half-size photos come first. Full-size photos follow, drawn alternately in the way of different viewers, with
+        larger photos between them for enlarged views.
         """
         photos = self.job.photos
         if progress < self.half_part:
@@ -146,7 +146,7 @@ class Schedule:
         self.queue: list[int] = []
 
     def draw(self, number: int, progress: float, count: int) -> Step:
-        """Draw the plan of step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
+        """Return the plan of step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
         if not self.queue:
             self.queue = self.rng.permutation(len(self.plan.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
@@ -170,7 +170,8 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
 def affordable_steps(seconds: float, plan: FitPlan) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps at half size.
 
-    A step at full size costs up to three times as much, one on larger photos more by their pixels.
+    A step at full size costs up to three times as much; a step on larger photos costs more in proportion to their
+    pixels.
     """
     budget, coarse = plan.job.options.time_budget, plan.half_part
     assert budget is not None

@@ -66,7 +66,7 @@ class Optimiser:
     def _take_prepared(
         self, state: State, step: Step, weight: np.ndarray, opacities: np.ndarray | None
     ) -> float | None:
-        """Take a step in few calls and return its error; None where it has to be taken by single ones."""
+        """Take a step in few calls and return its error; None if it has to be taken by single calls."""
         if self.poses is not None or not is_prepared(state):
             return None
         with use_threads() as threads:
@@ -98,7 +98,7 @@ class Optimiser:
         }
 
     def clear_fog(self, state: State, step: Step, view: int) -> None:
-        """Take one Adam step against fog: opacity that a view from outside shows where the start was empty."""
+        """Take one Adam step against fog: opacity in a view from outside where the start was empty."""
         assert self.plan.job.outside is not None
         self._move(state, fog_gradients(state.splats, self.plan.job.outside, view), step)
 
@@ -121,7 +121,7 @@ class Optimiser:
 
 
 def make_optimiser(plan: FitPlan) -> Optimiser:
-    """Return the optimiser of a planned fit; its cameras are where the photos were taken."""
+    """Return the optimiser of a planned fit, with cameras at the poses of the photos."""
     photos = plan.job.photos
     if not plan.job.options.move_cameras:
         return Optimiser(plan, photos, None)

@@ -37,9 +37,9 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
-    """Draw Gaussians into the half-size photos of a planned fit, and collect what they show of each.
+    """Draw Gaussians into the half-size photos of a planned fit, and collect how each photo shows each Gaussian.
 
-    The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
+    The other sizes, full size first, determine the size of the finest pixel. Without a fit the score is NaN.
     """
     photos = plan.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)

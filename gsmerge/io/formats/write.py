@@ -14,7 +14,7 @@ from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that are not written in a format; None if all are. UsageError for an unknown ending."""
+    """Describe the harmonics that a format leaves out; None if it keeps all. UsageError for an unknown ending."""
     chosen = output_format(path, spz_version, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
@@ -176,7 +176,7 @@ def write_ply(
 
 
 def _check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for what the readers refuse."""
+    """Raise ValueError for Gaussians or comments that the readers would refuse."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)
