@@ -141,7 +141,7 @@ def photo_array(images: np.ndarray | None) -> np.ndarray:
 
 
 def select_photos(images: np.ndarray, ids: Sequence[int]) -> np.ndarray:
-    """Select photos ``[c,h,w,3]`` by their numbers; without photos return None."""
+    """Select photos ``[c,h,w,3]`` by their numbers; an empty array stays empty."""
     return images[list(ids)] if len(images) else images
 
 
