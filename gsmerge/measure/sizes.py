@@ -60,6 +60,6 @@ def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.
 
 
 def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first pixel, and the one after the last, of ``old`` in a row that each of ``new`` pixels overlaps."""
+    """Find the first and the (exclusive) last of ``old`` pixels in a row that each of ``new`` pixels overlaps."""
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

@@ -41,7 +41,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Return the gradients of some Gaussians, by mask or by row; that of the view matrix stays."""
+        """Return the gradients of the Gaussians ``rows`` (mask or indices); that of the view matrix stays."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
@@ -142,10 +142,10 @@ def color_gradients(
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
 
-    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if computed
-    already; no gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
-    longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
-    gradient of the eye is minus the sum of those of the means.
+    ``grad_colors [m,3]`` are gradients such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if
+    computed already; no gradient passes where they are clipped at 0. ``used``: an earlier result that is no longer
+    needed; its memory is reused if large enough, since allocation takes a quarter of the time or more. The gradient of
+    the eye is minus the sum of those of the means.
     """
     m, splats = len(plan.ids), plan.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))

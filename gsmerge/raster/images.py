@@ -101,9 +101,9 @@ def render_in_turn(
     near: float = 0.01,
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed by ``convert``, pixel by pixel.
+    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed pixel by pixel by ``convert``.
 
-    At most ``at_once`` are in memory; large ones are drawn, and converted, in bands.
+    At most ``at_once`` images are in memory; large images are drawn and converted in bands.
     """
     under = background_color(background)
     plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
@@ -121,7 +121,7 @@ def render_in_turn(
 
 
 def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[..., ViewPlan]:
-    """Prepare the Gaussians for cameras, and return what plans the drawing of each view by its number, or a band."""
+    """Prepare the Gaussians for cameras, and return a function that plans the drawing of a view, or of a band of it."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
     def plan_one(view: int, band: tuple[int, int] | None = None) -> ViewPlan:

@@ -141,7 +141,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos that take no memory, for uses where only cameras matter; sides divided by ``level``."""
+    """Return black photos that take no memory, if only their cameras matter; sides divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -193,7 +193,7 @@ def score_photos(
 ) -> PhotoScore:
     """Score renders against the photos of ``views``, or a ``quarter`` of each; see :func:`photo_errors`.
 
-    ``covered``: a mask ``[h,w]`` for each of the views; None: where the Gaussians are opaque by half.
+    ``covered``: a mask ``[h,w]`` for each of the views; None: the pixels with an opacity of at least a half.
     """
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
@@ -231,7 +231,7 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[tile_height,tile_width]`` that selects a quarter of a view's tiles; None for small views."""
+    """Return a mask ``[tile_height,tile_width]`` of a quarter of a view's tiles; None for small views."""
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     if min(tile_height, tile_width) <= 3 * BLOCK:
         return None

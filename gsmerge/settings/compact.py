@@ -101,7 +101,7 @@ class CompactOptions(Settings):
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that need the scene in one piece."""
+        """Names of the settings in use that require the scene in one piece."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != OURS, "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
