@@ -25,7 +25,7 @@ def without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def bake(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> GroupSet:
-    """Decode groups into moments and children, so that gains, latents and decoder heads are no longer needed."""
+    """Convert groups to moments and children, so that gains, latents and decoder heads are no longer needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -180,9 +180,9 @@ def share(state: State) -> State:
 
 
 def divide_groups(state: State, *, fitted_colors: bool = True) -> DividedGroups:
-    """Return groups with children for every K: those of one batch as they came, others by dividing their children.
+    """Return groups with children for every K: groups of one batch unchanged, others with their children divided.
 
-    ``fitted_colors``: in the colours fitted to the photos instead of those of the input files. With networks, decoder
+    ``fitted_colors``: use the colours fitted to the photos instead of those of the input files. With networks, decoder
     heads set the colours.
     """
     groups, max_k, networks = state.groups, state.settings.max_k, state.networks
