@@ -189,7 +189,7 @@ def plan_whole(
 ) -> WholePlan:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
+    ``num_input``, ``num_reserved``: as in :func:`gsmerge.stages.segment.count_limits`.
     """
     if not scene.photos:
         options = replace(options, fit=replace(options.fit, fit="none"))

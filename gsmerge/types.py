@@ -341,7 +341,7 @@ class Scene:
 
     @property
     def finite_gaussians(self) -> Gaussians:
-        """Gaussians without the rows that replace those that are not finite in the file."""
+        """Gaussians of finite rows; rows that replace invalid rows of the file are left out."""
         return self.gaussians if self.pixel_ids is None else self.gaussians[self.pixel_ids >= 0]
 
     @property

@@ -91,7 +91,7 @@ def accept_reading(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recov
 
 @dataclass(frozen=True)
 class Fit:
-    """A grid of which rows are the pixels."""
+    """A grid whose pixels are the rows."""
 
     grid: GridFit
     recovery: Recovery

@@ -146,7 +146,7 @@ def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterato
 
 
 def _row_type(count: int) -> type[np.signedinteger[Any]]:
-    """Return the smallest type that numbers ``count`` rows, of which there may be hundreds of millions."""
+    """Return the smallest integer type for ``count`` rows, since there may be hundreds of millions."""
     return np.int32 if count <= np.iinfo(np.int32).max else np.int64
 
 

@@ -169,7 +169,10 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:
-    """Compute the normalised spectrum of steps over ``lag`` rows of values ``[n]``, which may be NaN."""
+    """Compute the power spectrum, as shares of its sum, of differences over ``lag`` rows.
+
+    ``values [n]`` may have NaN.
+    """
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)
@@ -181,6 +184,6 @@ def _power(values: np.ndarray, lag: int) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> float:
-    """Return the median of the numbers among values; 0 where there are none."""
+    """Return the median of the values that are not NaN; 0 without any."""
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else 0.0

@@ -296,8 +296,8 @@ _TABLE = (
                "beside the photos, and where these are transparent."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
-        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
-               "left out."),
+        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
+               "are left out."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
     ),
     panel(

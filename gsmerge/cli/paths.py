@@ -23,7 +23,7 @@ class FileOptions(Settings):
 
     normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
-    columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
+    columns: str = setting("needed", "Columns of a `.ply`: needed columns only, or full: all 62 of INRIA's, which "
         "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
     spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
         "degree 4.",

@@ -70,7 +70,7 @@ def look_up(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def _enlarge(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Resize a mask ``[h,w]`` to the size of a larger picture; border pixels belong to the mask."""
+    """Resize a mask ``[h,w]`` to a larger picture; pixels that it covers in part belong to it."""
     large = cv2.resize(mask.astype(np.uint8) * 255, shape[1::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(large > 0)
 

@@ -66,7 +66,7 @@ class ReadBudget:
 
 
 def read_budget(path: Path) -> ReadBudget:
-    """Return the budget of a file; SceneError as of :func:`check_file`."""
+    """Return the budget of a file; SceneError as in :func:`check_file`."""
     return ReadBudget(path, check_file(path))
 
 

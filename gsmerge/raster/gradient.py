@@ -121,13 +121,12 @@ def plan_gradients(
     colors: Array | None = None,
     with_viewmat: bool = False,
 ) -> Gradients:
-    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a plan.
+    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made from a plan.
 
-    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
-    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
-    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
-    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
-    which weights are drawn at all. Raises ValueError if an array has another shape.
+    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are the gradients of the loss. ``image``, with
+    its background, and ``transmittance`` are the results of ``composite``, and ``colors`` its argument.
+    ``with_viewmat`` also computes the gradient of the world-to-camera matrix. Gradients are zero where alpha is clamped
+    at 0.99; the choice of the drawn weights has no gradient. Raises ValueError if an array has another shape.
     """
     size = plan.height, plan.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))

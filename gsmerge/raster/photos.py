@@ -163,11 +163,10 @@ def photo_errors(
 ) -> list[Score]:
     """Render Gaussians into the photos' cameras and score every picture, several views at once.
 
-    ``score`` gets the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance
-    ``[h,w]``. ``views`` of the photos, in the order of the result; None: all. ``near`` is in the
-    Gaussians' unit; ``colors [n,3]`` replace the harmonics. ``keep`` gives a view's mask ``[n]`` of
-    the Gaussians to draw, ``tiles`` its mask ``[tile_height,tile_width]`` of the tiles to complete;
-    None is all.
+    ``score`` is called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
+    ``views``: views of the photos, in the order of the result; None: all. ``near`` is in the unit of the Gaussians.
+    ``colors [n,3]`` replace the harmonics. ``keep`` returns for a view the mask ``[n]`` of the Gaussians to draw, and
+    ``tiles`` the mask ``[tile_height,tile_width]`` of the tiles to complete; None: all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 

@@ -1,4 +1,4 @@
-"""A pool of processes on this machine, each of which makes one call after the other."""
+"""A pool of processes on this machine; each process makes one call after the other."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return the children that :func:`decode` makes without networks, however faint, and the group ``[n]`` of each."""
+    """Return the children that :func:`decode` makes without networks, faint ones too, and the group ``[n]`` of each."""
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():

@@ -1,4 +1,4 @@
-"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes of which no view is known.
+"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes without known views.
 
 Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
 add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was.

@@ -139,7 +139,7 @@ def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) 
 
 
 def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
-    """Return the children for every K, with every index within its range."""
+    """Read the children for every K, and check that every index is in range."""
     g = len(features)
     splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
     uniform = file.array("division.uniform", np.int32, None)

@@ -102,7 +102,7 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
     """Concatenate the views of scenes of one size and frame; either all are aligned, or none is.
 
-    ``photos``: those of all views, where they are together already.
+    ``photos``: the photos of all views, if they are in one array already.
     """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),

@@ -146,9 +146,10 @@ class _Residuals:
 
 
 def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
-    """Project the points of one end into the photos of the other, by the similarity between their frames.
+    """Compute the distances between projected points of one end and the keypoints of the other, in standard deviations.
 
-    ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
+    ``place`` maps between the frames of the two scenes. ``pixels``, ``spread``: standard deviations of a keypoint and
+    of the logarithm of a depth.
     """
     turns = other.viewmats[:, :3, :3]
     moved = place.move_points(end.points)

@@ -113,7 +113,7 @@ class _Storage(NamedTuple):
 
 @dataclass
 class _TorchFile:
-    """A file whose tensors are read, all of which together have at most its bytes."""
+    """A file whose tensors are read; together they have at most as many bytes as the file."""
 
     budget: ReadBudget
     num_bytes: int = 0  # read so far
@@ -206,7 +206,7 @@ def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
 
 
 def _names(budget: ReadBudget) -> Names:
-    """Return the allowed globals of torch's pickles: storages, each with the type of its numbers."""
+    """Return the globals that a pickle of torch may name: storages, each with the type of its numbers."""
     file = _TorchFile(budget)
     return {
         ("collections", "OrderedDict"): _make_dictionary,

@@ -104,7 +104,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Rows of a PLY file, of which each block is unpacked when it is taken."""
+    """Rows of a PLY file that are unpacked block by block when they are taken."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]

@@ -124,7 +124,10 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read one PLY file, or several of the same columns or of depth maps as one, in order; see :func:`read_ply`."""
+    """Read several files as one, in the given order; see :func:`read_ply`.
+
+    They are one PLY file, PLY files with equal columns, or files of depth maps.
+    """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     is_depth = input_format(paths[0]) is DEPTHS

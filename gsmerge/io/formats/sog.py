@@ -49,7 +49,7 @@ _MAX_STEPS = 200
 
 
 class _Files(Protocol):
-    """The files of one ``.sog`` by their names, of which nothing is read that is larger than all may be."""
+    """The files of one ``.sog`` by name; a file larger than the limit for all of them is not read."""
 
     @property
     def size(self) -> int:

@@ -46,7 +46,7 @@ def write_gaussians(
         overwrite: Replace an existing file.
         comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
-        normals: Of a ``.ply``, as of :func:`write_ply`.
+        normals: Of a ``.ply``, as in :func:`write_ply`.
         spz_version: Of a ``.spz``: 3, which most programs read, or 4, which has room for harmonics of degree 4 and
             needs ``zstandard``.
 
@@ -82,7 +82,7 @@ def write_levels(
         path: The index, a ``lod-meta.json``; its folder is made if it is missing.
         levels: Finite values, the finest level first.
         overwrite: Replace an existing index.
-        comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
+        comments: Lines as in :func:`write_gaussians`; only "SplatRenderMode: mip" is kept.
 
     Raises:
         UsageError: If the name is another one.
@@ -114,8 +114,9 @@ def add_levels(
 ) -> list[tuple[Path, list[Path]]]:
     """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
 
-    ``environment`` and ``measure`` are as of :func:`streamed.streamed_files`. Returns, for each level, the final path
-    of its first chunk's ``meta.json``, and the present paths of all its files; an environment's are the finest level's.
+    For ``environment`` and ``measure`` see :func:`streamed.streamed_files`. Returns for each level the final path of
+    the ``meta.json`` of its first chunk, and the temporary paths of all its files. The files of an environment belong
+    to the finest level.
     """
     for gaussians in levels if environment is None else (*levels, environment):
         _check_readable(gaussians, comments)

@@ -152,7 +152,7 @@ def split(labels, colours, areas, prior, across, most, least=0.0):
 
 
 def merge(labels, colours, areas, prior, most, least=0.0):
-    """Merge pairs of regions that are each other's best neighbour; arguments and result as of :func:`split`."""
+    """Merge pairs of regions that are each other's best neighbour; arguments and result as in :func:`split`."""
     count = len(areas)
     sums = sum_regions(labels, colours, np.ones(colours.shape[:2], np.bool_), count)
     partners, ratios = choose_merges(adjacent_pairs(labels), sums, prior)
@@ -220,7 +220,7 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as of :func:`fit_regions`."""
+    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as in :func:`fit_regions`."""
     table = simple_point_table()
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)

@@ -35,7 +35,7 @@ MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each p
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
-    """Return the Gaussians of the file, without rows that stand in for missing or broken ones."""
+    """Return the Gaussians of the file, without rows that were added for missing or invalid ones."""
     if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians

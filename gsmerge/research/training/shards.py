@@ -1,4 +1,4 @@
-"""Examples in files: written once, hashed, and read in random order, of which few are in memory.
+"""Examples in files: written once, hashed, and read in random order, with few in memory at a time.
 
 A shard is a safetensors file with one example. A scene's shards are named in a record, a JSON file that is written
 when all of them are; its name is a hash of the scene's files and of the settings. So a call that was interrupted goes
