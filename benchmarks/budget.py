@@ -21,7 +21,7 @@ from shared_scenes import export, read_held_out, scene_folders
 import gsmerge
 from gsmerge.facts.prepare import Frame, canonicalise
 from gsmerge.fit import FitJob, FitOptions, fit
-from gsmerge.moments import Members, scene_members
+from gsmerge.pooling import Members, scene_members
 from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions

@@ -77,7 +77,7 @@ def make_section(records: Sequence[Mapping[str, Any]]) -> str:
     return f"""## The defaults, seed by seed
 
 Made by `python benchmarks/defaults.py`. Held-out views; intervals are 95 % t intervals over the seeds, which decide the
-order of the views, the backgrounds and the held-out blocks.{outside}
+order of the views, the backgrounds and the held-out patches.{outside}
 
 {seeds}
 

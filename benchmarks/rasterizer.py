@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from gsmerge.kernels.raster.blend import SUMS, blend_backward, gather_slots  # noqa: E402
-from gsmerge.raster import composite, contributions, plan_view, prepare, splat_adjoint  # noqa: E402
+from gsmerge.raster import composite, contributions, prepare, splat_adjoint, tile_view  # noqa: E402
 from gsmerge.raster.composite import view_colors  # noqa: E402
 from gsmerge.raster.gradient import color_gradients, gradients_of  # noqa: E402
 from gsmerge.raster.metrics import psnr  # noqa: E402
@@ -76,12 +76,12 @@ class Clock:
         return result
 
 
-def walk_back(plan: Any, image: Any, transmittance: Any, gradient: Any, colors: Any) -> None:
+def walk_back(tiled: Any, image: Any, transmittance: Any, gradient: Any, colors: Any) -> None:
     """The raster's part of :func:`gradients_of`, its own memory included."""
-    slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
-    tiles, none = len(plan.isect_offsets) - 1, np.empty((0, 0), np.float32)
-    blend_backward(*plan.lists, colors, 0, tiles, image, transmittance, gradient, none, slots)
-    gather_slots(plan.flatten_ids, slots, 0, len(plan.ids), np.zeros((len(plan.ids), SUMS), np.float32))
+    slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
+    tiles, none = len(tiled.isect_offsets) - 1, np.empty((0, 0), np.float32)
+    blend_backward(*tiled.lists, colors, 0, tiles, image, transmittance, gradient, none, slots)
+    gather_slots(tiled.flatten_ids, slots, 0, len(tiled.ids), np.zeros((len(tiled.ids), SUMS), np.float32))
 
 
 def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int) -> tuple[dict[str, float], Any]:
@@ -96,31 +96,31 @@ def measure(scene: dict[str, Any], degree: int, sketch: ModuleType, repeats: int
     for _ in range(repeats + 1):
         clock("sketch forward", lambda: raster.forward(theirs))
         clock("sketch backward", lambda: raster.sums(gradient))
-        plan = clock("plan", lambda: plan_view(splats, *view))
-        image, _ = clock("composite", lambda plan=plan: composite(plan))
-        clock("adjoint", lambda plan=plan: splat_adjoint(plan, gradient))
-        clock("contributions", lambda plan=plan: contributions(plan))
-    (image, left), colors = composite(plan), view_colors(plan)
+        tiled = clock("tile", lambda: tile_view(splats, *view))
+        image, _ = clock("composite", lambda tiled=tiled: composite(tiled))
+        clock("adjoint", lambda tiled=tiled: splat_adjoint(tiled, gradient))
+        clock("contributions", lambda tiled=tiled: contributions(tiled))
+    (image, left), colors = composite(tiled), view_colors(tiled)
     shade = None
     for _ in range(repeats + 1):
         clock("sketch backward", lambda: raster.sums(gradient))
-        clock("raster backward", lambda: walk_back(plan, image, left, gradient, colors))
-        expected = clock("gradients", lambda: gradients_of(plan, colors, image, left, gradient, None, False))
+        clock("raster backward", lambda: walk_back(tiled, image, left, gradient, colors))
+        expected = clock("gradients", lambda: gradients_of(tiled, colors, image, left, gradient, None, False))
         shade = clock(
             "color gradients",
-            lambda expected=expected, shade=shade: color_gradients(plan, expected.colors, colors, used=shade),
+            lambda expected=expected, shade=shade: color_gradients(tiled, expected.colors, colors, used=shade),
         )
     return clock.best, image
 
 
 def wall(scene: dict[str, Any], threads: int, repeats: int) -> float:
-    """Best wall milliseconds of plan and composite of one view."""
+    """Best wall milliseconds of tiling and compositing one view."""
     columns = [scene[key] for key in ("means", "quats", "scales", "opacities")]
     splats = prepare(Gaussians(*columns, scene["sh"][:, :1], scene["sh"][:, :0]), np.zeros(3))
     view, clock = (scene["viewmat"], scene["K"], int(scene["width"]), int(scene["height"])), Clock()
     with use_threads(threads):
         for _ in range(repeats):
-            clock("forward", lambda: composite(plan_view(splats, *view)), time.perf_counter)
+            clock("forward", lambda: composite(tile_view(splats, *view)), time.perf_counter)
     return clock.best["forward"]
 
 
@@ -133,7 +133,7 @@ def main() -> None:
         print("nothing to measure: set GSMERGE_SHARED to the folder with golden/ and prototypes/")
         return
     generator, sketch = load(SHARED / "golden" / "scenes.py"), load_sketch()
-    print("| scene | SH | plan | composite | forward | sketch | ratio | adjoint | sketch backward | ratio "
+    print("| scene | SH | tile | composite | forward | sketch | ratio | adjoint | sketch backward | ratio "
           "| contributions | dB |")  # fmt: skip
     print("|-|-|-|-|-|-|-|-|-|-|-|-|")
     speedups, backward = [], []
@@ -144,8 +144,8 @@ def main() -> None:
                 t, image = measure(scene, degree, sketch, args.repeats)
             golden = SHARED / "golden" / f"{name}_sh{degree}_rgb.npy"
             quality = f"{psnr(image, np.load(golden)):.1f}" if golden.is_file() else "-"
-            forward = t["plan"] + t["composite"]
-            print(f"| {name} | {degree} | {t['plan']:.1f} | {t['composite']:.1f} | {forward:.1f} "
+            forward = t["tile"] + t["composite"]
+            print(f"| {name} | {degree} | {t['tile']:.1f} | {t['composite']:.1f} | {forward:.1f} "
                   f"| {t['sketch forward']:.1f} | {forward / t['sketch forward']:.2f} | {t['adjoint']:.1f} "
                   f"| {t['sketch backward']:.1f} | {t['adjoint'] / t['sketch backward']:.2f} "
                   f"| {t['contributions']:.1f} | {quality} |", flush=True)  # fmt: skip

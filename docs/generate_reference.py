@@ -132,10 +132,10 @@ def _cell(text: str | None) -> str:
 def _settings_page() -> str:
     from gsmerge.cli.paths import FileOptions
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.extend import ExtendOptions
     from gsmerge.settings.placement import PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
-    from gsmerge.states.options import ExtendOptions
 
     whole = settings_of(CompactOptions)
     stages = {name: list(flat_settings(one.kind).values()) for name, one in whole.items() if one.is_group}

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from gsmerge.io import read_ply as read_ply
     from gsmerge.io import to_cameras as to_cameras
     from gsmerge.io import write_gaussians as write_gaussians
-    from gsmerge.io import write_levels as write_levels
     from gsmerge.io import write_ply as write_ply
+    from gsmerge.io.formats.streamed import write_levels as write_levels
     from gsmerge.measure.evaluate import Evaluation as Evaluation
     from gsmerge.measure.evaluate import evaluate as evaluate
     from gsmerge.raster import Rendering as Rendering
@@ -54,7 +54,8 @@ _PUBLIC = {
     "compaction.tensors": ("compact_tensors",),
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
-    "io.formats.write": ("write_gaussians", "write_levels", "write_ply"),
+    "io.formats.streamed": ("write_levels",),
+    "io.formats.write": ("write_gaussians", "write_ply"),
     "measure.evaluate": ("Evaluation", "evaluate"),
     "states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),

@@ -28,6 +28,11 @@ class FileSize:
     levels: int = 1  # that are in it, each see LEVEL_FACTOR
 
     @property
+    def packed(self) -> bool:
+        """Whether the bytes depend on the content, so that only trials tell them."""
+        return self.file is not PLY
+
+    @property
     def finest(self) -> int:
         """Approximate bytes that are left for the finest level."""
         return int(self.num_bytes / sum(LEVEL_FACTOR**-level for level in range(self.levels)))

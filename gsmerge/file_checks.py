@@ -13,21 +13,19 @@ from gsmerge.errors import SceneError
 from gsmerge.io import file_notes, read_cameras, read_gaussians
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import as_pinholes, to_cameras
-from gsmerge.io.cameras.colmap import is_colmap
 from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
-from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, read_all_cameras, read_sharp_camera
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras, read_sharp_camera
 from gsmerge.io.formats import ply, spz, streamed
-from gsmerge.io.formats.read import FileInfo, degree_notes, read_level
+from gsmerge.io.formats.read import FileInfo, degree_notes
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import human_bytes
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.no_gaussians import check_scene_file
 from gsmerge.scene.read import load_files
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.states.gsm_file import read_gsm, wrong_checksums
-from gsmerge.states.options import SUFFIX
 from gsmerge.states.state_file import load_state
 
 NETWORKS = ".safetensors"
@@ -177,7 +175,7 @@ def _not_read(names: Sequence[str], remark: str = "") -> list[str]:
 def _read_levels(path: Path) -> FileCheck:
     """Read all levels of an index, one after the other."""
     index = streamed.read_index(path)
-    infos = [read_level(path, level, index).info for level in range(len(index.levels))]
+    infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
     problems = [f"level {level}: {problem}" for level, info in enumerate(infos) for problem in _problems(info)]
     beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))

@@ -282,7 +282,7 @@ def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.nda
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Damping:
     """Steps of :func:`descend`, and how their damping changes."""
 
     steps: int  # at most
@@ -294,29 +294,29 @@ class Schedule:
 
 
 def descend(
-    start: State, error: Callable[[State], float], step: Callable[[State, float], State | None], schedule: Schedule
+    start: State, error: Callable[[State], float], step: Callable[[State, float], State | None], damping: Damping
 ) -> State:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
-    ``step`` moves a state for a given damping; it returns None if it cannot.
+    ``step`` moves a state with an amount of damping; None where it cannot.
     """
-    state, damping = start, schedule.first
+    state, amount = start, damping.first
     least = error(state)
-    for _ in range(schedule.steps):
-        trial = step(state, damping)
+    for _ in range(damping.steps):
+        trial = step(state, amount)
         if trial is None:
             break
         trial_error = error(trial)
         if not trial_error < least:
-            damping *= schedule.brake
-            if damping > schedule.most:
+            amount *= damping.brake
+            if amount > damping.most:
                 break
             continue
         gain = 1 - trial_error / least
         state, least = trial, trial_error
-        if gain < schedule.min_gain:
+        if gain < damping.min_gain:
             break
-        damping *= schedule.ease
+        amount *= damping.ease
     return state
 
 

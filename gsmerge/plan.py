@@ -33,9 +33,8 @@ from gsmerge.settings.stages import (
     SegmentOptions,
 )
 from gsmerge.stages.assign import merge_unseen
-from gsmerge.stages.clean import clean
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import CountLimits, SuperpixelPlan, count_limits, scene_tree
+from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, scene_tree
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -74,7 +73,7 @@ EFFORTS = {
 class Plan:
     """All decisions about a run, made before the first superpixel is cut."""
 
-    superpixels: SuperpixelPlan  # How each view is cut, and into how many
+    superpixels: SuperpixelChoices  # How each view is cut, and into how many
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
@@ -129,7 +128,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     cuts = options.method == OURS and size.num_views > 0  # views into superpixels
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
-            checkpoint = load_networks(options, photos=reference.of_views, aligned=size.aligned)
+            checkpoint = load_networks(options, size)
         asked, options = options, resolve_budget(options, scene)
         segment = _resolve_superpixels(options.segment, scene, EFFORTS[options.effort])
         clean_options = options.clean
@@ -142,16 +141,18 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        whole = plan_whole(size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen))
-        limits = whole.limits
-        fit = _fit_photos(prepared, options, whole.fit)
+        choices = choose_for_scene(
+            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen)
+        )
+        limits = choices.limits
+        fit = _fit_photos(prepared, options, choices.fit)
     tree = None
     searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
-        superpixels=SuperpixelPlan(segment, limits, start_share(fit), tree),
-        match=replace(options.match, match=whole.match),
+        superpixels=SuperpixelChoices(segment, limits, start_share(fit), tree),
+        match=replace(options.match, match=choices.match),
         decode=options.decode,
         fit=fit,
         clean=clean_options,
@@ -169,7 +170,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 @dataclass(frozen=True)
-class WholePlan:
+class SceneChoices:
     """Decisions about a whole scene that cost no computation; a run, its estimate and its blocks share them."""
 
     blocks: int  # Parts in which the scene is compacted; at most, where many views alone ask for them
@@ -184,12 +185,12 @@ class WholePlan:
         return options.to_dict() | {"k": self.decode.k, "match": self.match, "checkpoint": self.checkpoint}
 
 
-def plan_whole(
+def choose_for_scene(
     scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
-) -> WholePlan:
+) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as in :func:`gsmerge.stages.segment.count_limits`.
+    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
     if not scene.photos:
         options = replace(options, fit=replace(options.fit, fit="none"))
@@ -201,16 +202,16 @@ def plan_whole(
     share = limits.share if fit.share is None else fit.share
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    networks = choose_networks(options, photos=scene.photos, aligned=scene.aligned)
-    return WholePlan(choose_blocks(scene, options), decode, limits, match, networks, fit)
+    networks = choose_networks(options, scene)
+    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     """Return the number of blocks for a scene; UsageError if the scene cannot be cut into as many as asked."""
     problems = blocks_problems(scene, options)
-    asked = wanted_blocks(options, *((scene.num_gaussians, scene.num_views) if scene.aligned else (0, 0)))
+    asked = wanted_blocks(options, scene.num_gaussians, scene.num_views)
     if options.blocks.blocks == "auto":
-        asked = min(scene.num_views, asked)
+        asked = 1 if problems else min(scene.num_views, asked)
     if asked <= 1:
         return 1
     if problems:
@@ -267,26 +268,24 @@ def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
 
 
-def choose_networks(options: CompactOptions, *, photos: bool, aligned: bool = True) -> str:
-    """Return the name of the checkpoint to load: the given one, or the shipped one if it improves results.
+def choose_networks(options: CompactOptions, size: SceneSize) -> str:
+    """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
-    The shipped networks improve scenes with one Gaussian per pixel (``aligned``), and other scenes with photos, if no
-    fit follows; a fit gains more from its steps (docs/laboratory/networks.md). ``photos``: whether there are photos to
-    fit to, other than renders of the scene itself.
+    If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
+    fit gains more by further steps (docs/laboratory/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    unfitted = options.fit.fit == "none"
-    return "shipped" if (aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
+    photos, unfitted = size.photos and not size.drawn, options.fit.fit == "none"
+    return "shipped" if (size.aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
-def load_networks(options: CompactOptions, *, photos: bool, aligned: bool) -> Checkpoint | None:
-    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages.
+def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
+    """Load the checkpoint to use, and check that it fits the options; None for the analytic stages alone.
 
-    ``photos``, ``aligned``: see :func:`choose_networks`. SceneError if it is required and cannot be used, UsageError if
-    it does not fit.
+    SceneError if it is required and cannot be used, UsageError if it does not fit.
     """
-    name = choose_networks(options, photos=photos, aligned=aligned)
+    name = choose_networks(options, size)
     if name == "none":
         return None
     from gsmerge.networks.checkpoint import find_checkpoint
@@ -356,7 +355,11 @@ def _merge_unseen(
     if count == 0:
         return unseen[:0], num_input
     merged = merge_unseen(visible, scene, count)
-    return (clean(merged, clean_options, scene, prepared.frame.leave)[0] if clean_options.asked else merged), num_input
+    if clean_options.asked:
+        from gsmerge.stages.clean import clean
+
+        merged, _ = clean(merged, clean_options, scene, prepared.frame.leave)
+    return merged, num_input
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:

@@ -206,7 +206,7 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the scene's curve as a small table: quality of short fits on held-out parts of the photos.
+    """Return the scene's curve as a small table: quality of short fits on held-out patches of the photos.
 
     The row nearest the number of Gaussians in the result is marked; the result may lie between two rows.
     """
@@ -222,7 +222,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
         + (f"  <- the result has {count:,}" if p is nearest else "")
         for p in points
     ]
-    return ["after short fits, on parts of the photos that they left out:", head, *rows]
+    return ["after short fits, on patches of the photos that they left out:", head, *rows]
 
 
 def summary_line(document: Mapping[str, Any]) -> str:

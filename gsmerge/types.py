@@ -330,6 +330,11 @@ class Scene:
         return np.asarray(self.pixel_ids >= 0).reshape(len(self.cameras), self.cameras.height, self.cameras.width)
 
     @property
+    def is_shown(self) -> bool:
+        """Whether photos, or the colours of rows that belong to pixels, show what the views see."""
+        return self.aligned or self.images is not None
+
+    @property
     def num_missing(self) -> int:
         """Number of pixels without a row in the file."""
         return 0 if self.missing is None else int(self.missing.sum())

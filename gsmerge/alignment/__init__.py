@@ -4,24 +4,42 @@
 ``layouts``, or, with pixels missing, from ``ordered_rows`` and ``incomplete``. ``score`` measures readings, ``judge``
 chooses one, and ``explain`` says why none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows
 without pixels, ``upright`` those of rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras.
+What few files need loads at its first use.
 """
 
 # ruff: noqa: F401  names for other packages
 
-from gsmerge.alignment.cameras import move_cameras, other_conventions
-from gsmerge.alignment.dropped_depths import fill_from_depths, guess_depths
-from gsmerge.alignment.estimate import (
-    ESTIMATED,
-    WITH_PHOTOS,
-    estimate_cameras,
-    estimate_from_rows,
-    estimate_with_photos,
-)
-from gsmerge.alignment.explain import explain_misalignment, misalignment_error
-from gsmerge.alignment.focal import estimate_focal
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from gsmerge.alignment.judge import Recovery
-from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, TRIMS, Layout
+from gsmerge.alignment.layouts import ESTIMATED, MAY_BE_UNALIGNED, TRIMS, WITH_PHOTOS, Layout
 from gsmerge.alignment.rotations import choose_rotations, read_rotations
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align
-from gsmerge.alignment.unaligned import check_cameras, choose_poses, find_padding
+
+if TYPE_CHECKING:
+    from gsmerge.alignment.cameras import move_cameras, other_conventions
+    from gsmerge.alignment.dropped_depths import fill_from_depths, guess_depths
+    from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows, estimate_with_photos
+    from gsmerge.alignment.explain import explain_misalignment, misalignment_error
+    from gsmerge.alignment.focal import estimate_focal
+    from gsmerge.alignment.unaligned import check_cameras, choose_poses, find_padding
+
+_LATER = {
+    "cameras": ("move_cameras", "other_conventions"),
+    "dropped_depths": ("fill_from_depths", "guess_depths"),
+    "estimate": ("estimate_cameras", "estimate_from_rows", "estimate_with_photos"),
+    "explain": ("explain_misalignment", "misalignment_error"),
+    "focal": ("estimate_focal",),
+    "unaligned": ("check_cameras", "choose_poses", "find_padding"),
+}
+_HOMES = {name: home for home, names in _LATER.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

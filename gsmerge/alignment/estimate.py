@@ -14,7 +14,17 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.alignment.calibration import calibrate
-from gsmerge.alignment.layouts import DEPTH_SHARE, Layout, da3_box, every_nth, exact_layouts, patch_grids, subsample
+from gsmerge.alignment.layouts import (
+    DEPTH_SHARE,
+    ESTIMATED,
+    WITH_PHOTOS,
+    Layout,
+    da3_box,
+    every_nth,
+    exact_layouts,
+    patch_grids,
+    subsample,
+)
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
 from gsmerge.alignment.stretches import UNIQUE, base_colors, byte_colors, place_stretch, shown_colors
@@ -22,9 +32,7 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_ca
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, resize_to
 from gsmerge.types import Cameras, Gaussians
 
-ESTIMATED = "estimated from the grid"  # source of estimated cameras
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
-WITH_PHOTOS = "estimated from rows and photos"  # of the cameras
 _STRETCH = 96  # rows that are compared with a photo
 _STRETCHES = 60  # of a view
 _PER_STRETCH = 12  # rows of each that cameras are estimated from
@@ -149,7 +157,7 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
             high = min(len(inside), start - first + unsure + dropped + _SLACK)
             if start >= 0 and low < high:
                 matches.append((start, *place_stretch(shown, colors[:, start : start + length], low, high)))
-        placed = _agreeing(np.array(matches, np.int64).reshape(-1, 4))
+        placed = _choose_agreeing(np.array(matches, np.int64).reshape(-1, 4))
         if not len(placed):
             return None
         within = np.linspace(0, length - 1, _PER_STRETCH).astype(int)
@@ -160,14 +168,14 @@ def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | N
         first = start + length + left // 2
         unsure = left // 2 + length
     width, height = grid.transform.width, grid.transform.height
-    blocks = tuple(range(len(grid.views)))
-    return Layout("", "pruned", "view-major", width, height, blocks, tuple(rows), tuple(pixels))
+    views = tuple(range(len(grid.views)))
+    return Layout("", "pruned", "view-major", width, height, views, tuple(rows), tuple(pixels))
 
 
-def _agreeing(stretches: np.ndarray) -> np.ndarray:
-    """Choose the stretches ``[s,4]`` that are unique and in order; empty if there are few.
+def _choose_agreeing(stretches: np.ndarray) -> np.ndarray:
+    """Choose the stretches ``[s,4]`` that are unique and in order; none if few are.
 
-    Their columns are the row, the place, the cost there, and the cost at the next best place.
+    Their columns are row, place, sum and the next best sum.
     """
     if not len(stretches):
         return stretches

@@ -52,8 +52,8 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
             pairs = pairs.select(pairs.views == 0)
             pose = None if reason else solve_pose(pairs, 0, cameras.Ks[0])
             # a pose that takes up most of wrong intrinsics, too, shows that the rows are pixels of some camera
-            posed = None if pose is None else replace(cameras[:1], viewmats=pose[None])
-            is_grid = posed is not None and median(pixel_errors(pairs, posed)) < 4 * alignment.limit_px
+            own_camera = None if pose is None else replace(cameras[:1], viewmats=pose[None])
+            is_grid = own_camera is not None and median(pixel_errors(pairs, own_camera)) < 4 * alignment.limit_px
             if reason or is_grid:
                 raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"
@@ -120,8 +120,10 @@ def explain_misalignment(
         mirrored = input_viewmats.copy()
         mirrored[:, axis] *= -1
         readings.append((f"the cameras fit with the {words}", mirrored))
-    scaled = [f for f in frames if f.kind == "scaled"]
-    readings += [(f"the cameras fit with their {f.description}", f.move_viewmats(input_viewmats)) for f in scaled]
+    scaled = [frame for frame in frames if frame.kind == "scaled"]
+    readings += [
+        (f"the cameras fit with their {frame.description}", frame.move_viewmats(input_viewmats)) for frame in scaled
+    ]
     for reason, viewmats in readings:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason

@@ -115,10 +115,7 @@ def _intrinsics_of_rays(
 
 
 def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:
-    """Solve for intrinsics (fx, fy, cx, cy) and return the largest median distance of a block, pixels, with them.
-
-    The distance is inf on failure.
-    """
+    """Solve for (largest median distance of a part, (fx, fy, cx, cy)), pixels; inf on failure."""
     poses = viewmats[pairs.views]
     turned = matmul(poses[:, :3, :3], pairs.points[:, :, None])[..., 0]
     camera = turned + poses[:, :3, 3]
@@ -127,8 +124,8 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
         return math.inf, ()
     slopes = camera[front, :2] / camera[front, 2:]
     (fx, fy), (cx, cy), errors = fit_lines(slopes, pairs.pixels[front])
-    blocks = pairs.blocks[front]
-    worst = max(float(np.median(errors[blocks == block])) for block in np.unique(blocks))
+    parts = pairs.parts[front]
+    worst = max(float(np.median(errors[parts == part])) for part in np.unique(parts))
     uneven = fx / fy if 0 < fx < math.inf and 0 < fy < math.inf else math.inf
     if not (math.isfinite(worst) and 1 / _MAX_UNEVEN < uneven < _MAX_UNEVEN):
         return math.inf, ()

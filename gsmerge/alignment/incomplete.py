@@ -16,7 +16,7 @@ from gsmerge.alignment.layouts import Layout
 from gsmerge.alignment.ordered_rows import (
     FAR,
     FAR_PX,
-    MIN_BLOCK,
+    MIN_RUN,
     ProjectedRows,
     concentrated_scale,
     finer_scale,
@@ -180,7 +180,7 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | N
 
     Chance is measured at pixel corners, and in the second nearest view, which cameras side by side have in common.
     """
-    if len(rows) < MIN_BLOCK:
+    if len(rows) < MIN_RUN:
         return None
     sample = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.int64))
     few, _ = _distances(rows, sample[::_FEW])

@@ -24,10 +24,10 @@ from gsmerge.alignment.score import (
 from gsmerge.errors import SceneError
 
 COLOR_MARGIN = 1.5  # by which the colours must beat the next reading's and shuffled ones, where pixels do not decide
-_UNCONFIRMED = 0.9  # of the colours' distance from shuffled pixels: as good as random
-_VARIES = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
-_ALIKE, _ALIKE_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
-_CERTAIN_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
+_RANDOM_SHARE = 0.9  # of the colours' distance from shuffled pixels: as good as random
+_MIN_SHUFFLED_COLOR = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
+_SAME, _SAME_PX = 1.15, 0.02  # two fits of one grid between which only the photos' colours can decide
+_WRONG_SIZE_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ def accept_reading(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recov
     margin = min(shuffled_px, math.inf if runner_up is None else runner_up.worst_px) / px
     if not close:
         confirmed = None  # where colours hardly vary, or there are no photos
-        if shuffled_color > _VARIES:
-            confirmed = color_error(inputs, best.layout) <= _UNCONFIRMED * shuffled_color
+        if shuffled_color > _MIN_SHUFFLED_COLOR:
+            confirmed = color_error(inputs, best.layout) <= _RANDOM_SHARE * shuffled_color
         return Recovery(best, runner_up, margin, None, confirmed)
     color, next_color = colors[chosen], min(colors[second], shuffled_color)  # NaN without photos: nothing is accepted
-    if not (next_color > _VARIES and next_color >= COLOR_MARGIN * color):
+    if not (next_color > _MIN_SHUFFLED_COLOR and next_color >= COLOR_MARGIN * color):
         return None
     return Recovery(best, runner_up, margin, next_color / max(color, 1e-3), True)
 
@@ -105,7 +105,7 @@ class Fit:
     def is_doubtful(self) -> bool:
         """Whether a grid of another size may fit as well, since borders are cut off and the scale is solved for."""
         best = self.recovery.best
-        return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _CERTAIN_PX
+        return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _WRONG_SIZE_PX
 
 
 def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -> Fit | None:
@@ -126,13 +126,13 @@ def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -
     exact = best.recovery.best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
     if exact and any(fit.grid.size != best.grid.size for fit in rivals):
         return None
-    near = max(_ALIKE * best.px, best.px + _ALIKE_PX)
+    near = max(_SAME * best.px, best.px + _SAME_PX)
     same = (fit for fit in fits if fit.grid.camera_file is best.grid.camera_file and fit.grid.size == best.grid.size)
-    alike = [fit for fit in same if fit.px <= near]
-    if len(alike) == 1:
+    same_px = [fit for fit in same if fit.px <= near]
+    if len(same_px) == 1:
         return best
-    errors = [color_error(read(fit.grid), fit.recovery.best.layout) for fit in alike]
-    return alike[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
+    errors = [color_error(read(fit.grid), fit.recovery.best.layout) for fit in same_px]
+    return same_px[int(np.argmin(np.nan_to_num(errors, nan=1.0)))]
 
 
 def _refine(inputs: AlignmentInput, reading: Reading) -> Reading:
@@ -142,7 +142,7 @@ def _refine(inputs: AlignmentInput, reading: Reading) -> Reading:
 
 
 def _differs(layout: Layout, other: Layout) -> bool:
-    """Return whether two layouts put rows into different pixels, on a sample of each block."""
+    """Return whether two layouts put rows to different pixels, judged by some rows of each part."""
     if layout.views != other.views or [r.size for r in layout.rows] != [r.size for r in other.rows]:
         return True
     a, b = subsample(layout, 200), subsample(other, 200)

@@ -16,6 +16,7 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resiz
 from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
+ESTIMATED, WITH_PHOTOS = "estimated from the grid", "estimated from rows and photos"  # sources of estimated cameras
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
@@ -30,17 +31,17 @@ _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small on
 
 @dataclass(frozen=True)
 class Layout:
-    """The pixel of each row, block by block; a block is one view, or one layer of a view."""
+    """The pixel of each row, part by part; a part is one view, or one layer of a view."""
 
     description: str  # what it is, for people
     kind: str  # "full", "trim", "box", "box+depth" or "pruned": which pixels there are
     order: str  # in which order the rows are
     width: int  # of the grid, pixels
     height: int
-    views: tuple[int, ...]  # the camera of each block
-    rows: tuple[np.ndarray, ...]  # the rows of each block, of any shape: not a copy where a stride will do
+    views: tuple[int, ...]  # the camera of each part
+    rows: tuple[np.ndarray, ...]  # the rows of each part, of any shape: not a copy where a stride will do
     pixels: tuple[np.ndarray, ...]  # ``[p]`` the pixel ``y·W + x`` of each of these rows
-    per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a block
+    per_pixel: int = 1  # Gaussians per pixel; above 1 each layer is a part
 
     def with_views_in(self, orders: Iterable[Sequence[int]]) -> Iterator[Layout]:
         """Yield copies of the layout with the views permuted by each of the ``orders``."""
@@ -53,12 +54,12 @@ class Layout:
         return self.kind == "full" and self.order == "view-major" and self.per_pixel == 1
 
     def pixel_ids(self, count: int) -> np.ndarray:
-        """Return the pixel ``(block·H + y)·W + x`` of each of ``count`` rows; -1 for rows without one."""
+        """Return the pixel ``(part·H + y)·W + x`` of each of ``count`` rows; -1 for rows without one."""
         if self.is_plain:
             return np.arange(count, dtype=_row_type(count))
         ids = np.full(count, -1, np.int64)
-        for block, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
-            ids[rows.reshape(-1)] = block * self.width * self.height + pixels
+        for part, (rows, pixels) in enumerate(zip(self.rows, self.pixels, strict=True)):
+            ids[rows.reshape(-1)] = part * self.width * self.height + pixels
         return ids
 
 
@@ -128,14 +129,14 @@ def plain_layout(views: int, width: int, height: int) -> Layout:
 def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[Layout]:
     """Yield the layouts with exactly ``count`` rows and at most ``views`` views.
 
-    The cameras of the blocks are a first guess: in order, or every n-th camera.
+    The cameras of the parts are a first guess: in order, or every n-th of them.
     """
     for box in boxes(width, height):
         for per_pixel in PER_PIXEL:
-            blocks, remainder = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
-            if remainder or not 1 <= blocks <= views:
+            num_used, remainder = divmod(count, (height - 2 * box.top) * (width - 2 * box.left) * per_pixel)
+            if remainder or not 1 <= num_used <= views:
                 continue
-            chosen = next((ids for ids in every_nth(views) if len(ids) == blocks), tuple(range(blocks)))
+            chosen = next((ids for ids in every_nth(views) if len(ids) == num_used), tuple(range(num_used)))
             yield from _orders(count, box, per_pixel, chosen, width, height)
 
 
@@ -154,16 +155,16 @@ def _orders(
     count: int, box: KeptBox, per_pixel: int, views: tuple[int, ...], width: int, height: int
 ) -> Iterator[Layout]:
     index, grid = np.arange(count, dtype=_row_type(count)), box.pixels(width, height)
-    rows, columns, blocks = *grid.shape, len(views)
+    rows, columns, num_views = *grid.shape, len(views)
     arranged = {
-        "view-major": index.reshape(blocks, rows, columns, per_pixel).transpose(0, 3, 1, 2),
-        "view-fastest": index.reshape(rows, columns, per_pixel, blocks).transpose(3, 2, 0, 1),
-        "column-major": index.reshape(blocks, columns, rows, per_pixel).transpose(0, 3, 2, 1),
-        "layer-major": index.reshape(per_pixel, blocks, rows, columns).transpose(1, 0, 2, 3),
+        "view-major": index.reshape(num_views, rows, columns, per_pixel).transpose(0, 3, 1, 2),
+        "view-fastest": index.reshape(rows, columns, per_pixel, num_views).transpose(3, 2, 0, 1),
+        "column-major": index.reshape(num_views, columns, rows, per_pixel).transpose(0, 3, 2, 1),
+        "layer-major": index.reshape(per_pixel, num_views, rows, columns).transpose(1, 0, 2, 3),
     }
     layers = f", {per_pixel} Gaussians per pixel" if per_pixel > 1 else ""
     for order, ids in arranged.items():
-        if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and blocks == 1):
+        if (order == "layer-major" and per_pixel == 1) or (order == "view-fastest" and num_views == 1):
             continue
         yield Layout(
             description=f"{box.description}{layers}, {order}",
@@ -172,8 +173,8 @@ def _orders(
             width=width,
             height=height,
             views=tuple(view for view in views for _ in range(per_pixel)),
-            rows=tuple(layer for block in ids for layer in block),
-            pixels=(grid.reshape(-1),) * (blocks * per_pixel),
+            rows=tuple(layer for layers in ids for layer in layers),
+            pixels=(grid.reshape(-1),) * (num_views * per_pixel),
             per_pixel=per_pixel,
         )
 
@@ -204,13 +205,13 @@ def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
     return []
 
 
-def subsample(layout: Layout, per_block: int) -> Layout:
-    """Thin a layout to about ``per_block`` rows of each block, spread over all columns and rows."""
+def subsample(layout: Layout, per_part: int) -> Layout:
+    """Thin a layout to about ``per_part`` rows of each part, spread over all columns and rows."""
     rows, pixels = [], []
-    for block_rows, block_pixels in zip(layout.rows, layout.pixels, strict=True):
-        chosen = np.arange(0, block_rows.size, spread_step(-(-block_rows.size // per_block), layout.width))
-        rows.append(block_rows.flat[chosen])
-        pixels.append(block_pixels[chosen])
+    for part_rows, part_pixels in zip(layout.rows, layout.pixels, strict=True):
+        chosen = np.arange(0, part_rows.size, spread_step(-(-part_rows.size // per_part), layout.width))
+        rows.append(part_rows.flat[chosen])
+        pixels.append(part_pixels[chosen])
     return replace(layout, rows=tuple(rows), pixels=tuple(pixels))
 
 

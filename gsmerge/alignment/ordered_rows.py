@@ -18,16 +18,16 @@ from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.view_paths import cheapest_views
 from gsmerge.types import Cameras
 
-MIN_BLOCK = 500  # rows of a view; fewer cannot be distinguished from noise
+MIN_RUN = 500  # rows of a view; fewer cannot be distinguished from noise
 WINDOW = 40  # rows averaged on either side of a restart
 RESTART = 0.25  # of the image's height: how far back a restart goes at least
-SHORT = 1500  # rows that say which view a block is of
+SHORT = 1500  # rows that say which view a run is of
 SCALES = np.geomspace(1 / 30, 30, 69)  # of the cameras' positions, tried in turn
 SPAN = 1.25  # factor by which the first guess of the scale may be off
 MAX_SCALES = 400  # that are tried
-TRIED_BLOCKS, STRETCH = 4, 2000  # blocks, and rows of each in a row, that a scale is tried on
+TRIED_RUNS, STRETCH = 4, 2000  # runs, and rows of each in a row, that a scale is tried on
 _SMALL = 1e-6  # weight of a point that says nothing
-_MAX_UNEVENNESS = 10.0  # of one block, so that no single one decides
+_MAX_UNEVENNESS = 10.0  # of one run, so that no single one decides
 FAR_PX, FAR = 10.0, 0.1  # pixels, and share of the shorter side, beyond which no finer scale helps
 MAX_BACK = 0.01  # share of the steps that may go back; of rows in no such order a quarter or more do
 MIN_CHANGES = 0.3  # share of the steps that change the view: fewer are views one after the other
@@ -93,18 +93,18 @@ class ProjectedRows:
 
 def read_view_major(rows: ProjectedRows) -> Layout | None:
     """Find the pixel of every row in a file that stores view after view; None if the views' rows cannot be found."""
-    blocks = _find_blocks(rows)
-    if blocks is None:
+    runs = _find_runs(rows)
+    if runs is None:
         return None
     width, height = rows.cameras.width, rows.cameras.height
     parts = []
-    for view, ids in blocks:
+    for view, ids in runs:
         u, v = rows.project(ids, view)
         pixels = assign_pixels(u, v, width, height)
         if not _distance(u, v, pixels, width) <= max(FAR_PX, FAR * min(width, height)):
             return None
         parts.append((view, ids, pixels))
-    return rows.layout("view-major", parts, missing=len(blocks) * width * height - len(rows))
+    return rows.layout("view-major", parts, missing=len(runs) * width * height - len(rows))
 
 
 def _distance(u: np.ndarray, v: np.ndarray, pixels: np.ndarray, width: int) -> float:
@@ -114,8 +114,8 @@ def _distance(u: np.ndarray, v: np.ndarray, pixels: np.ndarray, width: int) -> f
     return float(np.median(np.where(np.isfinite(away), away, width)))
 
 
-def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
-    """Find view and rows of each block, with views in rising order; None if the rows do not look like blocks."""
+def _find_runs(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
+    """Find (view, rows) of each run, views increasing; None if the rows do not look like runs."""
     count, views, largest = len(rows), len(rows.cameras), rows.cameras.width * rows.cameras.height
     start, view = 0, -1
     parts: list[np.ndarray] = []
@@ -127,8 +127,8 @@ def _find_blocks(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
             return None
         later = cost[view + 1 :]
         view = view + 1 + int(np.argmin(later)) if np.isfinite(later).any() else int(np.argmin(cost))
-        end = _block_end(rows, start, min(count, start + largest), view)
-        if end - start < MIN_BLOCK:
+        end = _run_end(rows, start, min(count, start + largest), view)
+        if end - start < MIN_RUN:
             return None
         parts.append(np.arange(start, end, dtype=np.int64))
         costs.append(cost)
@@ -162,8 +162,8 @@ def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
     return float(abs(np.median(du[good]) - 1) + np.median(np.abs(du[good] - 1)) + np.median(np.abs(dv[good])))
 
 
-def _block_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
-    """Find the first row after a block: where the projection clearly starts again, at the steepest step."""
+def _run_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
+    """Find the row after the last one of the run: the first clear restart, at its steepest step."""
     height = rows.cameras.height
     _, v = rows.project(np.arange(start, stop), view)
     v = np.clip(np.nan_to_num(v, nan=0.0), -height, 2 * height)
@@ -251,7 +251,7 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     Small moves do not change the assignment, so scales are tried in steps that move most rows by at most a quarter of a
     pixel.
     """
-    chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_BLOCKS).astype(int))
+    chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_RUNS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]
     parts = [(layout.views[b], layout.rows[b][a : a + STRETCH]) for b, a in zip(chosen, starts, strict=True)]
 
@@ -285,7 +285,7 @@ def concentrated_scale(rows: ProjectedRows) -> float | None:
     None if no scale within a factor of 30 concentrates them beyond chance.
     """
     views = len(rows.cameras)
-    if not 1 < views <= MAX_SCALED_VIEWS or len(rows) < MIN_BLOCK * views:
+    if not 1 < views <= MAX_SCALED_VIEWS or len(rows) < MIN_RUN * views:
         return None
     limit = log(float(SCALES[-1]))
     grid = exp(np.arange(-limit, limit, _SCALE_STEP))
@@ -332,7 +332,7 @@ def read_view_fastest(rows: ProjectedRows) -> Layout | None:
     changes views.
     """
     count, views = len(rows), len(rows.cameras)
-    if not 1 < views <= MAX_PATH_VIEWS or count < MIN_BLOCK * views or count * views > MAX_CELLS:
+    if not 1 < views <= MAX_PATH_VIEWS or count < MIN_RUN * views or count * views > MAX_CELLS:
         return None
     if count > PROBES * PROBE:  # a few pieces quickly show the many files that have no such order
         starts = np.linspace(0, count - PROBE, PROBES).astype(int)
@@ -349,7 +349,7 @@ def read_view_fastest(rows: ProjectedRows) -> Layout | None:
         first = np.unique(chosen_pixel[ids], return_index=True)[1]  # a step back may come to a pixel twice
         ids = ids[np.sort(first)]
         parts.append((view, ids, chosen_pixel[ids].astype(np.int64)))
-    if min(len(ids) for _, ids, _ in parts) < MIN_BLOCK:
+    if min(len(ids) for _, ids, _ in parts) < MIN_RUN:
         return None
     return rows.layout("view-fastest", parts, missing=views * rows.cameras.width * rows.cameras.height - count)
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.incomplete import read_incomplete
 from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
@@ -43,15 +42,15 @@ def read_grid(inputs: AlignmentInput, *, exact_frames: bool = False) -> list[Rea
     ``exact_frames``: try only cameras in the frame of their file, and files without missing pixels, which is quick.
     """
     readings: list[Reading] = []
-    for tier in _tiers(inputs, exact_frames=exact_frames):
-        readings += tier
+    for round_readings in _rounds(inputs, exact_frames=exact_frames):
+        readings += round_readings
         if any(reading.ok for reading in readings):
             return readings
     return []
 
 
-def _tiers(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
-    """Yield lists of readings of equal effort, the cheap ones first."""
+def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Reading]]:
+    """Yield rounds of readings that cost about as much, the cheap first."""
     finite = int(inputs.valid.sum())
     if inputs.order == "none" or (finite < ENOUGH and finite < FEW * len(inputs.gaussians)):
         return
@@ -61,6 +60,8 @@ def _tiers(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Readi
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
     if not exact_frames:
+        from gsmerge.alignment.incomplete import read_incomplete  # of the few files that lack rows
+
         yield from ([reading] for reading in read_incomplete(inputs))
 
 
@@ -85,8 +86,8 @@ def is_seen(inputs: AlignmentInput, layouts: Sequence[Layout]) -> bool:
 def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
     limit = max(_SEEN_LIMITS * pixel_limit(layout.width, layout.height), _SEEN_SHARE * min(layout.width, layout.height))
     count = len(layout.views)
-    for block in sorted({0, count // 2, count - 1}):
-        part = replace(layout, views=(0,), rows=layout.rows[block : block + 1], pixels=layout.pixels[block : block + 1])
+    for i in sorted({0, count // 2, count - 1}):
+        part = replace(layout, views=(0,), rows=layout.rows[i : i + 1], pixels=layout.pixels[i : i + 1])
         pairs = inputs.pairs(subsample(part, _SEEN_SAMPLES))
         if projective_error(pairs.points, pairs.pixels) <= limit:
             return True
@@ -139,14 +140,14 @@ def best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int
 
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | None:
-    """Find for each block the camera that shows it nearest to its pixels; None where two blocks choose the same."""
+    """Find for each part the camera into whose pixels it projects best; None where two choose the same."""
     pairs = inputs.pairs(subsample(layout, 300))
     chosen = []
-    for block in range(len(layout.views)):
-        block_pairs = pairs.select(pairs.blocks == block)
-        if not len(block_pairs.rows):
+    for part in range(len(layout.views)):
+        part_pairs = pairs.select(pairs.parts == part)
+        if not len(part_pairs.rows):
             return None
-        views = (np.full(len(block_pairs.rows), view) for view in range(len(inputs.cameras)))
-        errors = [median(pixel_errors(replace(block_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
+        views = (np.full(len(part_pairs.rows), view) for view in range(len(inputs.cameras)))
+        errors = [median(pixel_errors(replace(part_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
         chosen.append(int(np.argmin(errors)))
     return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None

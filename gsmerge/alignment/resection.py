@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.geometry import Schedule, descend, motion_matrices, robust_weights
+from gsmerge.geometry import Damping, descend, motion_matrices, robust_weights
 from gsmerge.kernels import reproject
 from gsmerge.kernels.matrices import eigh, matmul, solve
 
-SCHEDULE = Schedule(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
+DAMPING = Damping(steps=30, first=1e-3, ease=0.1, brake=10.0, most=1e8, min_gain=1e-10)
 MAX_STRETCH = 0.5  # of the focal length, in a step
 ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4  # numbers of the intrinsics: fx = fy; fx, fy; fx, fy, cx, cy
 _Fit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]  # intrinsics, poses, equations
@@ -61,7 +61,7 @@ def refine_poses(
             change, motions = _step(curvature, slope, damping)
             return fit(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
 
-    K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, SCHEDULE)
+    K, poses, _ = descend(fit(K, poses), lambda state: state[2][2], step, DAMPING)
     return K, poses
 
 

@@ -58,7 +58,7 @@ def _calibrate_layouts(
     fits = []
     for layout in layouts:
         count = len(layout.views)
-        if all(_fits(means, valid, layout, block) for block in {0, count // 2, count - 1}):
+        if all(_shows_part(means, valid, layout, i) for i in {0, count // 2, count - 1}):
             samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // count, _MAX_SAMPLES // 10))
             pairs = find_correspondences(means, valid, _thin(layout, samples))
             calibration = calibrate(pairs, layout.width, layout.height)
@@ -66,18 +66,18 @@ def _calibrate_layouts(
     return fits
 
 
-def _fits(means: np.ndarray, valid: np.ndarray, layout: Layout, block: int) -> bool:
-    """Return whether a projective camera shows the rows of a block in their pixels."""
-    rows, pixels = (part[block : block + 1] for part in (layout.rows, layout.pixels))
+def _shows_part(means: np.ndarray, valid: np.ndarray, layout: Layout, index: int) -> bool:
+    """Return whether a projective camera shows the rows of a part in their pixels."""
+    rows, pixels = (arrays[index : index + 1] for arrays in (layout.rows, layout.pixels))
     part = _thin(replace(layout, views=(0,), rows=rows, pixels=pixels), _SAMPLES)
     pairs = find_correspondences(means, valid, part)
     return projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height)
 
 
 def _thin(layout: Layout, samples: int) -> Layout:
-    """Reduce a layout of every pixel to a sample of pixels in each block."""
+    """Thin a layout of every pixel to some pixels of each part."""
     chosen = _spread(samples, layout.width, layout.height)
-    rows = tuple(block_rows.flat[chosen] for block_rows in layout.rows)
+    rows = tuple(part_rows.flat[chosen] for part_rows in layout.rows)
     return replace(layout, rows=rows, pixels=(chosen,) * len(rows))
 
 
@@ -90,10 +90,10 @@ def _spread(count: int, width: int, height: int) -> np.ndarray:
 
 def _layouts(count: int, width: int, height: int, by_column: bool) -> Iterator[Layout]:
     """Yield the layouts of grids of a size without borders."""
-    blocks = count // (width * height)
+    num_parts = count // (width * height)
     for per_pixel in PER_PIXEL:
-        if blocks % per_pixel == 0:
-            layouts = full_layouts(blocks // per_pixel, per_pixel, width, height)
+        if num_parts % per_pixel == 0:
+            layouts = full_layouts(num_parts // per_pixel, per_pixel, width, height)
             yield from (layout for layout in layouts if by_column == (layout.order == "column-major"))
 
 

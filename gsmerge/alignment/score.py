@@ -51,16 +51,16 @@ class Correspondences:
     points: np.ndarray  # ``[t,3]`` float64 means
     pixels: np.ndarray  # ``[t,2]`` pixel centres (x, y)
     views: np.ndarray  # ``[t]`` rows of the camera arrays
-    blocks: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
+    parts: np.ndarray  # ``[t]`` what wrote them, in order: a view, or one layer of it
     rows: np.ndarray  # ``[t]`` of the file
 
     def select(self, index: np.ndarray) -> Correspondences:
         """Select rows by a mask or indices."""
         return Correspondences(*(column[index] for column in vars(self).values()))
 
-    def split(self, values: np.ndarray, blocks: int) -> list[np.ndarray]:
-        """Split ``values [t,...]`` into one array per block."""
-        return np.split(values, np.cumsum(np.bincount(self.blocks, minlength=blocks))[:-1])
+    def split(self, values: np.ndarray, parts: int) -> list[np.ndarray]:
+        """Split ``values [t,...]`` into one array per part."""
+        return np.split(values, np.cumsum(np.bincount(self.parts, minlength=parts))[:-1])
 
 
 def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
@@ -228,12 +228,12 @@ class AlignmentInput:
 def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -> Correspondences:
     """Return the valid rows of a layout (``means [n,3]``, ``valid [n]``) with their pixels and views."""
     rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
-    blocks = np.repeat(np.arange(len(layout.views)), [len(block_rows) for block_rows in layout.rows])
+    parts = np.repeat(np.arange(len(layout.views)), [len(part_rows) for part_rows in layout.rows])
     good = valid[rows]
-    rows, pixels, blocks = rows[good], pixels[good], blocks[good]
+    rows, pixels, parts = rows[good], pixels[good], parts[good]
     y, x = np.divmod(pixels, layout.width)
     points = gather(means, rows).astype(np.float64)
-    return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[blocks], blocks, rows)
+    return Correspondences(points, np.stack([x, y], 1) + 0.5, np.array(layout.views)[parts], parts, rows)
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def score_layout(
 
 
 def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
-    """Measure median distance (pixels) and mean colour distance with the pixels of each block shuffled."""
+    """Measure median distance (pixels) and mean colour distance with pixels shuffled in each part, for comparison."""
     rng, layout = np.random.default_rng(0), sample_layout(best.layout)
     pairs = inputs.pairs(replace(layout, pixels=tuple(rng.permutation(pixels) for pixels in layout.pixels)))
     errors = pixel_errors(pairs, best.frame.move(inputs.cameras))

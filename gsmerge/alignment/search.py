@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.cameras import describe_reading, max_pixels, move_cameras, other_conventions
-from gsmerge.alignment.estimate import ESTIMATED, WITH_PHOTOS
-from gsmerge.alignment.explain import explain_count
 from gsmerge.alignment.judge import Fit, Recovery, accept_reading, choose_fit
 from gsmerge.alignment.layouts import (
+    ESTIMATED,
     MAY_BE_UNALIGNED,
+    WITH_PHOTOS,
     GridFit,
     Layout,
     check_photo_size,
@@ -28,8 +28,6 @@ from gsmerge.alignment.layouts import (
 )
 from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
 from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
-from gsmerge.alignment.unaligned import check_cameras, choose_cameras
-from gsmerge.alignment.upright import solve_upright, upright_error, upright_rotation
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -38,7 +36,7 @@ from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_f
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
-_LARGE = 2  # times as many pixels as rows: likely photos of another size than the grid's
+_MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _MAX_TRIED = 6  # grids that only the number of rows speaks for and that are tried with all frames
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 
@@ -47,8 +45,8 @@ _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
 class AlignmentResult:
     """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
 
-    # ``[n]`` int64, the pixel ``(block·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
-    # A block is a view, or one layer of a view with several Gaussians per pixel
+    # ``[n]`` int64, the pixel ``(part·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
+    # A part is a view, or one layer of a view with several Gaussians per pixel
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
     images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
@@ -61,12 +59,12 @@ class AlignmentResult:
 
     @property
     def layout(self) -> Layout | None:
-        """Pixel of each row, block by block; None for rows without pixels."""
+        """Pixel of each row, part by part; None for rows without pixels."""
         return None if self.recovery is None else self.recovery.best.layout
 
     @property
     def views(self) -> tuple[int, ...]:
-        """Camera of each block; for rows without pixels, all cameras."""
+        """Camera of each part; for rows without pixels, all cameras."""
         return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
 
 
@@ -80,15 +78,15 @@ class _Source:
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
-    seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`may_be`
+    seen: dict[Size, bool] = field(default_factory=dict)  # what is known of :meth:`could_show`
 
     @cached_property
     def images(self) -> np.ndarray:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
         return as_floats(self.photos)
 
-    def may_be(self, grid: GridFit) -> bool:
-        """Return whether any cameras could show the rows as pixels of the grid; results are cached by size."""
+    def could_show(self, grid: GridFit) -> bool:
+        """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
         if grid.size not in self.seen:
             inputs = self.inputs(grid, photos=False)
             self.seen[grid.size] = is_seen(inputs, possible_layouts(inputs))
@@ -160,12 +158,16 @@ def align(
         if fit is None:
             raise
     else:
-        fit = source.choose(_fits(source, grid))
+        fit = source.choose(_fit_rounds(source, grid))
     return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
 
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
     """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
+    from gsmerge.alignment.explain import explain_count
+    from gsmerge.alignment.unaligned import choose_cameras
+    from gsmerge.alignment.upright import upright_rotation
+
     info, camera_file = source.ply.info, source.camera_file
     if source.order not in MAY_BE_UNALIGNED:
         check_photo_size(info, camera_file, photo_size(source.photos))
@@ -184,8 +186,10 @@ def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequenc
 
 def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
-    for fitted in (grid, *square_grids(grid)) if len(source.photos) else ():
-        inputs = source.inputs(fitted)
+    from gsmerge.alignment.upright import solve_upright, upright_error
+
+    for candidate in (grid, *square_grids(grid)) if len(source.photos) else ():
+        inputs = source.inputs(candidate)
         frame = solve_upright(inputs, rotation)
         if frame is not None:
             break
@@ -194,27 +198,27 @@ def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> Alig
     moved = replace(inputs, cameras=frame.move(inputs.cameras), scale=None)
     recovery = accept_reading(moved, read_grid(moved))
     if recovery is not None:
-        return _make_result(source, Fit(fitted, replace(recovery, best=replace(recovery.best, frame=frame))))
+        return _make_result(source, Fit(candidate, replace(recovery, best=replace(recovery.best, frame=frame))))
     return AlignmentResult(
         None,
         moved.cameras,
         inputs.images,
         replace(source.camera_file, viewmats=moved.cameras.viewmats),
-        (*fitted.notes, f"the cameras are {frame.description}, as the photos' colours show"),
-        fitted.transform,
+        (*candidate.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        candidate.transform,
         problem="expected one Gaussian per pixel, found rows that were merged",
     )
 
 
-def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
+def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     """Yield rounds of fits that compete, the likely ones first.
 
-    Grids have the size of the photos, then other sizes; poses are as stored, moved, and in other conventions.
+    Grids are of the photos' size and of others; poses are as stored, moved, and in other conventions.
     """
     if source.order == "none":
         return
     other_sizes = _fit_other_sizes(source)
-    large = len(grid.cameras) * math.prod(grid.size) > _LARGE * len(source.ply.gaussians)
+    large = len(grid.cameras) * math.prod(grid.size) > _MANY_PIXELS * len(source.ply.gaussians)
     if large:
         yield next(other_sizes, [])
     fits = source.fit([grid])
@@ -225,6 +229,8 @@ def _fits(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
         yield _fit_moved(source, grid)
     if not large:
         yield next(other_sizes, [])
+    from gsmerge.alignment.unaligned import check_cameras  # few files come here
+
     rows = source.ply.gaussians, source.ply.valid
     grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
     yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
@@ -265,8 +271,8 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
     if best is None or not best.worst_px <= max_pixels(*grid.size):
         return []
     for other in _conventions(source.camera_file):
-        posed = replace(inputs, cameras=_with_poses(grid, other).cameras)
-        if score_layout(posed, best.layout, IDENTITY).ok:
+        other_inputs = replace(inputs, cameras=_with_poses(grid, other).cameras)
+        if score_layout(other_inputs, best.layout, IDENTITY).ok:
             return []
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
     moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
@@ -285,7 +291,7 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
     guesses: list[GridFit] = []
     candidates = other_grids(source.ply.info, camera_file, photo_size(source.photos))
     for _, ranked in groupby(candidates, key=lambda grid: grid.rank):
-        grids = [grid for grid in ranked if not grid.guessed or source.may_be(grid)]
+        grids = [grid for grid in ranked if not grid.guessed or source.could_show(grid)]
         guesses += [grid for grid in grids if grid.guessed]
         exact = exact_frames or any(grid.guessed for grid in grids)
         fits = source.fit(grids, photos=False, exact_frames=exact)

@@ -110,7 +110,7 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
 
 def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) -> Correspondences:
-    """Find stretches of rows in the photos; return the rows with one clear place, as a block for each photo."""
+    """Find stretches in the photos; return rows of those that are alike and in one place, a part for each."""
     colors, images = byte_colors(inputs.gaussians), inputs.images
     shown = [shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
     rows = np.array([t.start + t.step * np.arange(_LENGTH) for t in tries])
@@ -125,43 +125,43 @@ def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) ->
     ids = rows[chosen][:, within].reshape(-1)
     y, x = np.divmod(pixels[(places[chosen, :1] + within).clip(max=len(pixels) - 1).reshape(-1)], inputs.cameras.width)
     views = np.array([t.view for t in tries])[chosen].repeat(_PER_STRETCH)
-    blocks = np.arange(len(chosen)).repeat(_PER_STRETCH)
+    parts = np.arange(len(chosen)).repeat(_PER_STRETCH)
     pairs = Correspondences(
-        inputs.gaussians.means[ids].astype(np.float64), np.stack([x, y], 1) + 0.5, views, blocks, ids
+        inputs.gaussians.means[ids].astype(np.float64), np.stack([x, y], 1) + 0.5, views, parts, ids
     )
     return pairs.select(inputs.valid[ids])
 
 
 def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Similarity) -> Similarity | None:
     """Solve for scale and shift that the most stretches agree on; None if they are few."""
-    blocks = np.unique(pairs.blocks)
-    views = np.array([pairs.views[pairs.blocks == block][0] for block in blocks])
+    stretches = np.unique(pairs.parts)
+    views = np.array([pairs.views[pairs.parts == stretch][0] for stretch in stretches])
     if len(np.unique(views)) < _MIN_VIEWS:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
     def solve(chosen: np.ndarray) -> Similarity | None:
-        part = pairs.select(np.isin(pairs.blocks, chosen))
+        part = pairs.select(np.isin(pairs.parts, chosen))
         rays = ray_directions(part, inputs.cameras)
         return solve_frame(part.points, rays, rotation.rotation, shifted=True)
 
-    def agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
+    def find_agreeing(frame: Similarity | None, limit: float) -> np.ndarray:
         if frame is None:
-            return blocks[:0]
+            return stretches[:0]
         errors = pixel_errors(pairs, frame.move(inputs.cameras))
-        return blocks[[float(np.median(errors[pairs.blocks == block])) < limit for block in blocks]]
+        return stretches[[float(np.median(errors[pairs.parts == stretch])) < limit for stretch in stretches]]
 
-    best = blocks[:0]
+    best = stretches[:0]
     for _ in range(_PAIRS):
-        first = rng.choice(len(blocks))
+        first = rng.choice(len(stretches))
         second = rng.choice(np.flatnonzero(views != views[first]))
-        best = max(best, agreeing(solve(blocks[[first, second]]), _NEAR * limit), key=len)
+        best = max(best, find_agreeing(solve(stretches[[first, second]]), _NEAR * limit), key=len)
     frame = None
     for _ in range(_ROUNDS):
         frame = solve(best) if len(best) else None
-        best = agreeing(frame, limit)
-    counts = np.bincount(views[np.isin(blocks, best)], minlength=1)
-    if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(blocks):
+        best = find_agreeing(frame, limit)
+    counts = np.bincount(views[np.isin(stretches, best)], minlength=1)
+    if frame is None or (counts >= _MIN_STRETCHES).sum() < _MIN_VIEWS or len(best) < _MIN_AGREEING * len(stretches):
         return None
     text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
     return replace(frame, description=text, kind=rotation.kind)

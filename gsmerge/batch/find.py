@@ -24,8 +24,7 @@ from gsmerge.scene.files import (
 )
 from gsmerge.scene.no_gaussians import find_remedy
 
-MAX_FOLDERS = 100_000  # without a scene; a link to a system's folders leads to more
-FOLDERS_PER_SCENE = 5  # that are not counted for it
+MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
 _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
@@ -47,16 +46,11 @@ def main_file(scene: Path) -> Path:
     return named_ply(scene) or (plys[0] if len(plys) == 1 else scene)
 
 
-def find_scenes(
-    arguments: Sequence[str],
-    out: Path,
-    unreadable: list[SceneError] | None = None,
-) -> Iterator[Path]:
+def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
     """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
 
-    ``unreadable`` collects the errors of folders inside the arguments that cannot be read; without it, the first error
-    is raised. SceneError if an argument does not exist, has no scene, or has too many folders without a scene;
-    UsageError if it is the output folder.
+    A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
+    no scene or too many folders without one, UsageError if it is the output folder.
     """
     skip = os.path.realpath(out)
     for argument in arguments:
@@ -64,26 +58,20 @@ def find_scenes(
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
-            yield from _require_some(search.walk(path), search, argument, "in the folder")
+            yield from _require_some(search.walk(path), argument, "in the folder")
         elif path.suffix in SCENE_SUFFIXES and path.is_file():
             yield path
         elif glob.has_magic(argument) and not path.exists():
-            yield from _require_some(_matches(argument, search), search, argument, "that match")
+            yield from _require_some(_matches(argument, search), argument, "that match")
         elif path.is_file():
-            yield from _require_some(_listed(path, search), search, argument, "in the list")
+            yield from _require_some(_listed(path, search), argument, "in the list")
         else:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
-        if search.unreadable and unreadable is None:
-            raise search.unreadable[0]
-        if unreadable is not None:
-            unreadable += search.unreadable
 
 
-def _require_some(scenes: Iterator[Path], search: _Search, argument: str, where: str) -> Iterator[Path]:
+def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
     """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
-    if first is None and search.unreadable:
-        raise search.unreadable[0]
     if first is None:
         raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
     yield first
@@ -103,32 +91,32 @@ class _Search:
     """The folders of one argument: each is searched once, whatever links lead to it."""
 
     skip: str  # real path of the folder for the results
-    unreadable: list[SceneError] = field(default_factory=list)
     seen: set[str] = field(default_factory=set)  # real paths
-    repeats: int = 0  # how often a folder was met again
-    num_empty: int = 0  # folders without a scene
+    num_empty: int = 0  # folders since the last scene
 
     def walk(self, folder: Path) -> Iterator[Path]:
         """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
         for inside, names, folders in self.folders(folder):
-            if _is_scene(inside, names):
+            if names is None:
+                scenes = [inside]
+            elif _is_scene(inside, names):
                 folders[:] = [name for name in folders if name not in SCENE_PARTS]
                 scenes = [inside]
             else:
                 scenes = other_plys(inside) if any(name.endswith(".ply") for name in names) else []
-            self.num_empty = max(0, self.num_empty - FOLDERS_PER_SCENE * len(scenes))
+            self.num_empty = 0 if scenes else self.num_empty
             yield from scenes
 
-    def folders(self, first: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-        """Yield a folder and its sub-folders, with the names in each and a list of the sub-folders' names.
+    def folders(self, first: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
+        """Yield a folder and those below it, with the names in each, and a list of its folders' names.
 
-        The caller may remove names from that list: those folders are not entered.
+        The names are None if the folder cannot be read. The caller may remove names from that list: those folders are
+        not entered.
         """
         stack = [(first, os.path.realpath(first))]
         while stack:
             folder, real = stack.pop()
             if real == self.skip or real in self.seen:
-                self.repeats += real != self.skip
                 continue
             self.seen.add(real)
             self.num_empty += 1
@@ -138,9 +126,8 @@ class _Search:
             try:
                 with os.scandir(folder) as opened:
                     entries = {entry.name: entry for entry in opened}
-            except OSError as error:
-                if str(folder) not in {failure.path for failure in self.unreadable}:
-                    self.unreadable.append(SceneError(folder, f"cannot be read ({error.strerror})"))
+            except OSError:
+                yield folder, None, []
                 continue
             names = sorted(name for name in entries if not name.startswith("."))
             inside = [name for name in names if _is_folder(entries[name])]
@@ -165,10 +152,8 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
         if named_ply(folder) is not None:
             return True
         return not other_plys(folder) and bool(depth_maps.find_depth_maps(folder))
-    except SceneError:  # a frame is missing: reading the scene says which
+    except (SceneError, OSError):  # a frame is missing, or cannot be read: reading the scene says which
         return True
-    except OSError:  # its names can be read, and nothing else
-        return False
 
 
 def _matches(pattern: str, search: _Search) -> Iterator[Path]:
@@ -188,12 +173,12 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
         return
     at = parts.index("**")
     tail = parts[at + 1 :]
-    inner = _Search(search.skip, search.unreadable)
+    inner = _Search(search.skip)
     for base in glob.iglob(os.path.join(*parts[:at])) if at else (os.curdir,):
-        for folder, _, _ in inner.folders(Path(base)):
-            names = [] if tail else [str(folder)]
+        for folder, inside, _ in inner.folders(Path(base)):
+            names = [str(folder)] if inside is None or not tail else []
             names += _expand(os.path.join(glob.escape(str(folder)), *(tail or ("*",))), search)
-            inner.num_empty = max(0, inner.num_empty - FOLDERS_PER_SCENE * len(names))
+            inner.num_empty = 0 if names else inner.num_empty
             yield from names
 
 
@@ -209,13 +194,9 @@ def _listed(file: Path, search: _Search) -> Iterator[Path]:
         if not entry or entry.startswith("#"):
             continue
         path = file.parent / entry
-        if not os.path.isdir(path) or os.path.realpath(path) == search.skip:
+        if not os.path.isdir(path):
             yield path
-            continue
-        before = search.repeats, len(search.unreadable)
-        first = next(scenes := search.walk(path), None)
-        if first is not None:
-            yield first
+        elif os.path.realpath(path) not in search.seen:
+            scenes = search.walk(path)
+            yield next(scenes, path)
             yield from scenes
-        elif before == (search.repeats, len(search.unreadable)):
-            yield path

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from gsmerge import __version__
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files, level_output
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.report import SCHEMA_VERSION, file_sha256
@@ -72,10 +72,6 @@ class BatchOptions(Settings):
 
 class SceneCall(Protocol):
     """Call that makes the result of a scene."""
-
-    @property
-    def settings(self) -> CompactOptions:
-        """Settings that the time estimate depends on."""
 
     def key(self, files: SceneFiles) -> str:
         """Return a digest of everything that the result depends on."""
@@ -144,20 +140,18 @@ def find_jobs(
     out: Path,
     options: BatchOptions,
     results: Collection[str] = (),
-    unreadable: list[SceneError] | None = None,
 ) -> list[Job]:
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
-    line. ``results`` has the real paths of former results, which are not scenes. ``unreadable`` collects the errors of
-    sub-folders that cannot be read; without it they are raised. SceneError if an argument does not exist or has no
-    scene; UsageError if two scenes have the same output file, or an output is an input.
+    line. ``results`` has the real paths of former results, which are not scenes. SceneError if something does not exist
+    or has no scene; UsageError if two scenes would be written to one file, or one over another.
     """
     call = CompactCall(options.settings, options.opacity, options.hints)
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    for scene in find_scenes(arguments, out, unreadable):
+    for scene in find_scenes(arguments, out):
         real = os.path.realpath(main_file(scene))
         if real in inputs or real in results:
             continue

@@ -48,22 +48,19 @@ class RecordIndex:
     folder: Path
     end: int = 0  # byte up to which the records are read
     results: dict[str, Result] = field(default_factory=dict)  # by name
-    num_damaged: int = 0  # lines that could not be read
 
     def read_on(self) -> RecordIndex:
-        """Read the records that this or another process has added since the last call."""
+        """Read the records that this or another process has added since the last call; pass over damaged lines."""
         for end, line in each_line(self.folder / RECORDS, self.end):
             self.end = end
-            try:
+            with suppress(KeyError, TypeError, AttributeError):  # no record
                 if line is None:
-                    raise TypeError
+                    continue
                 output, status = _text(line["output"]), line["status"]
                 if status == DONE:
                     self.results[output] = _read_result(line, end)
                 elif status == FAILED and output in self.results:
                     self.results[output] = replace(self.results[output], key="")
-            except (KeyError, TypeError, AttributeError):  # no record
-                self.num_damaged += 1
         return self
 
     def paths(self) -> Iterator[str]:

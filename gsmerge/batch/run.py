@@ -1,12 +1,11 @@
 """Run a batch: make the call of every job, unless its result is done, and record how it ended.
 
 A kill is safe at any moment. Results are whole or not there, and are recorded right after; what a killed process leaves
-besides is the lock of its result, which says that a result without a record is of a batch.
+besides is a file that marks its result as begun, which says that a result without a record is of a batch.
 """
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import warnings
@@ -14,13 +13,14 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, check_folder, record
-from gsmerge.batch.schedule import make_schedule
+from gsmerge.batch.workload import choose_concurrency
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
@@ -46,15 +46,15 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     come last. Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray
     is not installed.
     """
-    schedule = make_schedule(jobs, options)
-    run = Run(folder, check_folder(folder), schedule.threads, options.overwrite)
+    concurrency = choose_concurrency(jobs, options)
+    run = Run(folder, check_folder(folder), concurrency.threads, options.overwrite)
     active: dict[str, Job] = {}
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
-        pool: Pool = ProcessPool(schedule.jobs, schedule.threads)
+        pool: Pool = ProcessPool(concurrency.jobs, concurrency.threads)
         if options.engine == "ray":
             cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
-            pool = RayPool(cluster, schedule.threads, jobs=schedule.jobs)
+            pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)
         stack.enter_context(closing(pool))
 
         def each_call(jobs: Sequence[Job], *, wait: bool) -> Iterator[Call]:
@@ -81,21 +81,21 @@ def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
     ``wait``: wait for another process that works on the result; otherwise return None. SceneError if nothing can be
     recorded.
     """
-    with lock_result(run.folder, job.output, wait=wait) as lock:
-        if lock is None:
+    with lock_result(run.folder, job.output, wait=wait) as begun:
+        if begun is None:
             return None
-        _clean(job, run, lock)
+        _clean(job, run, begun)
         try:
-            line = _make(job, run, lock)
+            line = _make(job, run, begun)
         except Exception as error:  # a bad scene must not end the batch
             line = record(FAILED, job.scene, job.output, error=error_line(error))
         if line["status"] != SKIPPED:
             append_line(run.folder / RECORDS, line)
-        lock.is_left = False
+        begun.unlink(missing_ok=True)
     return line
 
 
-def _make(job: Job, run: Run, lock: ResultLock) -> dict[str, Any]:
+def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     files = job.find_files()
     key, known = job.call.key(files), read_index(run.folder, run.start).read_on().results.get(job.output)
     is_new = known is not None and known.end > run.start  # by another run, or process of this one
@@ -106,10 +106,10 @@ def _make(job: Job, run: Run, lock: ResultLock) -> dict[str, Any]:
         raise UsageError(f"{run.folder / job.output}: {problem}")
     names = () if known is None else [file["path"] for file in known.files]
     foreign = [name for name in job.outputs if os.path.lexists(run.folder / name) and name not in names]
-    if foreign and not lock.is_left and not run.overwrite:
+    if foreign and not begun.exists() and not run.overwrite:
         problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
         raise UsageError(f"{run.folder / foreign[0]}: {problem}")
-    lock.leave_if_killed()
+    mark(begun)
     out = run.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings(record=True) as caught:
@@ -131,11 +131,11 @@ def read_index(folder: Path, start: int) -> RecordIndex:
 
 def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
     """Record the failure of a job whose process died; None if another process works on it now."""
-    with lock_result(run.folder, job.output, wait=False) as lock:
-        if lock is None:
+    with lock_result(run.folder, job.output, wait=False) as begun:
+        if begun is None:
             return None
         line = record(FAILED, job.scene, job.output, error=reason)
-        _clean(job, run, lock)
+        _clean(job, run, begun)
         append_line(run.folder / RECORDS, line)
     return line
 
@@ -143,66 +143,49 @@ def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
     """Remove the unfinished files of jobs whose processes were ended on purpose."""
     for job in jobs:
-        with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as lock:
-            if lock is not None:
-                _clean(job, run, lock)
+        with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as begun:
+            if begun is not None:
+                _clean(job, run, begun)
 
 
-def _clean(job: Job, run: Run, lock: ResultLock) -> None:
-    """Remove the files of a killed process, except the lock of a result that may have no record yet."""
-    if lock.is_left:
+def _clean(job: Job, run: Run, begun: Path) -> None:
+    """Remove the files that a killed process left, except the mark of a result that may be without a record."""
+    if begun.exists():
         paths = [run.folder / name for name in job.outputs]
         for folder in {path.parent for path in paths}:
             remove_stale(folder)
-        lock.is_left = any(map(os.path.lexists, paths))
+        if not any(map(os.path.lexists, paths)):
+            begun.unlink()
 
 
-@dataclass
-class ResultLock:
-    """A locked file of a result, which is left behind by a process that is killed while it makes the result."""
-
-    file: FileIO
-    is_left: bool  # whether a process has left it; whether this one leaves it
-
-    def leave_if_killed(self) -> None:
-        """Write the process number into the lock file, so that a kill leaves proof that a batch made the result."""
-        self.file.write(f"{os.getpid()}\n".encode())
-        os.fsync(self.file.fileno())  # on the disk before the result
-        self.is_left = True
+def mark(begun: Path) -> None:
+    """Say in a file which process works on a result, so that the result is known to be of a batch."""
+    with begun.open("wb") as file:
+        file.write(f"{os.getpid()}\n".encode())
+        file.flush()
+        os.fsync(file.fileno())  # on the disk before the result
 
 
 @contextmanager
-def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[ResultLock | None]:
+def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | None]:
     """Lock a result against other processes in the block; SceneError if that fails.
 
-    ``wait``: wait until another process releases it; otherwise yield None.
+    Yields the path of the file that marks the result as begun; None if another process has locked the result, unless
+    it is to ``wait`` for that.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     path = folder / f".batch-{name}.lock"
+    lock = FileLock(path)
     try:
-        file = _open_locked(path, wait=wait)
-    except OSError as error:
-        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
-    if file is None:
+        lock.acquire(timeout=-1 if wait else 0)
+    except Timeout:
         yield None
         return
-    with file:
-        lock = ResultLock(file, is_left=bool(os.fstat(file.fileno()).st_size))
-        try:
-            yield lock
-        finally:
-            if not lock.is_left:  # removed before the release: who waits for it sees that it is nobody's any more
-                path.unlink(missing_ok=True)
-
-
-def _open_locked(path: Path, *, wait: bool) -> FileIO | None:
-    while True:
-        file = FileIO(path, "ab")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            file.close()
-            return None
-        if os.fstat(file.fileno()).st_nlink:
-            return file
-        file.close()
+    except OSError as error:
+        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
+    try:
+        yield path.with_suffix(".begun")
+    finally:
+        with suppress(OSError):  # Windows removes no open file
+            path.unlink()  # before the release: who waits for it sees that it is nobody's any more
+        lock.release()

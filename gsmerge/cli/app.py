@@ -50,15 +50,17 @@ OTHER_WORDS = {
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
-# Commands of 0.1 -> what does the same; to be left out after the next release
-REPLACED = {"encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2"}
+# Commands and options of 0.1 -> what to do instead; to be left out after the next release
+FORMER_COMMANDS = {"encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2"}
+FORMER_OPTIONS = {
+    "rerun": "use --overwrite", "max_memory": "use --jobs", "retries": "a second call makes what failed",
+    "timeout": "end the run, and a second call goes on", "device": "all runs on the processor",
+    "align": "views are scored as they are",
+}  # fmt: skip
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
 )  # fmt: skip
-
-# Former option -> the one that does the same
-REPLACED = {"rerun": "overwrite", "max_memory": "jobs"}
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
@@ -145,8 +147,8 @@ def _usage_message(error: Any) -> str:
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
-        if match[1] in REPLACED:
-            return f"{match[1]} is no command any more: use {REPLACED[match[1]]}"
+        if match[1] in FORMER_COMMANDS:
+            return f"{match[1]} is no command any more: use {FORMER_COMMANDS[match[1]]}"
         near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
         message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
     return f"{message}; see '{place} --help'"
@@ -163,8 +165,8 @@ def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
-    if REPLACED.get(name) in names:
-        return f"{option} is no option: use --{REPLACED[name]}"
+    if name in FORMER_OPTIONS:
+        return f"{option} is no option any more: {FORMER_OPTIONS[name]}"
     if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
     if "set" not in names:

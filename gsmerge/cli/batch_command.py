@@ -13,23 +13,13 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import (
-    duration,
-    one_line,
-    print_document,
-    say,
-    say_notes,
-    say_warning,
-    separate_stdout,
-    total_progress,
-)
-from gsmerge.errors import BatchError, SceneError, TargetError, UsageError
+from gsmerge.cli.console import one_line, print_document, say, say_warning, separate_stdout, total_progress
+from gsmerge.errors import BatchError, TargetError, UsageError
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
-    from gsmerge.batch.records import RecordIndex
 
-MAX_LISTED = 20  # results in the table, failures below it, and folders that cannot be read
+MAX_LISTED = 20  # failures, and results that are worse than their input
 
 
 def parse_jobs(text: str) -> int:
@@ -88,31 +78,19 @@ def batch(args: opt.Args) -> None:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    index = RecordIndex(out).read_on()
-    unreadable: list[SceneError] = []
-    jobs = find_jobs(args.scenes, out, options, set(index.paths()), unreadable)
-    notes = [*damage_notes(index), *(f"passed by: {error}" for error in unreadable[:MAX_LISTED])]
+    jobs = find_jobs(args.scenes, out, options, set(RecordIndex(out).read_on().paths()))
     if args.dry_run:
-        print_plan(args, jobs, options, notes)
-        return
-    say_notes(notes, quiet=args.silent)
-    _run(args, jobs, options)
-    if unreadable:
-        raise BatchError(f"{len(unreadable)} folder(s) were passed by; the first: {unreadable[0]}")
-
-
-def damage_notes(index: RecordIndex) -> list[str]:
-    """Return a note where records could not be read."""
-    return [f"{index.num_damaged} damaged line(s) of the records were ignored"] if index.num_damaged else []
+        print_plan(args, jobs, options)
+    else:
+        _run(args, jobs, options)
 
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     """Compact all scenes, report each, and sum up."""
-    from gsmerge.batch.schedule import make_schedule
+    from gsmerge.batch.workload import choose_concurrency
 
-    totals, stdout, schedule = Totals(len(jobs)), sys.stdout, make_schedule(jobs, options)
-    at_once = f"{schedule.jobs or 'all it has room for'} at once, {schedule.threads} thread(s) each"
-    say(f"{len(jobs):,} scenes, {at_once}", quiet=args.silent)
+    totals, stdout = Totals(len(jobs)), sys.stdout
+    say(f"{len(jobs):,} scenes, {choose_concurrency(jobs, options)}", quiet=args.silent)
 
     def add(record: dict[str, Any]) -> None:
         totals.add(record)
@@ -186,7 +164,6 @@ class Totals:
     num_input: int = 0  # Gaussians in the scenes that were done
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
-    rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
@@ -203,18 +180,12 @@ class Totals:
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
             self.unmet += bool(report["unmet"])
-            if len(self.rows) < MAX_LISTED:
-                self.rows.append(_row(record["output"], report))
 
     def lines(self) -> list[str]:
-        """Write a table of the results, results worse than their input, failures, and a line of totals."""
+        """Say what is worse, what failed, and the totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
-        from gsmerge.report import text_table
 
-        header = ("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")
-        lines = text_table([header, *sorted(self.rows)]) if self.rows else []
-        if self.counts[DONE] > len(self.rows):
-            lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
+        lines: list[str] = []
         for status, reasons in (("worse", self.worse), (FAILED, self.failed)):
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
@@ -229,36 +200,23 @@ class Totals:
         return [*lines, line]
 
 
-def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
-    psnr = report["psnr_input_views"]
-    quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
-    counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
-    return output, *counts, f"{100 * report['ratio']:.2f} %", *quality, f"{report['total_seconds']:.1f}"
-
-
 def print_plan(
-    args: opt.Args,
-    jobs: Sequence[Job],
-    options: BatchOptions,
-    notes: Sequence[str],
-    unit: str = "scenes",
+    args: opt.Args, jobs: Sequence[Job], options: BatchOptions, unit: str = "scenes", notes: Sequence[str] = ()
 ) -> None:
-    """Print what a run would do and how long it would take; ``unit``: word for the jobs."""
-    from gsmerge.batch.schedule import estimate_memory, estimate_seconds, make_schedule, pending_jobs
-    from gsmerge.report import document_head, human_bytes
+    """Print what a run would do; ``unit``: word for the jobs."""
+    from gsmerge.batch.workload import choose_concurrency, pending_jobs
+    from gsmerge.report import document_head
 
-    out, pending, schedule = args.output, pending_jobs(jobs, args.output, options), make_schedule(jobs, options)
+    out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
     left = {job.output for job in pending}
-    seconds, memory = estimate_seconds(pending, schedule), estimate_memory(jobs, schedule)
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
         f"num_{unit}": len(jobs),
         "num_pending": len(pending),
-        "jobs": schedule.jobs,
-        "threads": schedule.threads,
-        "estimate": {"seconds": round(seconds, 1), "memory_bytes": memory},
+        "jobs": concurrency.jobs,
+        "threads": concurrency.threads,
         unit: [
             {"scene": j.scene, "output": j.output, "num_gaussians": j.num_gaussians, "done": j.output not in left}
             for j in jobs
@@ -268,8 +226,5 @@ def print_plan(
     }
     lines = [f"{job.scene} -> {out / job.output}" for job in pending]
     lines += [f"note: {note}" for note in notes]
-    lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do")
-    at_once = schedule.jobs or "as many as the cluster has room for"
-    lines.append(f"at once     {at_once}, {schedule.threads} thread(s) each")
-    lines.append(f"estimate    about {duration(seconds)}, {human_bytes(memory)} of memory")
+    lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do, {concurrency}")
     print_document(document, lines, as_json=args.json)

@@ -87,7 +87,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     notes, start = list[str](), scene.cameras.viewmats
     for name, path in zip(file_names(paths), paths, strict=True):
         holder, read = result_cameras(path), None
-        if holder is not None and (scene.images is not None or scene.aligned):
+        if holder is not None and scene.is_shown:
             with suppress(SceneError):  # whose ever it is, results can be measured without it
                 read = read_cameras(holder)
         if read is None or holder is None or read.names != scene.names:

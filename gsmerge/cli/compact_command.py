@@ -1,4 +1,4 @@
-"""``gsmerge compact``: the main job."""
+"""``gsmerge compact``: the main job, for scenes, and for views that are in a state of ``gsmerge extend`` already."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from gsmerge.cli.paths import (
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
-from gsmerge.states.options import SUFFIX
+from gsmerge.settings.extend import SUFFIX
 
 if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
@@ -36,6 +36,11 @@ if TYPE_CHECKING:
 
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
+# Arguments and options that say something about a state, too
+OF_STATES = (
+    "scenes", "k", "budget", "fit", "effort", "set", "output", "overwrite", "dry_run", "json", "quiet",
+    "seed", "threads",
+)  # fmt: skip
 
 
 @opt.command(
@@ -55,9 +60,7 @@ def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
     if any(path.suffix.lower() == SUFFIX for path in args.scenes):
-        from gsmerge.cli.compact_state import compact_state
-
-        compact_state(args, start)
+        _compact_state(args, start)
         return
     hints = args.hints()
     from gsmerge.compaction.files import level_output
@@ -122,14 +125,49 @@ def compact(args: opt.Args) -> None:
         raise TargetError("; ".join(filter(None, problems)))
 
 
+def _compact_state(args: opt.Args, start: float) -> None:
+    """Write a compact scene of a state, fitted to its photos; ``start``: the time when the command began."""
+    path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
+    if len(args.scenes) > 1:
+        raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
+    for name, value in vars(args).items():
+        if value and name not in OF_STATES and value != opt.OPTIONS[name].default:
+            flag = f"--{name.replace('_', '-')}"
+            raise UsageError(
+                f"{flag}: expected a scene with it, {path} is a state, which gsmerge extend makes of scenes"
+            )
+    out = args.output or default_output(path)
+    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
+    from gsmerge.fit import FitOptions
+    from gsmerge.settings.compact import CompactOptions
+    from gsmerge.states.files import compact_file, compact_line
+
+    left = {"viewer_cameras": False, "columns": "needed"}  # a state has no names of views
+    wanted, writing = args.make(FitOptions, FileOptions, **left)
+    check_format(out, writing)
+    run = args.given(("effort", "seed", "threads"))
+    with opt.usage_errors():
+        settings = replace(CompactOptions(fit=wanted), **run)
+    before = {"import": perf_counter() - start}
+    with stage_progress(quiet=args.silent) as progress:
+        document = compact_file(
+            path, out, settings, k=args.k, budget=args.budget, always_fit=args.fit is not None,
+            normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
+            dry_run=args.dry_run, progress=progress, seconds_before=before,
+        )  # fmt: skip
+    say_notes(document["notes"], quiet=args.silent)
+    print_document(document, compact_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
+
+
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
     """Return the settings with the requested engine; UsageError if it is not installed."""
-    from gsmerge.runtime.work import require_ray
     from gsmerge.settings.stages import Engine
 
     with opt.usage_errors():
         engine = Engine(args.engine, args.address)
     if engine.name == "ray" and not args.dry_run:
+        from gsmerge.runtime.work import require_ray
+
         require_ray()
     return replace(settings, blocks=replace(settings.blocks, engine=engine))
 
@@ -166,7 +204,8 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
 def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out: Path, hints: ReadHints) -> None:
     """Print an estimate of what ``compact`` would make of a scene."""
-    from gsmerge.compaction.files import Outputs, plan_files, plan_lines, read_input
+    from gsmerge.compaction.estimate import plan_files, plan_lines
+    from gsmerge.compaction.files import Outputs, read_input
 
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():

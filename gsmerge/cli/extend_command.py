@@ -25,8 +25,8 @@ def extend(args: opt.Args) -> None:
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.extend import ExtendOptions
     from gsmerge.states.files import batch_line, extend_file
-    from gsmerge.states.options import ExtendOptions
 
     settings = args.values(CompactOptions, ExtendOptions)
     batches = [args.files(scene) for scene in args.scenes]

@@ -27,11 +27,11 @@ from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words
 from gsmerge.settings.stages import CROP_FILES, Engine
-from gsmerge.states.options import ExtendOptions
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles

@@ -23,7 +23,7 @@ class FileOptions(Settings):
 
     normals: bool = setting(True, "Write the three columns of zeros that some viewers want of a `.ply`, 12 of its 68 "
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
-    columns: str = setting("needed", "Columns of a `.ply`: needed columns only, or full: all 62 of INRIA's, which "
+    columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
         "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
     spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
         "degree 4.",
@@ -39,21 +39,25 @@ def default_output(ply: Path) -> Path:
 
 def output_file(output: Path) -> Path:
     """Return the file that an output names; for a folder ``colmap``, that is the points of the COLMAP model."""
-    from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
+    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
 
     return output / PLACE / POINTS if output.name == FOLDER else output
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
     """List the files of an output that is a COLMAP model; SceneError if another program wrote the model."""
-    from gsmerge.io.cameras.colmap_model import POINTS, files_beside
+    from gsmerge.io.formats.table import POINTS
 
-    return files_beside(output) if output.name == POINTS else ()
+    if output.name != POINTS:
+        return ()
+    from gsmerge.io.cameras.colmap_model import files_beside
+
+    return files_beside(output)
 
 
 def is_index(output: Path) -> bool:
     """Return whether an output is the index of a Streamed SOG; its folder is made if missing."""
-    from gsmerge.io.formats.streamed import INDEX
+    from gsmerge.io.formats.table import INDEX
 
     return output.name == INDEX
 
@@ -105,7 +109,7 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
-    from gsmerge.io.cameras.colmap_model import MODEL_NAMES
+    from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     try:

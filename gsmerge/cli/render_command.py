@@ -68,7 +68,7 @@ def render(args: opt.Args) -> None:
         check_folder(args.output, inputs, overwrite=overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
     arguments = args.given(("views", "path", "frames", "fps", "background", "antialiased"))
-    drawing = drawings.PLANS[kind](
+    drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(
             files, args.scenes, like, args.output, args.opacity, hints, segmentation=segmentation, **arguments
         )

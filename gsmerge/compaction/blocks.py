@@ -37,12 +37,12 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
-from gsmerge.plan import Plan, WholePlan, make_plan
-from gsmerge.raster import contributions, plan_view
+from gsmerge.plan import Plan, SceneChoices, make_plan
+from gsmerge.raster import contributions, tile_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
-from gsmerge.raster.view_plan import Splats
+from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, make_array, peak_memory
 from gsmerge.runtime.record import Record, add_seconds, choose, current_record, note, record_part, stage
@@ -76,7 +76,7 @@ def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[B
 
 
 def compact_in_blocks(
-    scene: Scene, options: CompactOptions, whole: WholePlan, blocks: Sequence[Block], covisibility: Covisibility
+    scene: Scene, options: CompactOptions, choices: SceneChoices, blocks: Sequence[Block], covisibility: Covisibility
 ) -> CompactResult:
     """Compact an aligned scene in blocks of views.
 
@@ -85,10 +85,10 @@ def compact_in_blocks(
     included, and keeps its own: where two blocks meet, both fit the same Gaussians to the same photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
-    count, most = len(blocks), whole.limits.count
+    count, most = len(blocks), choices.limits.count
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
-        frame, options = scene_frame(scene), with_whole_choices(options, whole)
+        frame, options = scene_frame(scene), with_choices(options, choices)
     size = gaussians_at_once(scene.num_gaussians, count)
     memory = memory_bytes(size, photos=measure_size(scene).photos, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
@@ -120,9 +120,9 @@ def compact_in_blocks(
     facts = [
         {
             "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
-            "psnr_input_views": psnr, "fit": choices.get("fit"),
+            "psnr_input_views": psnr, "fit": chosen.get("fit"),
         }
-        for part, (_, choices), (psnr, _) in zip(parts, fitted, scores, strict=True)
+        for part, (_, chosen), (psnr, _) in zip(parts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
     return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
@@ -279,7 +279,7 @@ def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, 
         photos = blank_photos(part.prepared.scene.cameras[places], 2)
 
         def weights_of(view: int, photos: Photos = photos) -> np.ndarray:
-            return contributions(plan_view(splats, **photos.camera(view)))[0]
+            return contributions(tile_view(splats, **photos.camera(view)))[0]
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
             yield number, place, weights
@@ -297,14 +297,14 @@ def free_scene(scene: Scene) -> None:
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
-def with_whole_choices(options: CompactOptions, whole: WholePlan) -> CompactOptions:
-    """Return options with the fit steps and the networks that the plan of the whole scene chose."""
-    checkpoint = options.checkpoint if whole.checkpoint != "none" else "none"
-    settings: dict[str, Any] = {"fit_steps": whole.fit.steps, "checkpoint": checkpoint}
+def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptions:
+    """Return options with the fit steps and the networks that were chosen for the whole scene."""
+    checkpoint = options.checkpoint if choices.checkpoint != "none" else "none"
+    settings: dict[str, Any] = {"fit_steps": choices.fit.steps, "checkpoint": checkpoint}
     if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
         settings["require_checkpoint"] = True  # a node without it would make other bytes
     options = options.with_settings(settings)
-    return replace(options, fit=replace(options.fit, share=whole.limits.share))
+    return replace(options, fit=replace(options.fit, share=choices.limits.share))
 
 
 def block_options(

@@ -8,8 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from gsmerge.compaction.blocks import compact_in_blocks, cut_views
-from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import level_counts, search_count
@@ -18,12 +16,11 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, make_plan, note_engine, plan_whole
+from gsmerge.plan import Plan, choose_for_scene, make_plan, note_engine
 from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
 from gsmerge.types import Scene, StrPath
 
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
@@ -55,12 +52,14 @@ def compact(
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
         size = measure_size(scene)
-        whole = plan_whole(size, options)  # what needs no work to decide
-        note_engine(size, options, whole.blocks)
-        if whole.blocks > 1:
-            blocks, covisibility = cut_views(scene, options, whole.blocks)
+        choices = choose_for_scene(size, options)  # what needs no work to decide
+        note_engine(size, options, choices.blocks)
+        if choices.blocks > 1:
+            from gsmerge.compaction.blocks import compact_in_blocks, cut_views
+
+            blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
-                return compact_in_blocks(scene, options, whole, blocks, covisibility)
+                return compact_in_blocks(scene, options, choices, blocks, covisibility)
         return compact_piece(scene, options)
 
 
@@ -73,10 +72,15 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     for count in search:
         search.add(build_scored(method.build, prepared, plan, count))
     rebuild = partial(build_scored, method.build, prepared, plan)
-    best = meet_bytes(search.best, rebuild, prepared, plan)
+    best, packed = search.best, plan.size is not None and plan.size.packed
+    if packed:
+        from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
+
+        best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-    best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
+    if packed:
+        best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
     return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
 
 
@@ -95,6 +99,8 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     options = plan.clean
     if not options.asked:
         return build(prepared, plan, count)
+    from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
+
     scene, to_world = prepared.scene, prepared.frame.leave
     input_gaussians = scene.finite_gaussians
     most, asked = len(input_gaussians), count

@@ -14,7 +14,6 @@ from gsmerge.compaction.placement import (
     add_colmap,
     find_placement,
     name_photos,
-    output_notes,
     pad_harmonics,
     place,
 )
@@ -32,12 +31,12 @@ from gsmerge.io import (
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
-from gsmerge.io.cameras.npz_files import holds_images
+from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
-from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, DEPTHS, input_format
-from gsmerge.io.formats.write import add_levels
+from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
+from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, input_format
+from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head, human_bytes
 from gsmerge.runtime.record import report_progress

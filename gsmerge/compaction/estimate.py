@@ -1,22 +1,29 @@
-"""Estimate the size, time and memory of a run without running it."""
+"""Estimate the size, time and memory of a run without running it, as ``inspect`` and ``--dry-run`` show it."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsmerge.compaction.files import Outputs, check_saved_cameras, sized
+from gsmerge.compaction.methods import check_method
 from gsmerge.facts.partition import gaussians_at_once
-from gsmerge.facts.prepare import canonicalise
+from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import plan_whole, resolve_budget, stands_alone
-from gsmerge.report import human_bytes
+from gsmerge.plan import choose_for_scene, load_networks, resolve_budget, stands_alone
+from gsmerge.report import document_head, human_bytes
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.scene.read import Loaded
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.stages.segment import largest_count
 from gsmerge.types import Scene
 
@@ -36,16 +43,16 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     size = measure_size(scene)
     if options.budget.auto and scene.aligned:
         options = resolve_budget(options, canonicalise(scene)[0])
-    whole = plan_whole(size, options)
-    limits, settings = whole.limits, whole.settings(options)
+    choices = choose_for_scene(size, options)
+    limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)
     most = pixels if options.method.startswith("unmerged") else largest_count(limits, options.segment)
     count = min(scene.num_gaussians or pixels, most)
-    at_once, num_rest = gaussians_at_once(pixels, whole.blocks), 3 * scene.gaussians.shN.shape[1]
+    at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
     seconds = wall_seconds(
-        at_once * whole.blocks, len(scene), settings, threads=options.threads or available_threads(),
-        photos=size.photos, fit_steps=whole.fit.steps,
+        at_once * choices.blocks, len(scene), settings, threads=options.threads or available_threads(),
+        photos=size.photos, fit_steps=choices.fit.steps,
         num_drawn=drawn * float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
     )  # fmt: skip
     memory = memory_bytes(at_once, photos=size.photos, num_rest=num_rest, num_elsewhere=pixels - at_once)
@@ -54,12 +61,12 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "num_gaussians": count,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
-        "blocks": whole.blocks,
+        "blocks": choices.blocks,
         "method": options.method,
         "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings, photos=size.photos),
-        "fit_steps": whole.fit.steps,
+        "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),
@@ -81,4 +88,40 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
         " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
         f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
         *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
+    ]
+
+
+def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
+    """Return as a document what :func:`compact_files` would make of a scene."""
+    scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
+    check_saved_cameras(scene, outputs)
+    _, unused = check_method(settings, scene)
+    notes = [*load.notes, *unused, *missing_notes(scene)]
+    if os.path.lexists(out) and not outputs.overwrite:
+        notes.append(f"{out} exists already: --overwrite would replace it")
+    with record_run() as record:
+        if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
+            load_networks(settings, measure_size(scene))
+        run = estimate(scene, settings)
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
+    return {
+        **document_head(),
+        "dry_run": True,
+        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
+        "output": {"path": str(out)},
+        "compact": run,
+        "options": settings.to_dict(),
+        "notes": [*notes, *record.notes],
+    }
+
+
+def plan_lines(document: Mapping[str, Any]) -> list[str]:
+    """Write the document of :func:`plan_files` as lines for people."""
+    scene, out = document["input"], document["output"]["path"]
+    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
+    return [
+        f"would read {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
+        f"would write {out}{levels}",
+        *estimate_lines(document["compact"]),
+        *(f"note       {note}" for note in document["notes"]),
     ]

@@ -45,7 +45,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
 
     For an index of levels, a sample of the Gaussians stands for the coarser levels; see :func:`meet_bytes_of_levels`.
     """
-    if plan.size is None or plan.size.file is PLY:
+    if plan.size is None or not plan.size.packed:
         return candidate
     most = plan.size.num_bytes
     for _ in range(MAX_REBUILDS):

@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.estimate import estimate, estimate_lines
-from gsmerge.compaction.methods import check_method
-from gsmerge.compaction.placement import (
-    NUM_FULL,
-    add_colmap,
-    find_placement,
-    name_photos,
-    output_notes,
-    pad_harmonics,
-    place,
-)
 from gsmerge.compaction.result import CompactResult
-from gsmerge.compaction.streamed_parts import StreamedParts, split_levels
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.prepare import missing_notes
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
@@ -33,20 +18,21 @@ from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.formats.streamed import INDEX, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP
-from gsmerge.io.formats.write import add_levels
-from gsmerge.plan import load_networks
-from gsmerge.report import document_head, report_document, to_json
+from gsmerge.io.formats.table import COLMAP, INDEX
+from gsmerge.io.formats.write import output_notes
+from gsmerge.report import report_document, to_json
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress, record_run
+from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded, load_files
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Scene
+
+if TYPE_CHECKING:
+    from gsmerge.compaction.streamed_parts import StreamedParts
 
 
 @dataclass(frozen=True)
@@ -83,7 +69,7 @@ def compact_files(
     Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
     result cannot be written, UsageError if the settings need what the scene does not have.
     """
-    start, out, settings = perf_counter(), outputs.result, _sized(settings, outputs)
+    start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
@@ -103,14 +89,17 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
         result = _placed(result, outputs)
-        parts = split_levels(result, load.scene, settings, progress) if ending == INDEX else None
-        if parts is not None:
+        parts = None
+        if ending == INDEX:
+            from gsmerge.compaction.streamed_parts import split_levels
+
+            parts = split_levels(result, load.scene, settings, progress)
             result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        photos = name_photos(files.images, names)
-        written = _write_results(add, outputs, at[out], results, comments, result.cameras[views], photos, parts)
+        views_named = result.cameras[views], names, files.images
+        written = _write_results(add, outputs, at[out], results, comments, views_named, parts)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
@@ -130,46 +119,9 @@ def compact_files(
         )  # fmt: skip
         if outputs.report is not None:
             at[outputs.report].write_text(to_json(document), encoding="utf-8", errors="replace")
-    if ending == INDEX:
-        remove_unused_chunks(out)
+    if parts is not None:
+        parts.remove_unused(out)
     return document
-
-
-def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return a document of what :func:`compact_files` would make of a scene."""
-    scene, out, settings = load.scene, outputs.result, _sized(settings, outputs)
-    check_saved_cameras(scene, outputs)
-    _, unused = check_method(settings, scene)
-    notes = [*load.notes, *unused, *missing_notes(scene)]
-    if os.path.lexists(out) and not outputs.overwrite:
-        notes.append(f"{out} exists already: --overwrite would replace it")
-    with record_run() as record:
-        if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
-            size = measure_size(scene)
-            load_networks(settings, photos=size.photos, aligned=size.aligned)
-        run = estimate(scene, settings)
-    paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
-    return {
-        **document_head(),
-        "dry_run": True,
-        "input": {**paths, "num_gaussians": scene.num_gaussians, **load.recognised},
-        "output": {"path": str(out)},
-        "compact": run,
-        "options": settings.to_dict(),
-        "notes": [*notes, *record.notes],
-    }
-
-
-def plan_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the document of :func:`plan_files` as lines of text."""
-    scene, out = document["input"], document["output"]["path"]
-    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
-    return [
-        f"would read {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
-        f"would write {out}{levels}",
-        *estimate_lines(document["compact"]),
-        *(f"note       {note}" for note in document["notes"]),
-    ]
 
 
 def _write_results(
@@ -178,24 +130,24 @@ def _write_results(
     first: Path,
     results: Sequence[CompactResult],
     comments: Sequence[Sequence[str]],
-    cameras: Cameras,
-    photos: Sequence[str],
+    views: tuple[Cameras, Sequence[str], Path | None],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
-    """Write a result into the file ``first``, and its coarser levels, each with its header comments.
+    """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    A COLMAP model also needs the ``cameras`` and the names of their ``photos``; ``parts`` are the parts of a
-    ``lod-meta.json``. Returns the path of each result, with the temporary files that are renamed to it at the end.
+    A COLMAP model has the ``views``, too: cameras, names, and the folder of their photos; ``parts`` are those of a
+    ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
+    renamed.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
     if ending == COLMAP.ending:
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
+        from gsmerge.compaction.placement import add_colmap, name_photos
+
+        cameras, names, photos = views
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(photos, names))}
     if parts is not None:
-        (_, finest), *coarser = add_levels(
-            add, out, first, parts.levels, comments[0], environment=parts.environment, measure=parts.measure
-        )
-        return {out: [first, *finest], **dict(coarser)}
+        return parts.write(add, out, first, comments[0])
     written = {out: [first]}
     for level in range(1, len(results)):
         path = level_output(out, level)
@@ -208,8 +160,8 @@ def _write_results(
     return written
 
 
-def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Set in the settings the format whose bytes a budget counts."""
+def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
+    """Say in the settings whose bytes a budget counts."""
     budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
     return replace(settings, budget=budget)
 
@@ -217,6 +169,10 @@ def _sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
 def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
     """Move a result, its levels and its cameras into the output frame, and add columns that are written as zeros."""
     options = outputs.placement
+    if not (options.asked or outputs.full_columns):
+        return result
+    from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
+
     frame = find_placement(options, result.cameras if len(result.cameras) else None)
 
     def move(level: CompactResult) -> CompactResult:

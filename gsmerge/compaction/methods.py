@@ -15,11 +15,10 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
-from gsmerge.runtime.plugins import METHODS, load_plugin
+from gsmerge.runtime.plugins import METHODS, LazyFunction, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.stages import PrepareOptions
-from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import Gaussians, Scene
 
 Need = Literal["photos", "pixels"]
@@ -64,8 +63,9 @@ class _Superpixels(Method):
 
 
 SUPERPIXELS = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
+_MERGE_NEIGHBORS = LazyFunction("gsmerge.stages.pair_merge", "merge_neighbors")
 PAIRS = Method(  # by positions and colours alone
-    "pairs", lambda prepared, _, count: merge_neighbors(prepared.scene.gaussians, count), prepare=prepare_alone
+    "pairs", lambda prepared, _, count: _MERGE_NEIGHBORS(prepared.scene.gaussians, count), prepare=prepare_alone
 )
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
-from gsmerge.io import lost_harmonics
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.cameras.colmap_model import MODEL_NAMES, files_beside, model_files
-from gsmerge.io.formats.table import COLMAP
+from gsmerge.io.cameras.colmap_model import files_beside, model_files
+from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.measure.visibility import front_rows
@@ -93,13 +92,3 @@ def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
         with suppress(SceneError):
             return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]
     return [name.removeprefix("./").removeprefix("images/") for name in names]  # as a transforms.json has them
-
-
-def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
-    """Describe what an output lacks: harmonics without room in the format, and the photos of a COLMAP model."""
-    lost = lost_harmonics(out, sh_degree, spz_version)
-    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
-    if COLMAP.names(out) and not place.is_dir():
-        files = "the photos" if photos is None or not photos.is_dir() else photos
-        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
-    return notes

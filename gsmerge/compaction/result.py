@@ -13,7 +13,6 @@ from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
-from gsmerge.measure.preview import picture_html, to_picture
 from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss
@@ -136,6 +135,8 @@ class CompactResult:
         if len(self.cameras) == 0:
             return report
         image = render(self.gaussians.numpy(), self.cameras.numpy()[[len(self.cameras) // 2]]).images[0]
+        from gsmerge.measure.preview import picture_html, to_picture
+
         return picture_html(to_picture(image), "the middle view") + report
 
     def to(self, device: torch.device | str | None) -> CompactResult:

@@ -1,6 +1,6 @@
 """Search for the number of Gaussians: the knee of the scene's curve, a quality target, levels of detail.
 
-A curve is measured by short fits, judged by parts of the photos that they left out.
+A curve is measured by short fits, judged by patches of the photos that they left out.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from gsmerge.stages.segment import knee_count
 from gsmerge.types import Gaussians
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
-HOLDOUT = 0.1  # share of the photos' blocks
+HOLDOUT = 0.1  # share of the photos' patches
 NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
 PERCEPTUAL_SIDE = 64  # pixels, at least
 TRIED = "curve: what each count brings"  # progress
@@ -46,7 +46,7 @@ MAX_FACTOR = 4  # times the usual count is the most that a quality target may ta
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """Quality of a short fit with ``count`` Gaussians, measured on held-out parts of the photos."""
+    """Quality of a short fit with ``count`` Gaussians, measured on held-out patches of the photos."""
 
     count: int  # Gaussians
     psnr: float  # dB

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.raster import contributions, plan_view, prepare, render
+from gsmerge.raster import contributions, prepare, render, tile_view
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
@@ -159,7 +159,7 @@ def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.nda
     splats, K = prepare(sample), _lens(PROBE)
 
     def one_view(viewmat: np.ndarray) -> np.ndarray:
-        sums, _ = contributions(plan_view(splats, viewmat, K, PROBE, PROBE, near=near))
+        sums, _ = contributions(tile_view(splats, viewmat, K, PROBE, PROBE, near=near))
         return np.minimum(sums / np.float32(ENOUGH), 1) * splats.opacities
 
     return np.stack(parallel_map(one_view, viewmats))

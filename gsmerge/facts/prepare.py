@@ -152,7 +152,8 @@ class Prepared:
     def size(self) -> SceneSize:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
-        return measure_size(measured, photos=bool(self.reference.fit_views))
+        fitted = bool(self.reference.fit_views)
+        return measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -238,12 +239,17 @@ def missing_notes(scene: Scene) -> list[str]:
     """Return the note of a run on the replacement of missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
-    return [NO_PHOTOS] if scene.aligned and scene.images is None else []
+    return [NO_PHOTOS] if _lacks_photos(scene) else []
+
+
+def _lacks_photos(scene: Scene) -> bool:
+    """Return whether the rows' own colours stand in for photos."""
+    return scene.images is None and scene.is_shown and len(scene) > 0
 
 
 def with_row_colors(scene: Scene) -> Scene:
     """Return a scene with its rows' own colours as photos if it has pixels and no photos, as :func:`prepare` does."""
-    if scene.images is not None or not scene.aligned or len(scene) == 0:
+    if not _lacks_photos(scene):
         return scene
     with record_part(silent=True):
         colored = add_row_colors(canonicalise(scene)[0])

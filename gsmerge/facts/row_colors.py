@@ -13,7 +13,7 @@ from gsmerge.facts.mend_photos import fill_gaps
 from gsmerge.facts.views import camera_kinds, subset
 from gsmerge.geometry import camera_depths, sh0_to_rgb
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import plan_view, prepare
+from gsmerge.raster import prepare, tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.photos import COVERED, WHOLE, blank_photos
 from gsmerge.runtime.record import note
@@ -51,11 +51,11 @@ def _picture(scene: Scene, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     Also returns masks ``[h,w]`` of the pixels that are known, and of the pixels that are drawn.
     """
     part = subset(scene, views.tolist())
-    plan = plan_view(prepare(part.gaussians), **blank_photos(part.cameras).camera(0))
-    seen = view_colors(plan)
-    drawn, transmittance = blend(plan, seen, np.zeros(3, np.float32))
+    tiled = tile_view(prepare(part.gaussians), **blank_photos(part.cameras).camera(0))
+    seen = view_colors(tiled)
+    drawn, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
     colors = sh0_to_rgb(part.gaussians.sh0[:, 0])
-    colors[plan.ids] = seen
+    colors[tiled.ids] = seen
     own, opacity = _front(part, colors.clip(0, 1))
     alpha = 1 - transmittance
     drawn = (drawn / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)

@@ -18,6 +18,7 @@ class SceneSize:
     width: int
     aligned: bool  # whether each Gaussian belongs to a pixel
     photos: bool  # whether there are photos to fit to, or what stands in for them
+    drawn: bool = False  # whether that is drawings of the scene itself
     num_cameras: int = 2  # views at different places; 1: one camera took all
     sh_degree: int = 0
 
@@ -27,16 +28,15 @@ class SceneSize:
         return self.height * self.width
 
 
-def measure_size(scene: Scene, *, photos: bool | None = None) -> SceneSize:
+def measure_size(scene: Scene, *, photos: bool | None = None, drawn: bool = False) -> SceneSize:
     """Return the sizes of a scene.
 
-    ``photos``: whether there are photos to fit to; None: whether the scene has images, or pixels whose colours replace
-    them.
+    ``photos``, ``drawn``: see :class:`SceneSize`; None: whether the scene has photos, or pixels whose colours stand in.
     """
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
         scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
-        photos=scene.images is not None or scene.aligned if photos is None else photos,
+        photos=scene.is_shown if photos is None else photos, drawn=drawn,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip

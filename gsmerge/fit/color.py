@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.raster import composite, plan_view, prepare
+from gsmerge.raster import composite, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -38,8 +38,8 @@ def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
-        plan = plan_view(splats, **photos.camera(view))
-        return view_weights(plan), composite(plan)[0]
+        tiled = tile_view(splats, **photos.camera(view))
+        return view_weights(tiled), composite(tiled)[0]
 
     views, images = zip(*parallel_map(one_view, range(len(photos))), strict=True)
     return Drawn(list(views), list(images))
@@ -53,11 +53,11 @@ def fit_colors(
     seed: int = 0,
     color_precision: np.ndarray | None = None,
 ) -> FitResult:
-    """Fit base colours to the photos, and keep them only if held-out blocks get better.
+    """Fit base colours to the photos, and keep them only if held-out patches get better.
 
-    ``drawn`` are the Gaussians drawn into the photos, see :func:`draw`; ``seed`` chooses the held-out blocks.
-    ``color_precision [n]`` is the weight of each present colour as a prior, from the pixels of earlier photos.
-    Geometry, opacities and higher harmonics stay unchanged.
+    ``drawn`` are the same Gaussians in the photos, see :func:`draw`; ``seed`` chooses the held-out patches.
+    ``color_precision [n]`` weighs each present colour as a prior, by the pixels of earlier photos that it was fitted
+    to. Geometry, opacities and higher harmonics stay.
     """
     train = training_weights(photos, min(0.5, HOLDOUT * options.holdout), seed)
     precision = 0.0 if color_precision is None else color_precision[:, None].astype(np.float64)
@@ -76,7 +76,7 @@ class ColorSystem:
     drawn: Drawn  # The Gaussians against the photos
     photos: Photos  # V photos
     options: FitOptions  # The solver's settings
-    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out blocks, 1 elsewhere
+    train: list[np.ndarray]  # [h,w] of every view: 0 on the held-out patches, 1 elsewhere
     weights: list[np.ndarray]  # [h,w] of the pixels of every view
     gains: np.ndarray  # [v,3] exposures
     precision: np.ndarray | float  # [n,1] prior added to the diagonal, by which earlier photos pull offsets to 0; or 0
@@ -88,7 +88,7 @@ class ColorSystem:
         return parallel_map(lambda view: self._image(view, x), range(len(self.photos)))
 
     def score(self, x: np.ndarray | None = None) -> float:
-        """Return the PSNR (dB) of the held-out blocks; None: with the colours from before the fit."""
+        """Return the PSNR (dB) of the held-out patches; None: with the colours before the fit."""
         images = self.drawn.images if x is None else self._images(x)
         return holdout_psnr(images, self.photos, self.train, self.options.tuning.min_gain)
 
@@ -137,10 +137,10 @@ class ColorSystem:
 
 
 def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) -> tuple[np.ndarray, FitReport]:
-    """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out blocks get worse.
+    """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out patches get worse.
 
     The first third of the steps uses equal weights. In the second third, badly fitting pixels count less and exposure
-    is compensated. The last third uses all pixels, including the held-out blocks.
+    is compensated. The last third uses all pixels, including the held-out patches.
     """
     steps = options.tuning.iterations
     third = steps // 3
@@ -154,7 +154,7 @@ def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) ->
             x = conjugate_gradients(system.reweigh(x, everywhere=True), x, last, prior_weight)
             return x, FitReport("color", True, steps, before, after, f"prior weight {prior_weight:g}")
         prior_weight *= 8
-    stopped = "held-out parts of the photos did not improve"
+    stopped = "held-out patches of the photos did not improve"
     return start, FitReport("none", False, steps, before, after, stopped)
 
 

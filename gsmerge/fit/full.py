@@ -15,10 +15,9 @@ import numpy as np
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.growth import grow_to
 from gsmerge.fit.report import FitReport, FitResult
-from gsmerge.fit.schedule import GROWTH, PROBE, FitPlan, Schedule, affordable_steps
-from gsmerge.fit.scores import score_state
+from gsmerge.fit.schedule import GROWTH, PROBE, FitRun, Schedule, affordable_steps
 from gsmerge.fit.steps import make_optimiser
-from gsmerge.fit.survey import Survey, survey_photos
+from gsmerge.fit.survey import Survey, score_state, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
@@ -27,19 +26,19 @@ from gsmerge.types import Gaussians
 
 
 def fit_full(
-    gaussians: Gaussians, plan: FitPlan, survey: Survey | None = None, fixed: np.ndarray | None = None
+    gaussians: Gaussians, run: FitRun, survey: Survey | None = None, fixed: np.ndarray | None = None
 ) -> FitResult:
-    """Fit all parameters of Gaussians to the photos of a plan.
+    """Fit all parameters of Gaussians to the photos of a run.
 
-    The result after the half-size steps is kept if it beats the start on held-out blocks; otherwise the start is
-    returned. The full-size steps then use every block. ``survey``: survey of the Gaussians, if made already; ``fixed``:
+    The result after the half-size steps is kept if it beats the start on held-out patches; otherwise the start is
+    returned. The full-size steps then use every patch. ``survey``: survey of the Gaussians, if made already; ``fixed``:
     mask ``[n]`` of Gaussians that stay unchanged.
     """
-    job, options, schedule, tail = plan.job, plan.job.options, Schedule(plan), TailMean()
-    state, optimiser = start_state(gaussians), make_optimiser(plan)
+    job, options, schedule, tail = run.job, run.job.options, Schedule(run), TailMean()
+    state, optimiser = start_state(gaussians), make_optimiser(run)
     if fixed is not None:
         state.fixed[:] = fixed
-    survey = survey_photos(gaussians, plan) if survey is None else survey
+    survey = survey_photos(gaussians, run) if survey is None else survey
     state.box_shares[:], state.min_sizes[:] = limit_moves(survey, options.tuning)
     half, judged = optimiser.photos[1], not options.judged
     before = after = survey.score
@@ -47,8 +46,8 @@ def fit_full(
     started = time.perf_counter()
     while step < steps:
         part = step / steps
-        if part >= plan.half_part and not judged:  # before growth: halves that were never fitted show less
-            after, judged = score_state(state, plan, half), True
+        if part >= run.half_part and not judged:  # before growth: halves that were never fitted show less
+            after, judged = score_state(state, run, half), True
             if after <= before:
                 break
         if grows and part >= GROWTH and len(state.x) < job.count:
@@ -56,19 +55,19 @@ def fit_full(
         drawn = schedule.draw(step + 1, part, len(state.x))
         error += (optimiser.step(state, drawn) - error) / min(step + 1, 10)
         step += 1
-        outside_view = plan.outside_view(step, part)
+        outside_view = run.outside_view(step, part)
         if outside_view is not None:
             optimiser.clear_fog(state, drawn, outside_view)
         if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:
-            steps = affordable_steps(time.perf_counter() - started, plan)
+            steps = affordable_steps(time.perf_counter() - started, run)
         if job.progress:
             job.progress(step, steps, decibels(error))
     if not judged:
-        after = score_state(state, plan, half)
+        after = score_state(state, run, half)
     if options.judged and after <= before:
-        why = f"held-out parts of the photos were no better after {step} steps"
+        why = f"held-out patches of the photos were no better after {step} steps"
         return gaussians, FitReport("none", False, step, before, after, why, origins=np.arange(len(gaussians)))
     if grows and len(state.x) < job.count:  # a time budget may end before the growth
         state = grow_to(state, half, job.count)

@@ -8,7 +8,7 @@ from gsmerge.fit.fit_state import CARRIED, State, state_of
 from gsmerge.geometry import lower_median, quat_to_rotmat
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
-from gsmerge.raster import composite, plan_view, splat_adjoint
+from gsmerge.raster import composite, splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import in_turn
 
@@ -68,9 +68,9 @@ def error_masses(state: State, half: Photos) -> np.ndarray:
     """Sum ``[n]`` blending weight times absolute pixel error of each Gaussian over all half-size photos."""
 
     def one_view(view: int) -> np.ndarray:
-        plan = plan_view(state.splats, **half.camera(view))
-        image, _ = composite(plan, state.view_colors())
-        return splat_adjoint(plan, np.abs(image - half.image(view)).mean(-1, keepdims=True))[:, 0]
+        tiled = tile_view(state.splats, **half.camera(view))
+        image, _ = composite(tiled, state.view_colors())
+        return splat_adjoint(tiled, np.abs(image - half.image(view)).mean(-1, keepdims=True))[:, 0]
 
     masses = np.zeros(len(state.x))
     for of_view in in_turn(one_view, range(len(half))):

@@ -14,11 +14,11 @@ import numpy as np
 
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.raster import Splats, plan_view
+from gsmerge.raster import Splats, tile_view
 from gsmerge.raster.composite import blend
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
-from gsmerge.raster.view_plan import ViewPlan
+from gsmerge.raster.tiled_view import TiledView
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras
@@ -85,10 +85,10 @@ def mark_empty(opacities: np.ndarray) -> np.ndarray:
 
 def _blend_black(
     splats: Splats, views: Photos, view: int, tiles: np.ndarray | None = None
-) -> tuple[ViewPlan, np.ndarray]:
-    """Plan a view and blend black Gaussians in it; return the plan and the transmittance ``[h,w]``."""
-    plan = plan_view(splats, **views.camera(view), tiles=tiles)
-    return plan, blend(plan, np.zeros((len(plan.ids), 3), np.float32), np.zeros(3, np.float32))[1]
+) -> tuple[TiledView, np.ndarray]:
+    """Tile a view and blend black Gaussians in it; return the view and the transmittance ``[h,w]``."""
+    tiled = tile_view(splats, **views.camera(view), tiles=tiles)
+    return tiled, blend(tiled, np.zeros((len(tiled.ids), 3), np.float32), np.zeros(3, np.float32))[1]
 
 
 def _tiles_of(weights: np.ndarray) -> np.ndarray:
@@ -102,10 +102,10 @@ def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
     """Return the gradients of each Gaussian for the fog of a view, which is the weighted mean of its opacity."""
     assert views.weights is not None
     weights = views.weights[view]
-    plan, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
-    black, colors = np.zeros((*weights.shape, 3), np.float32), np.zeros((len(plan.ids), 3), np.float32)
+    tiled, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
+    black, colors = np.zeros((*weights.shape, 3), np.float32), np.zeros((len(tiled.ids), 3), np.float32)
     wanted = weights / np.float32(-weights.size)  # of the transmittance, which is 1 - opacity
-    g = gradients_of(plan, colors, black, transmittance, black, wanted, with_viewmat=False)
+    g = gradients_of(tiled, colors, black, transmittance, black, wanted, with_viewmat=False)
     return g[np.flatnonzero(np.abs(g.opacities) > TOUCHED)]
 
 

@@ -18,7 +18,7 @@ from gsmerge.types import Scene
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
 MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
 ALIKE = 0.01  # of the scale: the rounding of sizes
-BLOCK = 32  # pixels, at most
+PATCH = 32  # pixels, at most
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 
 
@@ -58,7 +58,7 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
 def largest_scale(scene: Scene) -> float:
     """Return the size of the photos as a multiple of the views' size, at least 1."""
     large = scene.large_photos
-    if large is None or scene.images is None or len(scene) == 0:
+    if large is None or len(scene) == 0:
         return 1.0
     focals = (0, 1), (0, 1)
     return max(1.0, float((large.Ks[0][focals] / scene.cameras.Ks[0][focals]).min()))
@@ -86,19 +86,19 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
-    """Return training weights ``[h,w]`` float32 per view: 0 on held-out blocks, else the weights of the photo.
+    """Return training weights ``[h,w]`` float32 per view: 0 on held-out patches, the photo's weights elsewhere.
 
-    Pixels with reduced weights are not held out. Pixels with no weight get ``HIDDEN``.
+    Pixels that count less are not held out; those that do not count at all have the weight ``HIDDEN``.
     """
-    size = max(1, min(BLOCK, min(photos.height, photos.width) // 4))
+    size = max(1, min(PATCH, min(photos.height, photos.width) // 4))
 
     def one_view(view: int) -> np.ndarray:
         rows, columns = -(-photos.height // size), -(-photos.width // size)
         random = np.random.default_rng([seed, view])
-        blocks = random.random((rows, columns)) < share
-        if not blocks.any():
-            blocks[random.integers(rows), random.integers(columns)] = rows * columns > 1
-        full = np.repeat(np.repeat(~blocks, size, 0), size, 1)[: photos.height, : photos.width]
+        patches = random.random((rows, columns)) < share
+        if not patches.any():
+            patches[random.integers(rows), random.integers(columns)] = rows * columns > 1
+        full = np.repeat(np.repeat(~patches, size, 0), size, 1)[: photos.height, : photos.width]
         if photos.weights is None:
             return full.astype(np.float32)
         weights = photos.weights[view]
@@ -113,9 +113,9 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 
 
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
-    """Return the PSNR (dB) of renders on the held-out blocks, where ``weights [h,w]`` are 0.
+    """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
-    Exposure is compensated if it differs by a factor of ``min_gain`` or more.
+    Exposure of the photos that differs by a factor of ``min_gain`` or more is compensated.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)

@@ -16,7 +16,7 @@ from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.project import CAMERA, CONIC, SUMS, TILE
 from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
 from gsmerge.kernels.signature import FilledTable
-from gsmerge.raster.view_plan import MANY, MANY_EACH, aligned_rows
+from gsmerge.raster.tiled_view import MANY, MANY_EACH, aligned_rows
 from gsmerge.runtime.threads import parallel_map
 
 SPARE = 1.25  # times the intersections of a view for which there is no room yet

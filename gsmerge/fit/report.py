@@ -18,9 +18,9 @@ class FitReport:
     """Facts about a fit and its scores."""
 
     method: str  # `"none"`, `"color"` or `"full"`: what the result comes from
-    accepted: bool  # Whether the held-out blocks got better; if not, nothing was changed
+    accepted: bool  # Whether the held-out patches got better; if not, nothing was changed
     steps: int  # Steps of the full fit, or conjugate-gradient steps
-    holdout_before: float  # PSNR (dB) on the held-out blocks before the fit
+    holdout_before: float  # PSNR (dB) on the held-out patches before the fit
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
@@ -55,7 +55,7 @@ def record_fit(report: FitReport | None) -> None:
         seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
         note(f"{seen}; --fit none makes none")
     if not report.accepted:
-        note("the fit was not accepted: held-out parts of the photos did not get better")
+        note("the fit was not accepted: held-out patches of the photos did not get better")
 
 
 def report_steps(step: int, steps: int, photos: float) -> None:

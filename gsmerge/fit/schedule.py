@@ -19,7 +19,7 @@ DROPOUT = 0.1  # share of the Gaussians that a step leaves out with few views
 LONG_DROPOUT = 0.05  # the same in runs of LONG_STEPS that look at each view often
 LONG_LOOKS = 30
 LARGE_STEPS = (0, 2)  # of every five, look at larger photos; with more of them the views' own size gets worse
-PROBE = 6  # steps that are timed to plan a time budget
+PROBE = 6  # steps that are timed to keep to a time budget
 MAX_STEPS = 2000
 LONG_RUN = 300  # steps beyond which the last ones shrink in proportion
 # How steps after those on half-size photos draw, in turn: whether at half size, the low-pass as a share of the
@@ -59,21 +59,21 @@ class DrawMode:
 
 
 @dataclass(frozen=True)
-class FitPlan:
-    """Plan of a full fit: weights of the pixels, dropout, and the share of steps at half size."""
+class FitRun:
+    """A full fit as it was prepared: weights of the pixels, dropout, and the share of steps at half size."""
 
     job: FitJob
-    # [h,w] float32 of each photo at half size: 0 on held-out blocks, if the fit is judged by them, `HIDDEN`
+    # [h,w] float32 of each photo at half size: 0 on held-out patches, if the fit is judged by them, `HIDDEN`
     # on pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
     # The same as a step uses them, at every size: 0 on hidden pixels; at full size 1 on held-out
-    # blocks, too, and larger photos count everywhere
+    # patches, too, and larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps, the first ones, on half-size photos
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside to fit after step ``step`` (from 1); None: no view."""
+        """Return the index of the view from outside that is fitted after step ``step`` (from 1); None: none."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -82,8 +82,8 @@ class FitPlan:
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.
 
-        Half-size photos come first. Full-size photos follow, drawn alternately in the way of different viewers, with
-        larger photos between them for enlarged views.
+        Half-size photos come first, then full-size ones, drawn in turn in the ways of different viewers. Larger photos
+        in between show what an enlarged view shows.
         """
         photos = self.job.photos
         if progress < self.half_part:
@@ -98,8 +98,8 @@ class FitPlan:
         return DrawMode(size, share * photos[0].eps2d, antialiased)
 
 
-def plan_run(job: FitJob) -> FitPlan:
-    """Plan a fit: held-out blocks, pixels outside masks, and dropout where there are few views."""
+def prepare_fit(job: FitJob) -> FitRun:
+    """Prepare a fit: held-out patches, pixels outside masks, and dropout where there are few views."""
     photos, options = job.photos, job.options
     few = len(photos[0]) <= FEW_VIEWS and options.steps >= MANY_STEPS
     long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
@@ -112,7 +112,7 @@ def plan_run(job: FitJob) -> FitPlan:
         trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
-    return FitPlan(job, weights, (everywhere, trained, *larger), dropout, options.half_res_part)
+    return FitRun(job, weights, (everywhere, trained, *larger), dropout, options.half_res_part)
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:
@@ -141,18 +141,18 @@ class Schedule:
     for dropout would change all results of few views and of long runs.
     """
 
-    def __init__(self, plan: FitPlan):
-        self.plan, self.rng = plan, np.random.default_rng(plan.job.seed)
+    def __init__(self, run: FitRun):
+        self.run, self.rng = run, np.random.default_rng(run.job.seed)
         self.queue: list[int] = []
 
     def draw(self, number: int, progress: float, count: int) -> Step:
-        """Return the plan of step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
+        """Draw step ``number`` (from 1) for ``count`` Gaussians; every view comes once per round."""
         if not self.queue:
-            self.queue = self.rng.permutation(len(self.plan.job.photos[0])).tolist()
+            self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
-        if self.plan.dropout > 0:
-            kept = self.rng.random(count, dtype=np.float32) >= self.plan.dropout
-        return Step(number, progress, self.plan.draw_mode(number, progress), view, background, kept)
+        if self.run.dropout > 0:
+            kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout
+        return Step(number, progress, self.run.draw_mode(number, progress), view, background, kept)
 
 
 def loss_weights(rates: Tuning, progress: float) -> tuple[float, float]:
@@ -167,14 +167,14 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
     return (np.repeat(each, [3, 3, 4, 1, 3]) * power(decay, progress)).astype(np.float32)
 
 
-def affordable_steps(seconds: float, plan: FitPlan) -> int:
+def affordable_steps(seconds: float, run: FitRun) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps at half size.
 
     A step at full size costs up to three times as much; a step on larger photos costs more in proportion to their
     pixels.
     """
-    budget, coarse = plan.job.options.time_budget, plan.half_part
+    budget, coarse = run.job.options.time_budget, run.half_part
     assert budget is not None
-    pixels = [photos.height * photos.width for photos in plan.job.photos]
+    pixels = [photos.height * photos.width for photos in run.job.photos]
     mean_step = seconds / PROBE * (coarse + 3 * (1 - coarse) * (1 + max(pixels) / pixels[0]) / 2)
     return int(np.clip((budget - seconds) / mean_step + PROBE, PROBE + 1, MAX_STEPS))

@@ -7,23 +7,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
 from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
-from gsmerge.fit.schedule import FitJob, plan_run
-from gsmerge.fit.scores import photo_error
-from gsmerge.fit.survey import survey_photos
+from gsmerge.fit.schedule import FitJob, prepare_fit
+from gsmerge.fit.survey import photo_error, survey_photos
 from gsmerge.raster import prepare
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # dB that the held-out blocks must gain; after less, the whole photos are compared
+CLOSE = 1.0  # dB that the held-out patches must gain; after less, the whole photos are compared
 ALWAYS = float("inf")  # where the full fit failed: it may have begun where another one ended
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
@@ -51,9 +49,9 @@ def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], opti
 def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Drop Gaussians that no photo shows, and fit the rest to the photos.
 
-    If the full fit does not improve held-out parts of the photos, the colour fit is tried. Views from outside are added
-    to the job. If the options need no photos, as in drafts without a fit, all Gaussians are returned and the report is
-    None.
+    If the full fit does not improve held-out patches of the photos, the colour fit is tried. Views from outside are
+    added to the job. If the options need no photos, as in drafts without a fit, all Gaussians are returned and the
+    report is None.
     """
     options = job.options
     if not options.needs_photos:  # it costs as much as all that was done before
@@ -68,14 +66,14 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a job with its views from outside."""
-    options, plan = job.options, plan_run(job)
-    survey = survey_photos(gaussians, plan)
+    options, run = job.options, prepare_fit(job)
+    survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
     if options.fit == "none":
         return kept, None
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, plan, survey[keep], fixed), CLOSE)
+    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])
@@ -96,12 +94,14 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport
 
 def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
     """Fit base colours alone to the half-size photos."""
+    from gsmerge.fit.color import draw, fit_colors  # few fits come here
+
     half = job.photos[1]
     return fit_colors(gaussians, draw(gaussians, half), half, job.options, job.seed)
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
-    """Return the fitted Gaussians, or their start if held-out blocks hardly gained and whole photos got worse.
+    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos got worse.
 
     Further steps of the default size only scatter Gaussians that are fitted already. After a gain of ``close`` dB or
     more the photos are not compared.

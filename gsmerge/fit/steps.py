@@ -2,34 +2,76 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.fit.fit_state import State
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import fog_gradients
-from gsmerge.fit.poses import PoseState, start_poses
 from gsmerge.fit.prepared_step import StepTables, is_prepared
-from gsmerge.fit.schedule import FitPlan, Step, loss_weights, step_sizes
+from gsmerge.fit.schedule import FitRun, Step, loss_weights, step_sizes
+from gsmerge.geometry import motion_matrices
+from gsmerge.kernels.elementary import power
 from gsmerge.kernels.gaussians import optimise as kernels
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster.blend import MAX_ALPHA
-from gsmerge.raster import plan_view
+from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos
-from gsmerge.raster.view_plan import camera_numbers
+from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.settings.fit import Tuning
 
 ROWS = 16384  # Gaussians per piece of an optimiser step
+EPS = 1e-15  # of Adam
+
+
+@dataclass(eq=False)
+class PoseState:
+    """Motions of the cameras under optimisation; their mean stays zero, so that the scene does not drift."""
+
+    start: np.ndarray  # [v,4,4] viewmats before the fit
+    viewmats: np.ndarray  # [v,4,4] float64, updated by steps, shared with all photos
+    # [v,6] motion of each, see gsmerge.geometry.motion_vectors: about the scene's middle, where
+    # turns and shifts of a camera show differently
+    x: np.ndarray
+    m: np.ndarray  # First moment
+    v: np.ndarray  # Second moment
+    counts: np.ndarray  # [v] steps of each
+    pixel: float  # Angle of a pixel, radians; also its size at the scene's depth
+
+    def step(self, view: int, gradient: np.ndarray, rates: Tuning, progress: float) -> None:
+        """Take one Adam step of a view by the gradient ``[4,4]`` of its viewmat; steps fall to zero at the end."""
+        turns = matmul(self.viewmats[view, :3, :3].T, gradient[:3])
+        (_, ab, ac), (ba, _, bc), (ca, cb, _) = turns[:, :3]
+        slope = np.array([cb - bc, ac - ca, ba - ab, *turns[:, 3]])
+        self.counts[view] += 1
+        for moment, beta, value in ((self.m, rates.beta1, slope), (self.v, rates.beta2, slope**2)):
+            moment[view] += (1 - beta) * (value - moment[view])
+        first_left, second_left = power([rates.beta1, rates.beta2], self.counts[view])
+        first, second = self.m[view] / (1 - first_left), self.v[view] / (1 - second_left)
+        self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * first / (np.sqrt(second) + EPS)
+        self.x -= self.x.mean(0)
+        self.viewmats[:] = matmul(self.start, motion_matrices(self.x))
+
+
+def start_poses(photos: tuple[Photos, ...]) -> tuple[PoseState, tuple[Photos, ...]]:
+    """Return motions of zero for the photos' cameras, and the photos with viewmats that the motions update."""
+    start = photos[0].viewmats.astype(np.float64)
+    zero, shared = np.zeros((len(start), 6)), start.copy()
+    pixel = 1 / float(photos[0].Ks[:, [0, 1], [0, 1]].mean())
+    state = PoseState(start, shared, zero, zero.copy(), zero.copy(), np.zeros(len(start), np.int64), pixel)
+    return state, tuple(replace(level, viewmats=shared) for level in photos)
 
 
 @dataclass(eq=False)
 class Optimiser:
     """Optimiser of a full fit: takes its steps, and moves cameras where the options ask for it."""
 
-    plan: FitPlan
-    photos: tuple[Photos, ...]  # Those of the plan's job, at the poses of the moment
+    run: FitRun
+    photos: tuple[Photos, ...]  # Those of the run's job, at the poses of the moment
     poses: PoseState | None  # The motions of the cameras; None where they are fixed
     tables: StepTables | None = None  # Of the state that took the last prepared step
 
@@ -41,19 +83,19 @@ class Optimiser:
     def step(self, state: State, step: Step) -> float:
         """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
         photos, mode, opacities = self.photos[step.mode.size], step.mode, None
-        weight = self.plan.step_weights[mode.size][step.view]
+        weight = self.run.step_weights[mode.size][step.view]
         if step.kept is not None:
-            fuller = state.splats.opacities / np.float32(1 - self.plan.dropout)
+            fuller = state.splats.opacities / np.float32(1 - self.run.dropout)
             opacities = step.kept * np.minimum(fuller, MAX_ALPHA)
         error = self._take_prepared(state, step, weight, opacities)
         if error is not None:
             return error / max(3 * float(weight.sum()), 1)
         camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
-        drawn = plan_view(state.splats, **camera, opacities=opacities)
+        drawn = tile_view(state.splats, **camera, opacities=opacities)
         all_colors = state.view_colors()
         colors = view_colors(drawn) if all_colors is None else all_colors.take(drawn.ids, 0)
         image, transmittance = blend(drawn, colors, step.background)
-        rates = self.plan.job.options.tuning
+        rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
         gradient, error = image_gradient(image, photos.image(step.view), weight, *weights)
         with_viewmat = self.poses is not None
@@ -75,7 +117,7 @@ class Optimiser:
                 tables = self.tables = StepTables(state, threads)
             mode, photos = step.mode, self.photos[step.mode.size]
             camera = photos.camera(step.view) | {"eps2d": mode.eps2d, "antialiased": mode.antialiased}
-            rates = self.plan.job.options.tuning
+            rates = self.run.job.options.tuning
             numbers = self._constants(state, step) | {
                 "camera": camera_numbers(**camera),
                 "background": step.background,
@@ -88,7 +130,7 @@ class Optimiser:
 
     def _constants(self, state: State, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""
-        options, count = self.plan.job.options, max(len(state.x), 1)
+        options, count = self.run.job.options, max(len(state.x), 1)
         rates = options.tuning
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
@@ -99,8 +141,8 @@ class Optimiser:
 
     def clear_fog(self, state: State, step: Step, view: int) -> None:
         """Take one Adam step against fog: opacity in a view from outside where the start was empty."""
-        assert self.plan.job.outside is not None
-        self._move(state, fog_gradients(state.splats, self.plan.job.outside, view), step)
+        assert self.run.job.outside is not None
+        self._move(state, fog_gradients(state.splats, self.run.job.outside, view), step)
 
     def _move(self, state: State, g: Gradients, step: Step) -> None:
         """Take one Adam step along gradients."""
@@ -120,10 +162,10 @@ class Optimiser:
         parallel_map(update, range(0, len(g.ids), ROWS))
 
 
-def make_optimiser(plan: FitPlan) -> Optimiser:
-    """Return the optimiser of a planned fit, with cameras at the poses of the photos."""
-    photos = plan.job.photos
-    if not plan.job.options.move_cameras:
-        return Optimiser(plan, photos, None)
+def make_optimiser(run: FitRun) -> Optimiser:
+    """Return the optimiser of a fit; its cameras are where the photos were taken."""
+    photos = run.job.photos
+    if not run.job.options.move_cameras:
+        return Optimiser(run, photos, None)
     poses, moving = start_poses(photos)
-    return Optimiser(plan, moving, poses)
+    return Optimiser(run, moving, poses)

@@ -1,17 +1,18 @@
-"""Survey of the start of a fit: what the photos show of each Gaussian."""
+"""Look at the photos during a fit: what they show of each Gaussian, and how well Gaussians show them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
-from gsmerge.fit.fit_state import start_state
-from gsmerge.fit.schedule import FitPlan
-from gsmerge.fit.scores import score_images
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.fit.fit_state import State, start_state
+from gsmerge.fit.photo_sizes import holdout_psnr
+from gsmerge.fit.schedule import FitRun
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
-from gsmerge.raster.photos import Photos
+from gsmerge.raster.photos import Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Gaussians
 
@@ -20,7 +21,7 @@ from gsmerge.types import Gaussians
 class Survey:
     """Facts that half-size photos show about each of the n Gaussians that a fit starts from."""
 
-    score: float  # PSNR (dB) of the held-out blocks of these pictures
+    score: float  # PSNR (dB) of the held-out patches of these pictures
     inside: np.ndarray  # [n] bool, whether some photo's frustum may hold it
     peaks: np.ndarray  # [n] float32 largest blending weight
     sums: np.ndarray  # [n] float64 blending weights summed over all photos, pixels
@@ -36,17 +37,17 @@ class Survey:
         return Survey(self.score, **columns)
 
 
-def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
-    """Draw Gaussians into the half-size photos of a planned fit, and collect how each photo shows each Gaussian.
+def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
+    """Draw Gaussians into the half-size photos of a fit, and collect what they show of each.
 
-    The other sizes, full size first, determine the size of the finest pixel. Without a fit the score is NaN.
+    The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
     """
-    photos = plan.job.photos
+    photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
     colors = state.view_colors()
 
     def one_view(view: int) -> tuple[np.ndarray, ...]:
-        drawn = plan_view(state.splats, **half.camera(view))
+        drawn = tile_view(state.splats, **half.camera(view))
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
@@ -59,7 +60,7 @@ def survey_photos(gaussians: Gaussians, plan: FitPlan) -> Survey:
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(score_images(images, plan, half), inside, peaks, sums, squares, pixels)
+    return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
@@ -73,11 +74,33 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
     splats = prepare(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
-        plan = plan_view(splats, **photos.camera(view))
-        return plan.ids, contributions(plan)[1]
+        tiled = tile_view(splats, **photos.camera(view))
+        return tiled.ids, contributions(tiled)[1]
 
     peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
     for ids, peaks in in_turn(one_view, range(len(photos))):
         inside[ids] = True
         np.maximum(peak, peaks, out=peak)
     return peak, inside
+
+
+def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
+    """Return the PSNR (dB) of renders on the held-out patches of the half-size photos; NaN if nothing is held out."""
+    options = plan.job.options
+    if options.fit == "none" or not options.judged:
+        return float("nan")
+    return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
+
+
+def score_state(state: State, plan: FitRun, half: Photos) -> float:
+    """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
+    return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
+
+
+def photo_error(gaussians: Gaussians, photos: Photos) -> float:
+    """Return the mean squared error of renders against whole photos."""
+
+    def score(view: int, image: np.ndarray, _: np.ndarray) -> float:
+        return float(((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(dtype=np.float64))
+
+    return float(np.mean(photo_errors(gaussians, photos, score)))

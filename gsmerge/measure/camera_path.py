@@ -77,7 +77,7 @@ def _parse_number(text: str | None, expected: str, most: float) -> float | None:
     return number
 
 
-def plan_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
+def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
     """Make the ``count`` cameras of an orbit or a spline through the cameras of a scene.
 
     Args:

@@ -16,7 +16,7 @@ from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES
-from gsmerge.measure.camera_path import parse_path, plan_path, viewing_depth
+from gsmerge.measure.camera_path import parse_path, sample_path, viewing_depth
 from gsmerge.measure.preview import (
     FOLDER,
     H264,
@@ -79,7 +79,7 @@ class DrawOptions:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A planned drawing: paths, facts, and a function that yields the pictures one by one."""
+    """A drawing before it is made: paths, facts, and a function that yields the pictures one by one."""
 
     paths: list[Path]  # Of the pictures, or that of the video
     facts: dict[str, Any]  # About them, for the report
@@ -87,7 +87,7 @@ class Drawing:
 
 
 @dataclass(frozen=True, eq=False)
-class Framed:
+class DrawnScenes:
     """Scenes to draw together, and the scene whose frame and views they share."""
 
     scenes: list[tuple[Path, Gaussians]]
@@ -101,7 +101,7 @@ class Framed:
     def draw(
         self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
     ) -> Iterator[tuple[Picture, ...]]:
-        """Yield the 8-bit pictures of all scenes for each camera; each thread has one view in memory."""
+        """Yield the 8-bit pictures of all scenes for each camera; memory holds one view per thread."""
         grey, antialiased = options.background, options.antialiased
         drawn = (
             render_in_turn(
@@ -123,47 +123,47 @@ def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, im
     return like if like.cameras is not None else replace(like, cameras=files.cameras)
 
 
-def plan_panel(options: DrawOptions) -> Drawing:
-    """Plan one picture: columns for photo, before and after, a row for each chosen view and one from outside."""
-    framed = _read(options, photos=True)
-    used = list(framed.load.views.used)
-    cameras, photos = framed.load.views.cameras[used], framed.load.views.images
+def prepare_panel(options: DrawOptions) -> Drawing:
+    """Prepare one picture of photo, before, after, ... with a row for each of some views and one from outside."""
+    group = _read(options, photos=True)
+    used = list(group.load.views.used)
+    cameras, photos = group.load.views.cameras[used], group.load.views.images
     ids = options.choose(len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
-        parts = [(path.name, gaussians) for path, gaussians in framed.scenes]
+        parts = [(path.name, gaussians) for path, gaussians in group.scenes]
         view_photos = photos[used] if len(photos) else None
         how = {"background": options.background, "antialiased": options.antialiased}
         rows = view_pictures(parts, cameras, view_photos, max_views=len(ids), **how)
         yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=len(photos) > 0, **how)])
 
-    facts = {"scenes": framed.counts(), "views": ids, "photos": len(photos) > 0, "notes": framed.notes}
+    facts = {"scenes": group.counts(), "views": ids, "photos": len(photos) > 0, "notes": group.notes}
     return Drawing([options.output], facts, draw)
 
 
-def plan_pictures(options: DrawOptions) -> Drawing:
-    """Plan one picture for each camera."""
-    framed = _read(options, photos=False)
-    ids = options.choose(len(framed.load.views.cameras))
-    views, stems = framed.load.views.cameras[ids], picture_stems(framed.load.views.names)
+def prepare_pictures(options: DrawOptions) -> Drawing:
+    """Prepare one picture for each camera."""
+    group = _read(options, photos=False)
+    ids = options.choose(len(group.load.views.cameras))
+    views, stems = group.load.views.cameras[ids], picture_stems(group.load.views.names)
     size = {"width": views.width, "height": views.height}
     return Drawing(
         [options.output / f"{stems[i]}.png" for i in ids],
-        {**size, "num_gaussians": len(framed.scenes[0][1]), "views": ids, "notes": framed.notes},
-        lambda threads: (picture for (picture,) in framed.draw(views, options, threads)),
+        {**size, "num_gaussians": len(group.scenes[0][1]), "views": ids, "notes": group.notes},
+        lambda threads: (picture for (picture,) in group.draw(views, options, threads)),
     )
 
 
-def plan_frames(options: DrawOptions) -> Drawing:
-    """Plan a video, or its frames as pictures, of the scenes side by side along a camera path."""
-    framed, cameras, near, ids = _path_cameras(options)
-    labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in framed.scenes]
+def prepare_frames(options: DrawOptions) -> Drawing:
+    """Prepare a video, or its frames as pictures, of the scenes side by side along a camera path."""
+    group, cameras, near, ids = _path_cameras(options)
+    labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
-        for drawn in framed.draw(cameras, options, threads, near):
+        for drawn in group.draw(cameras, options, threads, near):
             yield contact_sheet([list(zip(labels, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
 
-    facts = {"views": ids, "notes": framed.notes, "scenes": framed.counts(), "path": options.path}
+    facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
     if is_video(options.output):
         _check_frame(options.output, len(labels) * cameras.width, cameras.height)
@@ -178,7 +178,7 @@ def _check_frame(output: Path, width: int, height: int) -> None:
         raise SceneError(output, problem, FOLDER)
 
 
-def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[int]]:
+def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
     """Make the cameras of a path, and read the scenes that they are placed in.
 
     Returns the scenes, the cameras, the near plane, and the views that the path uses.
@@ -188,19 +188,19 @@ def _path_cameras(options: DrawOptions) -> tuple[Framed, Cameras, float, list[in
     file, separate = None if path else Path(options.path), True
     if file is not None and _lacks_cameras(options.like):
         options, separate = replace(options, like=replace(options.like, cameras=file)), False
-    framed = _read(options, photos=False)
-    placed = framed.load.views.cameras
-    cameras = placed if file is None or not separate else _place_file(file, framed.load)
+    group = _read(options, photos=False)
+    placed = group.load.views.cameras
+    cameras = placed if file is None or not separate else _place_file(file, group.load)
     ids = options.choose(len(cameras))
     cameras = cameras[ids]
-    depth = viewing_depth(cameras if file is None else placed, framed.scenes[0][1].means)
+    depth = viewing_depth(cameras if file is None else placed, group.scenes[0][1].means)
     if path is not None:
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            cameras = plan_path(path, cameras, depth, options.frames or max(PATH_FRAMES, least))
+            cameras = sample_path(path, cameras, depth, options.frames or max(PATH_FRAMES, least))
         except ValueError as error:
             raise UsageError(str(error)) from error
-    return framed, cameras, NEAR * depth, ids
+    return group, cameras, NEAR * depth, ids
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
@@ -210,8 +210,8 @@ def _place_file(file: Path, load: Loaded) -> Cameras:
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
-def plan_superpixels(options: DrawOptions) -> Drawing:
-    """Plan pictures of each photo's superpixels: borders, mean colours, and saliency."""
+def prepare_superpixels(options: DrawOptions) -> Drawing:
+    """Prepare pictures of each photo's superpixels: borders, mean colours, and saliency."""
     load, cut = load_files(options.files, opacity=options.opacity, hints=options.hints), options.segmentation
     assert cut is not None
     scene = load.pixel_scene()
@@ -230,7 +230,12 @@ def plan_superpixels(options: DrawOptions) -> Drawing:
     return Drawing([options.output / f"{stems[i]}.{kind}.png" for i in ids for kind in KINDS], facts, draw)
 
 
-PLANS = {"panel": plan_panel, "views": plan_pictures, "path": plan_frames, "superpixels": plan_superpixels}
+DRAWINGS = {
+    "panel": prepare_panel,
+    "views": prepare_pictures,
+    "path": prepare_frames,
+    "superpixels": prepare_superpixels,
+}
 
 
 def _lacks_cameras(files: SceneFiles) -> bool:
@@ -238,18 +243,18 @@ def _lacks_cameras(files: SceneFiles) -> bool:
     return files.cameras is None and files.images is None and read_sharp_camera(files.ply) is None
 
 
-def _read(options: DrawOptions, *, photos: bool) -> Framed:
+def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     """Read the scenes, and place the cameras in the frame of ``options.like``."""
     files, like, paths = options.files, options.like, options.paths
     first = read_rows(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
-    framed = first if same_file else read_rows(like, opacity="auto", hints=AUTO)
-    load = _with_views(place_cameras_in_scene(framed, like, hints=options.hints, photos=photos))
+    rows = first if same_file else read_rows(like, opacity="auto", hints=AUTO)
+    load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
-    return Framed(list(zip(paths, scenes, strict=True)), named if plys else list(notes[0]), load)
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), named if plys else list(notes[0]), load)
 
 
 def _with_views(load: Loaded) -> Loaded:

@@ -17,7 +17,7 @@ from gsmerge.facts.views import pick_views
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.raster import Splats, plan_view, prepare
+from gsmerge.raster import Splats, prepare, tile_view
 from gsmerge.raster.composite import blend
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
@@ -96,9 +96,9 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
 
 def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
     """Draw the opacity ``[h,w]`` of a scene in one camera."""
-    plan = plan_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    black = np.zeros((len(plan.ids) + 1, 3), np.float32)
-    return 1 - blend(plan, black[1:], black[0])[1]
+    tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
+    black = np.zeros((len(tiled.ids) + 1, 3), np.float32)
+    return 1 - blend(tiled, black[1:], black[0])[1]
 
 
 def fog_sums(reference: np.ndarray, result: np.ndarray) -> np.ndarray:

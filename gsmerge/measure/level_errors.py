@@ -20,7 +20,7 @@ from gsmerge.io.formats.streamed import Leaf
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.measure.fog import outside_cameras
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.raster import Splats, ViewPlan, plan_view, prepare
+from gsmerge.raster import Splats, TiledView, prepare, tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -75,26 +75,26 @@ class LevelErrors:
         present = [[level for level, rows in enumerate(leaf.rows) if len(rows)] for leaf in leaves]
         always = self.levels < 0
         drawn = always | (self.levels == np.array([levels[0] for levels in present])[leaf_of])
-        whole = self._draw(self._plan(camera, drawn))
+        whole = self._draw(self._tile(camera, drawn))
         lost = np.zeros((len(leaves), len(leaves[0].rows)))
         for number, (_, *coarser) in enumerate(present):
             inside = (leaf_of == number) & ~always
-            tiles = shown_tiles(self._plan(camera, inside))
+            tiles = shown_tiles(self._tile(camera, inside))
             pixels = tiles.repeat(TILE, 0).repeat(TILE, 1)[: camera.height, : camera.width]
             for level in coarser if tiles.any() else ():
-                picture = self._draw(self._plan(camera, np.where(inside, self.levels == level, drawn), tiles))
+                picture = self._draw(self._tile(camera, np.where(inside, self.levels == level, drawn), tiles))
                 lost[number, level] = np.square(picture[pixels] - whole[pixels], dtype=np.float64).sum()
         num_pixels = camera.width * camera.height
         return float(np.square(whole, dtype=np.float64).sum()) / num_pixels, lost / num_pixels
 
-    def _plan(self, camera: Cameras, keep: np.ndarray, tiles: np.ndarray | None = None) -> ViewPlan:
+    def _tile(self, camera: Cameras, keep: np.ndarray, tiles: np.ndarray | None = None) -> TiledView:
         viewmat, K = camera.viewmats[0], camera.Ks[0]
-        return plan_view(self.splats, viewmat, K, camera.width, camera.height, near=self.near, keep=keep, tiles=tiles)
+        return tile_view(self.splats, viewmat, K, camera.width, camera.height, near=self.near, keep=keep, tiles=tiles)
 
     @staticmethod
-    def _draw(plan: ViewPlan) -> np.ndarray:
+    def _draw(tiled: TiledView) -> np.ndarray:
         """Draw colours and opacity ``[h,w,4]``, since the background of a viewer is unknown."""
-        image, transmittance = blend(plan, view_colors(plan), np.zeros(3, np.float32))
+        image, transmittance = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))
         return np.concatenate([image, 1 - transmittance[..., None]], 2)
 
 
@@ -121,9 +121,9 @@ def level_errors(
     return LevelErrors(prepare(Gaussians.concat(padded)), numbers, tuple(pictures), near, progress)
 
 
-def shown_tiles(plan: ViewPlan) -> np.ndarray:
-    """Return a mask ``[tile_height, tile_width]`` of the tiles in which a plan shows something."""
-    return (np.diff(plan.isect_offsets) > 0).reshape(-(-plan.height // TILE), -1)
+def shown_tiles(tiled: TiledView) -> np.ndarray:
+    """Return a mask ``[tile_height, tile_width]`` of the tiles in which a view shows something."""
+    return (np.diff(tiled.isect_offsets) > 0).reshape(-(-tiled.height // TILE), -1)
 
 
 def coverage(leaves: Sequence[Leaf], camera: Cameras) -> np.ndarray:

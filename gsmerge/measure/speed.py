@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.sizes import zoom_cameras
-from gsmerge.raster import plan_view, prepare, render
+from gsmerge.raster import prepare, render, tile_view
 from gsmerge.raster.weights import view_weights
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
@@ -90,6 +90,6 @@ def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
     splats, entries = prepare(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in range(len(cameras)):
-        plan = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
-        entries += len(view_weights(plan).lanes)
+        tiled = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)
+        entries += len(view_weights(tiled).lanes)
     return entries / max(len(cameras) * cameras.width * cameras.height, 1)

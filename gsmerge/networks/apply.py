@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
@@ -29,6 +28,7 @@ from gsmerge.networks.tokens import (
     split_tables,
 )
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array, concat_columns, concat_rows, like

@@ -8,8 +8,8 @@ import numpy as np
 
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, LEAF, build_tree, nearest_of_others, sum_cross_view
-from gsmerge.moments import Members
-from gsmerge.raster.view_plan import pieces
+from gsmerge.pooling import Members
+from gsmerge.raster.tiled_view import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
 from gsmerge.networks.options import GROUP, MEMBER, PART
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
 TOKENS = 4096  # tokens of one table: a megabyte of activations, which stay in a processor's cache

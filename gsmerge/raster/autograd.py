@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 from gsmerge.kernels.raster.project import add_rows
 from gsmerge.raster.composite import Rendering, draw_views, prepare_views, view_colors
 from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, pose_gradient
-from gsmerge.raster.view_plan import Array, ViewPlan, plan_view
+from gsmerge.raster.tiled_view import Array, TiledView, tile_view
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -26,14 +26,14 @@ class _Render(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         cameras = replace(cameras, viewmats=tensors[-1])
         splats, viewmats, Ks = prepare_views(Gaussians(*tensors[:-1]), cameras)
-        plans: dict[int, ViewPlan] = {}
+        tiled: dict[int, TiledView] = {}
 
-        def plan_one(view: int) -> ViewPlan:
-            plans[view] = plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
-            return plans[view]
+        def tile_one(view: int) -> TiledView:
+            tiled[view] = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, **options)
+            return tiled[view]
 
-        drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
-        ctx.plans = plans
+        drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
+        ctx.views = tiled
         images, alphas = torch.from_numpy(drawn.images), torch.from_numpy(drawn.alphas)
         # kept through autograd, so that it notices when one of them was overwritten in the meantime
         ctx.save_for_backward(*tensors, images, alphas)
@@ -51,19 +51,19 @@ class _Render(torch.autograd.Function):
         totals = [np.zeros(tensor.shape, np.float32) for tensor in tensors[:-1]]
         poses = np.zeros(tensors[-1].shape)
         shade: ColorGradients | None = None
-        for view, plan in sorted(ctx.plans.items()):
+        for view, tiled in sorted(ctx.views.items()):
             image, left, grad_image, grad_alpha = (
                 np.ascontiguousarray(tensor.numpy())
                 for tensor in (images[view], lefts[view], grad_images[view], grad_alphas[view, ..., 0])
             )
-            colors, moves = view_colors(plan), ctx.needs_input_grad[-1]
-            shape = gradients_of(plan, colors, image, left, grad_image, -grad_alpha, moves)
-            shade = color_gradients(plan, shape.colors, colors, used=shade)
+            colors, moves = view_colors(tiled), ctx.needs_input_grad[-1]
+            shape = gradients_of(tiled, colors, image, left, grad_image, -grad_alpha, moves)
+            shade = color_gradients(tiled, shape.colors, colors, used=shade)
             rows = [shape.means + shade.means, shape.quats, shape.scales, shape.opacities, shade.sh0, shade.shN]
             for total, row in zip(totals, rows, strict=True):
-                add_rows(plan.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
+                add_rows(tiled.ids, row.reshape(len(row), total[:1].size), total.reshape(len(total), total[:1].size))
             if moves:
-                poses[view] = pose_gradient(plan, shape, shade)
+                poses[view] = pose_gradient(tiled, shape, shade)
         gradients = [
             torch.from_numpy(total).to(tensor.dtype) if needed else None
             for total, tensor, needed in zip([*totals, poses], tensors, ctx.needs_input_grad[4:], strict=True)

@@ -2,9 +2,9 @@
 
 For training loops, on arrays and without autograd::
 
-    plan = plan_view(splats, viewmat, K, width, height)
-    image, transmittance = composite(plan, colors, background)
-    wanted = plan_gradients(plan, grad_image, image=image, transmittance=transmittance, colors=colors)
+    tiled = tile_view(splats, viewmat, K, width, height)
+    image, transmittance = composite(tiled, colors, background)
+    wanted = view_gradients(tiled, grad_image, image=image, transmittance=transmittance, colors=colors)
     means[wanted.ids] -= rate * wanted.means
 
 :func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
@@ -22,7 +22,7 @@ from gsmerge.kernels.raster import sh
 from gsmerge.kernels.raster.blend import blend_backward, gather_slots
 from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.composite import view_colors
-from gsmerge.raster.view_plan import Array, ViewPlan, pieces, tile_ranges
+from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another thread: they take longer than forward
@@ -30,7 +30,7 @@ WORTH = 1 << 12  # intersections or Gaussians that are worth handing to another 
 
 @dataclass(frozen=True, eq=False)
 class Gradients:
-    """Gradients of a loss with respect to the Gaussians of a plan."""
+    """Gradients of a loss with respect to the Gaussians of a view."""
 
     ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
     means: Array  # [m,3] float32, through geometry alone (colours seen from elsewhere: color_gradients)
@@ -48,7 +48,7 @@ class Gradients:
 
 @dataclass(frozen=True, eq=False)
 class ColorGradients:
-    """Gradients of a loss through the colours of a plan's Gaussians in its view."""
+    """Gradients of a loss through the colours of the Gaussians of a view."""
 
     ids: Array  # [m] int32, ascending: the Gaussians that the rows belong to; all others have none
     sh0: Array  # [m,1,3] float32
@@ -71,7 +71,7 @@ def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
 
 
 def gradients_of(
-    plan: ViewPlan,
+    tiled: TiledView,
     colors: Array,
     image: Array,
     transmittance: Array,
@@ -79,9 +79,9 @@ def gradients_of(
     grad_left: Array | None,
     with_viewmat: bool,
 ) -> Gradients:
-    """Return the gradients of :func:`plan_gradients`, given contiguous float32 arrays that are not checked."""
-    m, splats = len(plan.ids), plan.splats
-    slots = np.empty((len(plan.flatten_ids), SUMS), np.float32)
+    """Return the gradients of :func:`view_gradients`, given contiguous float32 arrays that are not checked."""
+    m, splats = len(tiled.ids), tiled.splats
+    slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
     means, quats, scales, tints = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
     opacities = np.empty(m, np.float32)
@@ -89,18 +89,18 @@ def gradients_of(
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def tiles(span: tuple[int, int]) -> None:
-        blend_backward(*plan.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
+        blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:
-        gather_slots(plan.flatten_ids, slots, *span, sums)
+        gather_slots(tiled.flatten_ids, slots, *span, sums)
         project_backward(
-            splats.means, splats.quats, splats.scales, plan.opacities, plan.ids, sums, plan.camera, *span,
+            splats.means, splats.quats, splats.scales, tiled.opacities, tiled.ids, sums, tiled.camera, *span,
             means, quats, scales, opacities, poses,
         )  # fmt: skip
         tints[slice(*span)] = sums[slice(*span), :3]
 
     with use_threads() as threads:
-        parallel_map(tiles, tile_ranges(plan, threads, WORTH))
+        parallel_map(tiles, tile_ranges(tiled, threads, WORTH))
         parallel_map(project, _blocks(m, threads))
     viewmat = None
     if poses is not None:
@@ -108,11 +108,11 @@ def gradients_of(
         viewmat = np.zeros((4, 4))
         viewmat[:3, 3] = pose[9:]
         viewmat[:3, :3] = pose[:9].reshape(3, 3) + np.outer(pose[9:], splats.origin)
-    return Gradients(plan.ids, means, quats, scales, opacities, tints, viewmat)
+    return Gradients(tiled.ids, means, quats, scales, opacities, tints, viewmat)
 
 
-def plan_gradients(
-    plan: ViewPlan,
+def view_gradients(
+    tiled: TiledView,
     grad_image: Array,
     grad_transmittance: Array | None = None,
     *,
@@ -121,34 +121,35 @@ def plan_gradients(
     colors: Array | None = None,
     with_viewmat: bool = False,
 ) -> Gradients:
-    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made from a plan.
+    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
 
-    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are the gradients of the loss. ``image``, with
-    its background, and ``transmittance`` are the results of ``composite``, and ``colors`` its argument.
-    ``with_viewmat`` also computes the gradient of the world-to-camera matrix. Gradients are zero where alpha is clamped
-    at 0.99; the choice of the drawn weights has no gradient. Raises ValueError if an array has another shape.
+    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
+    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
+    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
+    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
+    which weights are drawn at all. Raises ValueError if an array has another shape.
     """
-    size = plan.height, plan.width
+    size = tiled.height, tiled.width
     grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
     transmittance = _expect("transmittance", transmittance, size)
     left = None if grad_transmittance is None else _expect("grad_transmittance", grad_transmittance, size)
-    drawn = view_colors(plan) if colors is None else _expect("colors", colors, (len(plan.splats), 3))[plan.ids]
-    return gradients_of(plan, drawn, image, transmittance, grad_image, left, with_viewmat)
+    drawn = view_colors(tiled) if colors is None else _expect("colors", colors, (len(tiled.splats), 3))[tiled.ids]
+    return gradients_of(tiled, drawn, image, transmittance, grad_image, left, with_viewmat)
 
 
 def color_gradients(
-    plan: ViewPlan, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
+    tiled: TiledView, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
 ) -> ColorGradients:
-    """Return the gradients of a loss through the spherical harmonics of a plan's Gaussians in its view.
+    """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
-    ``grad_colors [m,3]`` are gradients such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if
-    computed already; no gradient passes where they are clipped at 0. ``used``: an earlier result that is no longer
-    needed; its memory is reused if large enough, since allocation takes a quarter of the time or more. The gradient of
-    the eye is minus the sum of those of the means.
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if computed
+    already; no gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
+    longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
+    gradient of the eye is minus the sum of those of the means.
     """
-    m, splats = len(plan.ids), plan.splats
+    m, splats = len(tiled.ids), tiled.splats
     grad_colors = _expect("grad_colors", grad_colors, (m, 3))
-    colors = view_colors(plan) if colors is None else _expect("colors", colors, (m, 3))
+    colors = view_colors(tiled) if colors is None else _expect("colors", colors, (m, 3))
     rest = splats.shN.shape[1:]
     if used is not None and len(used.ids) >= m and used.shN.shape[1:] == rest:
         sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]
@@ -157,20 +158,20 @@ def color_gradients(
     with use_threads() as threads:
         parallel_map(
             lambda span: sh.view_colors_backward(
-                splats.means, splats.shN, plan.ids, plan.eye, *span, colors, grad_colors, sh0, shN, means
+                splats.means, splats.shN, tiled.ids, tiled.eye, *span, colors, grad_colors, sh0, shN, means
             ),
             pieces(m, threads),
         )
-    return ColorGradients(plan.ids, sh0, shN, means)
+    return ColorGradients(tiled.ids, sh0, shN, means)
 
 
-def pose_gradient(plan: ViewPlan, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
+def pose_gradient(tiled: TiledView, gradients: Gradients, shade: ColorGradients | None = None) -> Array:
     """Return the gradient ``[4,4]`` float64 of the viewmat, through geometry and, with ``shade``, through colours."""
     assert gradients.viewmat is not None
     viewmat = gradients.viewmat.copy()
     if shade is not None:
         # the eye is -R^T t, and moves against the means
         eye = -shade.means.sum(0, dtype=np.float64)
-        viewmat[:3, :3] -= np.outer(plan.viewmat[:3, 3], eye)
-        viewmat[:3, 3] -= matmul(plan.viewmat[:3, :3], eye)
+        viewmat[:3, :3] -= np.outer(tiled.viewmat[:3, 3], eye)
+        viewmat[:3, 3] -= matmul(tiled.viewmat[:3, :3], eye)
     return viewmat

@@ -1,4 +1,4 @@
-"""Rendering of Gaussians into every camera, and what a scene's views see: weights, depths, a plan of each view."""
+"""Rendering of Gaussians into every camera, and what a scene's views see: weights, depths, tile lists."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from gsmerge.raster.composite import (
     view_colors,
 )
 from gsmerge.raster.photos import NEAR
-from gsmerge.raster.view_plan import ViewPlan, plan_view, prepare
+from gsmerge.raster.tiled_view import TiledView, prepare, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, Scene, like
 
-ONE_AT_A_TIME = 4_000_000  # Gaussians; the plan of a view is as large as they are
+ONE_AT_A_TIME = 4_000_000  # Gaussians; a tiled view is as large as they are
 BAND_PIXELS = 1 << 22  # of a picture that are in memory as floating-point numbers; larger ones are drawn in bands
 MIN_ALPHA = 0.5  # opacity of a pixel from which it counts when superpixels are merged
 
@@ -84,8 +84,8 @@ def render(
 
         drawn = render_tensors(gaussians, cameras, under, with_depths=with_depths, **options)
     else:
-        plan_one = _planner(gaussians, cameras, options)
-        drawn = draw_views(plan_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
+        tile_one = _tiler(gaussians, cameras, options)
+        drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
     if not tensors:
         return drawn
     return Rendering(*(None if part is None else like(part, tensors[0]) for part in vars(drawn).values()))
@@ -106,50 +106,50 @@ def render_in_turn(
     At most ``at_once`` images are in memory; large images are drawn and converted in bands.
     """
     under = background_color(background)
-    plan_one = _planner(gaussians, cameras, {"antialiased": antialiased, "near": near})
+    tile_one = _tiler(gaussians, cameras, {"antialiased": antialiased, "near": near})
     lines, tall = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > tall:
         bands = [(first, min(first + tall, lines)) for first in range(0, lines, tall)]
         for view in range(len(cameras)):
-            plans = (plan_one(view, band) for band in bands)
-            yield np.concatenate([convert(blend(plan, view_colors(plan), under)[0]) for plan in plans])
+            parts = (tile_one(view, band) for band in bands)
+            yield np.concatenate([convert(blend(part, view_colors(part), under)[0]) for part in parts])
         return
     for first in range(0, len(cameras), at_once):
         count = min(at_once, len(cameras) - first)
         shape = count, cameras.height, cameras.width
-        yield from map(convert, draw_views(plan_one, shape, under, with_depths=False, first=first).images)
+        yield from map(convert, draw_views(tile_one, shape, under, with_depths=False, first=first).images)
 
 
-def _planner(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[..., ViewPlan]:
-    """Prepare the Gaussians for cameras, and return a function that plans the drawing of a view, or of a band of it."""
+def _tiler(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[..., TiledView]:
+    """Prepare the Gaussians for cameras, and return what tiles each view by its number, or a band of it."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
 
-    def plan_one(view: int, band: tuple[int, int] | None = None) -> ViewPlan:
-        return plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, band=band, **options)
+    def tile_one(view: int, band: tuple[int, int] | None = None) -> TiledView:
+        return tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, band=band, **options)
 
-    return plan_one
+    return tile_one
 
 
 def seen_weights(scene: Scene) -> np.ndarray:
     """Measure each Gaussian's largest summed blending weight in one view, ``[n]`` float32, pixels."""
     most, lock = np.zeros(len(scene.gaussians), np.float32), Lock()
 
-    def one_view(_: int, plan: ViewPlan) -> None:
-        sums, _peaks = contributions(plan)
+    def one_view(_: int, tiled: TiledView) -> None:
+        sums, _peaks = contributions(tiled)
         with lock:
             np.maximum(most, sums, out=most)
 
-    plan_views(scene, one_view)
+    tile_views(scene, one_view)
     return most
 
 
-def plan_views(scene: Scene, use: Callable[[int, ViewPlan], None]) -> None:
-    """Call ``use(view, plan)`` with the plan of every view, in parallel if memory allows."""
+def tile_views(scene: Scene, use: Callable[[int, TiledView], None]) -> None:
+    """Call ``use(view, tiled)`` with every view, tiled, in parallel if memory allows."""
     splats, cameras = prepare(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> None:
-        use(view, plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
+        use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
 
     if len(splats) <= ONE_AT_A_TIME:
         parallel_map(one_view, range(len(scene)))

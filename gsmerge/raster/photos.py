@@ -14,7 +14,7 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import psnr
-from gsmerge.raster.view_plan import Splats, plan_view, prepare
+from gsmerge.raster.tiled_view import Splats, prepare, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -22,7 +22,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 Score = TypeVar("Score")
 
 NEAR = 0.01  # near plane of every render that is scored, in canonical units
-ONE_AT_A_TIME = 400_000  # Gaussians; the plan of a view is as large as they are, so threads share one view instead
+ONE_AT_A_TIME = 400_000  # Gaussians; a tiled view is as large as they are, so threads share one view instead
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
 MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
 COVERED = np.float32(0.5)  # transmittance below which a pixel shows Gaussians
@@ -88,7 +88,7 @@ class Photos:
         return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
 
     def camera(self, view: int) -> dict[str, Any]:
-        """Return the arguments of :func:`gsmerge.raster.plan_view` for rendering into a photo."""
+        """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo."""
         return {
             "viewmat": self.viewmats[view],
             "K": self.Ks[view],
@@ -172,8 +172,8 @@ def photo_errors(
 
     def one_view(view: int) -> Score:
         shown, complete = (None if choose is None else choose(view) for choose in (keep, tiles))
-        plan = plan_view(splats, **photos.camera(view), near=near, keep=shown, tiles=complete)
-        return score(view, *composite(plan, colors))
+        tiled = tile_view(splats, **photos.camera(view), near=near, keep=shown, tiles=complete)
+        return score(view, *composite(tiled, colors))
 
     chosen = range(len(photos)) if views is None else views
     if len(splats) > ONE_AT_A_TIME:

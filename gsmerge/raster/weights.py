@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.kernels.raster import list_weights as kernels
-from gsmerge.raster import ViewPlan
+from gsmerge.raster import TiledView
 
 Array = NDArray[Any]
 
@@ -38,10 +38,10 @@ class ViewWeights:
         return self.starts, self.lanes, self.weights, self.flatten_ids, self.isect_offsets, self.tile_width
 
 
-def view_weights(plan: ViewPlan) -> ViewWeights:
-    """Compute the blending weights of a planned view."""
-    starts, lanes, weights = kernels.list_weights(*plan.lists, plan.height, plan.width)
-    return ViewWeights(plan.ids, *plan.lists[1:], starts, lanes, weights, plan.height, plan.width)
+def view_weights(tiled: TiledView) -> ViewWeights:
+    """Compute the blending weights of a tiled view."""
+    starts, lanes, weights = kernels.list_weights(*tiled.lists, tiled.height, tiled.width)
+    return ViewWeights(tiled.ids, *tiled.lists[1:], starts, lanes, weights, tiled.height, tiled.width)
 
 
 def apply(view: ViewWeights, colors: Array) -> Array:

@@ -1,8 +1,10 @@
-"""Commands and methods that installed packages add, found by their entry points."""
+"""What is imported at its first use: functions of optional parts, and what installed packages add as entry points."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import UsageError
@@ -11,6 +13,22 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of entry points
+
+
+@dataclass(frozen=True)
+class LazyFunction:
+    """A function by its module and name, which imports the module when it is called: for tables of formats."""
+
+    module: str
+    name: str
+
+    def __call__(self, *arguments: Any, **settings: Any) -> Any:
+        """Import the module, and call the function."""
+        return self.load()(*arguments, **settings)
+
+    def load(self) -> Any:
+        """Import the function."""
+        return getattr(import_module(self.module), self.name)
 
 
 @cache

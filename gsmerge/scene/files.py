@@ -14,15 +14,23 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path
-from gsmerge.io.cameras.npz_files import holds_images
-from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import find_cameras, find_other_cameras, read_cameras, read_sharp_camera
-from gsmerge.io.formats.depth_maps import FRAMES, SUFFIX, find_depth_maps, is_frame, own_cameras
+from gsmerge.io.cameras.read import (
+    CHUNK,
+    find_cameras,
+    find_other_cameras,
+    holds_images,
+    read_cameras,
+    read_sharp_camera,
+)
 from gsmerge.io.formats.ply import header_content, header_counts
+from gsmerge.io.formats.table import DEPTHS, FRAMES, POSES, SEVERAL_USES, is_frame
 from gsmerge.io.image_names import list_images
-from gsmerge.scene.no_gaussians import check_scene_file, no_gaussians
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import StrPath
 
+_CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file")
+_NO_GAUSSIANS = LazyFunction("gsmerge.scene.no_gaussians", "no_gaussians")
+_FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
 # The first that exists and is no result wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 # Of trained scenes, the one of the most steps: INRIA's, and gsplat's
@@ -106,7 +114,8 @@ def find_scene_files(
         raise SceneError(path, problem, f"name {path.parent}")
     for part in plys:
         check_file(part)
-        check_scene_file(part)
+        if part.suffix.lower() in SEVERAL_USES:
+            _CHECK_SCENE_FILE(part)
     base = path if ply != path else ply.parent
     folder = Path(os.path.realpath(ply.parent))
     above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
@@ -114,7 +123,7 @@ def find_scene_files(
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-    camera_path = _named(cameras) or (own_cameras(ply) if ply.suffix == SUFFIX else result_cameras(ply))
+    camera_path = _named(cameras) or (_depths_cameras(ply) if ply.suffix == DEPTHS.ending else result_cameras(ply))
     camera_path = camera_path or next((place for place in places if place is not None), None)
     image_path = _named(images)
     if image_path is None and is_frame(ply):
@@ -135,6 +144,11 @@ def find_scene_files(
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=tuple(plys) if len(plys) > 1 else ())
+
+
+def _depths_cameras(path: Path) -> Path:
+    """Return the file of the cameras that depth maps are placed by."""
+    return path.parent.parent / POSES if is_frame(path) else path
 
 
 def result_cameras(ply: Path) -> Path | None:
@@ -159,7 +173,7 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     if len(plys) == 1:
         return plys
     if not plys:
-        raise no_gaussians(folder)
+        raise _NO_GAUSSIANS(folder)
     places = {path.parent for path in plys}
     if is_frame(plys[0]):
         return plys
@@ -181,7 +195,7 @@ def list_plys(folder: Path) -> list[Path]:
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
-    plys = plys or find_depth_maps(folder) or _results_in(folder)
+    plys = plys or _FIND_DEPTH_MAPS(folder) or _results_in(folder)
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -9,9 +10,9 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import array_names
+from gsmerge.io.cameras.read import array_names
 from gsmerge.io.formats.ply import header_content
-from gsmerge.io.formats.table import may_hold_gaussians
+from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
 _NAME = "name the .ply of the Gaussians, or the folder that it is in"
@@ -63,6 +64,10 @@ POINTS_ONLY = (
 
 def no_gaussians(folder: Path) -> SceneError:
     """Make the error of a folder without a scene: what is there instead, and what to do."""
+    try:
+        os.scandir(folder).close()
+    except OSError as error:
+        return SceneError(folder, f"cannot be read ({error.strerror})")
     content, remedy = _content(folder) or ("", _NAME)
     problem = "expected a .ply of Gaussians in the folder, found none"
     return SceneError(folder, f"{problem} but {content}" if content else problem, remedy)
@@ -100,7 +105,7 @@ def _content(folder: Path) -> tuple[str, str] | None:
 def check_scene_file(path: Path) -> None:
     """Raise SceneError with the remedy for a file that is known to hold no Gaussians, such as ``results.npz``."""
     suffix = path.suffix.lower()
-    if suffix not in (".npz", ".glb") or not check_file(path) or may_hold_gaussians(path):
+    if suffix not in SEVERAL_USES or not check_file(path) or may_hold_gaussians(path):
         return
     if suffix == ".npz" and not array_names(path):  # damaged, which its reader says
         return

@@ -20,17 +20,13 @@ from gsmerge.alignment import (
     align,
     check_alignment,
     choose_rotations,
-    fill_from_depths,
-    find_padding,
-    guess_depths,
     read_rotations,
 )
-from gsmerge.alignment.registration.join import join_scenes
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
-from gsmerge.io.cameras.npz_files import holds_images, read_depths
+from gsmerge.io.cameras.read import holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
@@ -195,6 +191,8 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
     """Make one scene of several of the same place, with the notes of all."""
+    from gsmerge.alignment.registration.join import join_scenes
+
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
     scene, used = joined.scene, [loads[i] for i in joined.used]
     notes = [f"{name}: {text}" for name, load in zip(joined.names, loads, strict=True) for text in load.notes]
@@ -350,6 +348,8 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
     images = scene.images
     if images is None or scene.missing is None:
         return scene, []
+    from gsmerge.alignment import fill_from_depths, guess_depths
+
     depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
     source = "from the depth maps"
     if depths is not None:
@@ -373,6 +373,8 @@ def _place_rows(
     padding.
     """
     if result.pixel_ids is None:
+        from gsmerge.alignment import find_padding
+
         gaussians = ply.gaussians
         keep = ply.valid & ~find_padding(gaussians)
         count = int(ply.valid.sum()) - int(keep.sum())

@@ -5,31 +5,21 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from gsmerge.alignment import (
-    ESTIMATED,
-    check_cameras,
-    estimate_cameras,
-    estimate_focal,
-    estimate_from_rows,
-    estimate_with_photos,
-)
+from gsmerge.alignment import ESTIMATED
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.embedded import SHARP
-from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.read import CAMERA_PLACES, read_cameras, read_sharp_camera
-from gsmerge.io.formats.depth_maps import is_frame, read_images
+from gsmerge.io.cameras.read import CAMERA_PLACES, CHUNK, read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import (
     IMAGE_SUFFIXES,
     find_image,
-    list_images,
     match_images,
     match_masks,
     natural_key,
@@ -53,11 +43,12 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.files import MASK_PLACES, SceneFiles
-from gsmerge.scene.grid_photos import match_photos
 from gsmerge.types import Cameras, LargePhotos
 
+_READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
 _SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw
 _SHOWS_BETTER = 0.8  # of the colours' distance from other photos
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
@@ -73,67 +64,21 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
 
     If a file has only poses, the focal length is estimated; SceneError if that fails.
     """
+    stored = None
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
         if stored.focal is not None:
             return stored
-        photos = stored_photos(files, stored)
-        estimated = estimate_focal(ply, stored, photos)
-        if estimated is None:
-            reason = "no focal length fits the Gaussians" if len(photos) else "no photos that show them"
-            raise missing_intrinsics(stored.path, f", and {reason}")
-        return estimated
-    sharp = read_sharp_camera(files.ply)
+    sharp = read_sharp_camera(files.ply) if stored is None else None
     if sharp is not None:
         return sharp
+    from gsmerge.scene.estimate_cameras import estimate_cameras, estimate_focal, estimate_grid  # few files need it
+
+    if stored is not None:
+        return estimate_focal(ply, stored, stored_photos(files, stored))
     if files.images is None:
-        return _estimate_grid(ply, files.ply, images_beside(files.ply), files.ply.parent)
-    return _estimate_cameras(ply, files.ply, files.images) if files.images.is_dir() else _estimate_grid(ply, files.ply)
-
-
-def _estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile | None:
-    """Estimate cameras of the photos in a folder; None if rows and photos do not determine them.
-
-    SceneError if the rows are a grid whose views no photo shows.
-    """
-    paths = list_images(folder)
-    size = image_size(paths[0]) if paths else (0, 0)
-    names = [photo.relative_to(folder).as_posix() for photo in paths]
-    rows = ply.gaussians, ply.valid
-    cameras = estimate_cameras(path, *rows, names, *size)
-    if cameras is not None:
-        return cameras
-    cameras = _estimate_grid(ply, path, paths, folder)
-    if cameras is None:
-        return estimate_with_photos(path, *rows, names, size, partial(decode_images, paths))
-    if paths and cameras.photo_map is None:
-        grid = f"{len(cameras)} views of {cameras.widths[0]} x {cameras.heights[0]} pixels"
-        problem = f"expected photos of the {grid} whose grid the Gaussians are"
-        raise SceneError(folder, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
-    return cameras
-
-
-def _estimate_grid(
-    ply: GaussianFile, path: Path, paths: Sequence[Path] = (), folder: Path = Path()
-) -> CameraFile | None:
-    """Estimate the cameras of rows that form a grid, and find its photos in a folder; None for other rows."""
-    grid = estimate_from_rows(path, ply.gaussians, ply.valid)
-    if grid is None:
-        return None
-    cameras, pictures = grid
-    match = match_photos(pictures, paths)
-    if match is None:
-        return cameras
-    Ks = cameras.Ks.copy()
-    Ks[:, :2, 2] += match.trim
-    return replace(
-        cameras,
-        Ks=Ks,
-        widths=cameras.widths + 2 * match.trim,
-        heights=cameras.heights + 2 * match.trim,
-        names=tuple(paths[photo].relative_to(folder).as_posix() for photo in match.chosen),
-        photo_map=(match.size, match.transform),
-    )
+        return estimate_grid(ply, files.ply, images_beside(files.ply), files.ply.parent)
+    return estimate_cameras(ply, files.ply, files.images) if files.images.is_dir() else estimate_grid(ply, files.ply)
 
 
 def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
@@ -145,6 +90,8 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
     if usual is None or usual.name == _SEEN_PLACE or not (usual.parent / _SEEN_PLACE).is_dir():
         return files, []
     seen = usual.parent / _SEEN_PLACE
+
+    from gsmerge.alignment import check_cameras
 
     def ratio(images: Path) -> float:
         photos = stored_photos(replace(files, images=images), camera_file)
@@ -189,7 +136,7 @@ def _photos_inside(files: SceneFiles, camera_file: CameraFile) -> Photos:
     if files.images is None:
         return ()
     if is_frame(files.images):
-        return read_images(files.plys)
+        return _READ_IMAGES(files.plys)
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
     stored = (camera_file if same_file else read_cameras(files.images, scene=files.ply.stem)).images
     without = same_file and files.images.suffix == CHUNK and not len(stored)

@@ -85,11 +85,11 @@ class FitOptions(Settings):
     half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
         "By default 0.5, below 150 steps 0.7, below 20 all; less for more than 8.6 % of the Gaussians.",
         least=0, most=1)  # fmt: skip
-    holdout: float = setting(0.05, "Share of the photos' blocks that decides whether a fit is accepted.", above=0,
+    holdout: float = setting(0.05, "Share of the photos' patches that decides whether a fit is accepted.", above=0,
         below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight at some pixel of some photo; Gaussians below it "
         "in all photos that they lie in are left out.", least=0, most=1)  # fmt: skip
-    judged: bool = setting(True, "Whether the result has to show held-out blocks better than its start; not where the "
+    judged: bool = setting(True, "Whether the result has to show held-out patches better than its start; not where the "
         "start has seen them.", internal=True)  # fmt: skip
     move_cameras: bool = setting(False, "Whether the full fit moves the cameras on; a plan decides it by `poses`.",
         internal=True)  # fmt: skip

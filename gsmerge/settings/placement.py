@@ -30,6 +30,11 @@ class PlacementOptions(Settings):
             parse_triple(name, getattr(self, name))
 
     @property
+    def asked(self) -> bool:
+        """Whether the scene is changed at all."""
+        return self.moves or self.sh_degree is not None
+
+    @property
     def moves(self) -> bool:
         """Whether the scene is turned, scaled or moved."""
         return any(value is not None for value in (self.up, self.scale, self.rotate, self.translate))

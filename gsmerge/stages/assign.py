@@ -13,11 +13,10 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry import morton_codes
-from gsmerge.kernels.gaussians.fronts import weigh_centres
 from gsmerge.kernels.raster.contribution import dominant_labels
-from gsmerge.moments import Members, pool_members, scene_members, unaligned_members
-from gsmerge.raster import ViewPlan
-from gsmerge.raster.images import ONE_AT_A_TIME, plan_views
+from gsmerge.pooling import Members, pool_members, scene_members, unaligned_members
+from gsmerge.raster import TiledView
+from gsmerge.raster.images import ONE_AT_A_TIME, tile_views
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -59,6 +58,8 @@ def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     ties the first view counts. The front of a pixel is the Gaussian with the largest opacity x transmittance among
     those with their centre in it, or -1 without any.
     """
+    from gsmerge.kernels.gaussians.fronts import weigh_centres  # with networks alone
+
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
@@ -99,22 +100,22 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
-    def one_view(view: int, plan: ViewPlan) -> None:
-        values, labels = view_owners(plan, groups.labels[view], groups.counts[view])
+    def one_view(view: int, tiled: TiledView) -> None:
+        values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
         with lock:
-            old, first = best.values[plan.ids], best.views[plan.ids]
+            old, first = best.values[tiled.ids], best.views[tiled.ids]
             better = (values > old) | ((values == old) & (labels >= 0) & (view < first))
-            ids = plan.ids[better]
+            ids = tiled.ids[better]
             best.values[ids], best.views[ids], best.labels[ids] = values[better], view, labels[better]
 
-    plan_views(scene, one_view)
+    tile_views(scene, one_view)
     return best
 
 
-def view_owners(plan: ViewPlan, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def view_owners(tiled: TiledView, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and that superpixel ``[m]``."""
     labels = np.ascontiguousarray(labels, np.int32)
-    return dominant_labels(*plan.lists, labels, count)
+    return dominant_labels(*tiled.lists, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
-from gsmerge.moments import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.networks.corrector import ANALYTIC, Corrector
+from gsmerge.pooling import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions

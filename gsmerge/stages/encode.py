@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge.kernels.gaussians.pool import group_members
-from gsmerge.moments import Members, Moments, Rule, pool_members, scene_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
+from gsmerge.pooling import Members, Moments, Rule, pool_members, scene_members
 from gsmerge.runtime.record import choose, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
@@ -47,7 +47,7 @@ def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth")
     """Pool every superpixel into one Feature Gaussian, in order of view and label.
 
     Superpixels without a valid member are left out. ``rule``: see
-    :func:`gsmerge.moments.pool_members`.
+    :func:`gsmerge.pooling.pool_members`.
     """
     starts, ids, views = member_rows(scene, members, groups)
     return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.moments import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
+from gsmerge.pooling import Members
 from gsmerge.runtime.record import stage
 from gsmerge.types import Array, FeatureGaussians, Matches, Segmentation, as_tensor, to_float32
 

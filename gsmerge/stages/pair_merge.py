@@ -13,7 +13,7 @@ import numpy as np
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.cross_view import LEAF, build_tree
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
-from gsmerge.moments import MAX_OPACITY, principal_axes
+from gsmerge.pooling import MAX_OPACITY, principal_axes
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, to_float32

@@ -47,7 +47,7 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (
 
 
 @dataclass(frozen=True, eq=False)
-class SuperpixelPlan:
+class SuperpixelChoices:
     """Method, limits and numbers for cutting a scene into superpixels."""
 
     options: SegmentOptions  # Method and number
@@ -57,16 +57,16 @@ class SuperpixelPlan:
 
 
 @stage("segment")
-def segment_scene(scene: PicturedScene, plan: SuperpixelPlan, count: int | None) -> Segmentation:
+def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
     """Cut every view into superpixels, by the options or so that they give exactly ``count`` Gaussians.
 
     For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many; a finer tree is
     built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
     budget, the tree is cut at the largest allowed count instead.
     """
-    limits, options, views = plan.limits, plan.options, len(scene)
+    limits, options, views = choices.limits, choices.options, len(scene)
     if count is None:
-        pictures, each = scene.images, max(1, int(limits.per_view * plan.start_share))
+        pictures, each = scene.images, max(1, int(limits.per_view * choices.start_share))
         if not options.adapts:
             return Segmentation(segment(pictures, options, each), limits.default, exact=False)
         # to the number in the end, of which the fit begins with a share
@@ -75,8 +75,8 @@ def segment_scene(scene: PicturedScene, plan: SuperpixelPlan, count: int | None)
         if count <= limits.max_count:
             return Segmentation(groups, count, exact=False)
         count = limits.max_count
-    tree = plan.tree
-    first = max(views, int(count * plan.start_share))
+    tree = choices.tree
+    first = max(views, int(count * choices.start_share))
     if tree is None or first > len(tree):
         tree = scene_tree(scene, options, limits, count)
     return Segmentation(cut_tree(tree, first), count, exact=True)
@@ -91,10 +91,10 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
     return region_tree(pictures, depths, segment(pictures, options, leaves), valid)
 
 
-def knee_count(scene: PicturedScene, plan: SuperpixelPlan) -> int:
+def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
     """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
-    limits = plan.limits
-    tree = plan.tree or scene_tree(scene, plan.options, limits, limits.default)
+    limits = choices.limits
+    tree = choices.tree or scene_tree(scene, choices.options, limits, limits.default)
     return max(limits.min_count, min(auto_count(tree), limits.max_count))
 
 

@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
@@ -208,6 +207,8 @@ def _lab_colours(pixels: np.ndarray) -> np.ndarray:
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str, adapt: float | None) -> np.ndarray:
     """Run BASS from hexagonal or from saliency seeds; return padded labels."""
+    from gsmerge.kernels.superpixels.bass import adapt_labels, infer_labels
+
     height, width, _ = pixels.shape
     if segmentation == "bass":
         seeds = hexagonal_seeds(height, width, count)

@@ -9,9 +9,9 @@ from typing import Any
 from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import merge_settings
 from gsmerge.states.decode import decode_state
 from gsmerge.states.extend import BatchReport, extend
-from gsmerge.states.options import merge_settings
 from gsmerge.states.state import State
 from gsmerge.states.state_file import load_state, save_state
 from gsmerge.types import Gaussians, Scene
@@ -26,7 +26,7 @@ class Compactor:
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.states.options.ExtendOptions`: ``Compactor(superpixels="3%", max_k=2)``.
+            :class:`gsmerge.settings.extend.ExtendOptions`: ``Compactor(superpixels="3%", max_k=2)``.
 
     Raises:
         ValueError: If a setting is unknown or out of range.

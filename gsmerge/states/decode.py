@@ -21,19 +21,19 @@ from gsmerge.types import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
-class DecodePlan:
+class DecodeCounts:
     """Number of Gaussians to decode, per group and in all."""
 
-    counts: np.ndarray  # [g] most Gaussians of each group
+    per_group: np.ndarray  # [g] most Gaussians of each group
     min_contribution: float  # See StoredSettings; 0: contributions are not measured
     total: int | None = None  # Gaussians to be met; None: as many as can be seen
     notes: tuple[str, ...] = ()  # What differs from what was asked for, one sentence each
 
 
-def plan_decode(
+def count_children(
     state: State, groups: DividedGroups, *, k: int | None = None, budget: int | str | None = None
-) -> DecodePlan:
-    """Plan how many Gaussians each group of a state becomes; see :func:`decode_state`."""
+) -> DecodeCounts:
+    """Count the Gaussians that each group of a state becomes; see :func:`decode_state`."""
     s = state.settings
     if budget is not None and k is not None:
         raise UsageError("expected one of k and budget, got both")
@@ -42,11 +42,11 @@ def plan_decode(
         return _distribute(state, groups, s.target_count)
     if auto:
         knee = s.knee_count or len(groups)
-        plan = _distribute(state, groups, max(len(groups), knee))
+        counts = _distribute(state, groups, max(len(groups), knee))
         if knee >= len(groups):
-            return plan
+            return counts
         note = f"budget auto would take {knee} Gaussians, fewer than there are groups; begin a state with budget auto"
-        return replace(plan, notes=(note,))
+        return replace(counts, notes=(note,))
     if budget is not None:
         return _distribute(state, groups, _group_budget(state, groups, budget))
     number = s.k if k is None else k
@@ -54,9 +54,9 @@ def plan_decode(
         more = "" if s.max_k == MAX_CHILDREN else ", as its first batch set (more with a larger max k)"
         raise UsageError(f"k: expected 1 to {s.max_k}{more}, got {number!r}")
     if s.num_slots is not None:
-        plan = _distribute(state, groups, s.num_slots * number)
-        return replace(plan, min_contribution=s.min_contribution, total=None)
-    return DecodePlan(np.full(len(groups), number), s.min_contribution)
+        counts = _distribute(state, groups, s.num_slots * number)
+        return replace(counts, min_contribution=s.min_contribution, total=None)
+    return DecodeCounts(np.full(len(groups), number), s.min_contribution)
 
 
 def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int:
@@ -74,31 +74,31 @@ def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int
     return count - state.num_kept
 
 
-def _distribute(state: State, groups: DividedGroups, total: int) -> DecodePlan:
+def _distribute(state: State, groups: DividedGroups, total: int) -> DecodeCounts:
     """Distribute a number of Gaussians to the groups where they help most."""
     order, extra = groups.division.growth_order, max(0, total - len(groups))
     counts = 1 + np.bincount(order[:extra], minlength=len(groups))
     if extra <= len(order):
-        return DecodePlan(counts, 0.0, total)
+        return DecodeCounts(counts, 0.0, total)
     limit, count = len(groups) + len(order) + state.num_kept, total + state.num_kept
     note = f"{count} Gaussians were asked for, and the groups divide into {limit} at most"
-    return DecodePlan(counts, 0.0, total, (note,))
+    return DecodeCounts(counts, 0.0, total, (note,))
 
 
-def decode_planned(state: State, groups: DividedGroups, plan: DecodePlan) -> Gaussians:
-    """Decode the planned number of canonical Gaussians, without a fit."""
+def decode_counts(state: State, groups: DividedGroups, wanted: DecodeCounts) -> Gaussians:
+    """Decode these numbers of canonical Gaussians, without a fit."""
     s, cameras = state.settings, state.cameras
-    if plan.total is None:
-        gaussians, _ = children_of(groups, plan.counts, cameras)
+    if wanted.total is None:
+        gaussians, _ = children_of(groups, wanted.per_group, cameras)
         gaussians = gaussians[gaussians.opacities >= s.min_opacity]
     else:
-        order, total = groups.division.growth_order, plan.total
+        order, total = groups.division.growth_order, wanted.total
         gaussians = deal_visible(
             order, len(groups), total, s.min_opacity, lambda counts: children_of(groups, counts, cameras)[0]
         )
-    if plan.min_contribution > 0:
-        gaussians = gaussians[visible_mask(gaussians, blank_photos(cameras, 2), plan.min_contribution)]
-    return gaussians if state.kept is None else Gaussians.concat([gaussians, state.kept])
+    if wanted.min_contribution > 0:
+        gaussians = gaussians[visible_mask(gaussians, blank_photos(cameras, 2), wanted.min_contribution)]
+    return Gaussians.concat([gaussians, state.kept])
 
 
 @dataclass(frozen=True)
@@ -150,17 +150,17 @@ def decode_state(
     options = options or FitOptions(fit="full" if len(state.replay) else "none")
     check_fit(state, options)
     groups = divide_groups(state, fitted_colors=options.fit == "none")
-    plan = plan_decode(state, groups, k=k, budget=budget)
+    counts = count_children(state, groups, k=k, budget=budget)
     if options.fit == "none":
         with use_threads(threads):
-            return DecodeResult(state.frame.leave(decode_planned(state, groups, plan)), None, plan.notes)
-    notes = plan.notes
+            return DecodeResult(state.frame.leave(decode_counts(state, groups, counts)), None, counts.notes)
+    notes = counts.notes
     if options.photo_scale not in ("auto", 1):
         notes = *notes, f"photo_scale {options.photo_scale:g} is 1: a state stores its photos at the size of its views"
-    max_count = int(plan.counts.sum())
+    max_count = int(counts.per_group.sum())
     start_count = max(len(groups), int(start_share(options) * max_count)) + state.num_kept
     with use_threads(threads), record_run(progress) as record:
-        gaussians = decode_planned(state, groups, plan_decode(state, groups, budget=start_count))
+        gaussians = decode_counts(state, groups, count_children(state, groups, budget=start_count))
         images = state.replay.images.astype(np.float32) / np.float32(255)
         cameras = state.cameras[state.replay.views]
         photos = photos_of(images, cameras), photos_of(images, cameras, 2)
@@ -169,7 +169,7 @@ def decode_state(
             gaussians, report = fit(gaussians, job)
         notes = *notes, *record.notes
         if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
-            note = "the fit was not accepted: held-out parts of the photos did not get better"
+            note = "the fit was not accepted: held-out patches of the photos did not get better"
             groups, notes = divide_groups(share(state)), (*notes, note)
-            gaussians = decode_planned(state, groups, plan_decode(state, groups, k=k, budget=budget))
+            gaussians = decode_counts(state, groups, count_children(state, groups, k=k, budget=budget))
     return DecodeResult(state.frame.leave(gaussians), report, notes)

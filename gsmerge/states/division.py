@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import gather_groups
-from gsmerge.moments import Members, feature_to_gaussians
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.stages.decode import deal_order, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
 

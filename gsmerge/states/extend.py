@@ -17,11 +17,16 @@ from gsmerge.runtime.record import Progress, choose, note, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MAX_CHILDREN, USUAL_K
 from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews, take
 from gsmerge.stages.segment import knee_count
-from gsmerge.states.batch import (
+from gsmerge.states.extend_decoded import DECODED
+from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
+from gsmerge.states.groups import select_groups, share, share_groups
+from gsmerge.states.state import DividedGroups, GroupSet, State, StoredSettings, no_photos
+from gsmerge.states.view_batch import (
     Batch,
     BatchFeatures,
     StateKind,
@@ -31,11 +36,6 @@ from gsmerge.states.batch import (
     rows_in_view,
     update_replay,
 )
-from gsmerge.states.extend_latents import LATENTS, keeps_latents, own_checkpoint
-from gsmerge.states.extend_moments import MOMENTS
-from gsmerge.states.groups import select_groups, share, share_groups
-from gsmerge.states.options import ExtendOptions
-from gsmerge.states.state import Colors, DividedGroups, GroupSet, State, StoredSettings, no_photos
 from gsmerge.types import Gaussians, Scene
 
 USUAL_MAX_K = 4  # children that are stored of a group, unless more are asked for, or a number of Gaussians is
@@ -87,10 +87,10 @@ def extend(
         count = choose_count(prepared, plan, build)
         if keep_all(prepared.scene, count) is not None:
             raise UsageError(f"budget: {count} keeps every Gaussian, which needs no state; use compact without one")
-        has_latents = keeps_latents(plan) if state is None else state.networks is not None
+        has_latents = keeps_latents(plan) if state is None else state.keeps_latents
         if keeps_latents(plan) and not has_latents:
             note("the state holds no latents: groups of this batch are decoded when they enter")
-        batch, kind = make_batch(state, prepared, plan, extend_options), LATENTS if has_latents else MOMENTS
+        batch, kind = make_batch(state, prepared, plan, extend_options), LATENTS if has_latents else DECODED
         if not batch.is_new.all():
             note(
                 f"views with the cameras of earlier ones, which count once: {sum(~batch.is_new)} of {len(batch.is_new)}"
@@ -102,7 +102,7 @@ def extend(
         else:
             state, others = _join(state, new, batch, kind)
             counts |= others
-        if new.networks is not None:
+        if has_latents:
             choose(groups=counts["num_new"], clusters=len(state), **plan.network_facts)
         if prepared.reference.score_views:
             state = _with_photos(state, batch)
@@ -135,7 +135,7 @@ def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
     )
     return State(
         groups=groups,
-        kept=plan.unseen if len(plan.unseen) else None,
+        kept=plan.unseen,
         frame=prepared.frame,
         cameras=in_float64(cameras),
         replay=no_photos(cameras),
@@ -166,7 +166,6 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
             counts["num_covered"] = len(new.features) - len(novel)
             new = replace(new, features=take(new.features, novel))
     groups, joined = kind.join(groups, rows, new, batch, settings.max_k)
-    kept = [gaussians for gaussians in (state.kept, batch.plan.unseen) if gaussians is not None and len(gaussians)]
     settings = replace(
         settings,
         num_input=settings.num_input + batch.num_new,
@@ -176,7 +175,7 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
     state = replace(
         state,
         groups=groups,
-        kept=Gaussians.concat(kept) if kept else None,
+        kept=Gaussians.concat([state.kept, batch.plan.unseen]),
         cameras=concat_cameras(state.cameras, cameras[batch.is_new]),
         settings=settings,
         networks=new.networks,
@@ -187,13 +186,12 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
 def _with_photos(state: State, batch: Batch) -> State:
     """Fit colours to a batch's photos, except colours from decoder heads, and store some of the photos."""
     groups = state.groups
-    if batch.extend_options.fit_colors and state.networks is None:
+    if batch.extend_options.fit_colors and not state.keeps_latents:
         with stage("fit"):
             shared = share_groups(groups, state.cameras, 1) if isinstance(groups, DividedGroups) else groups
             shared, report = fit_batch_colors(shared, batch.photos, batch.plan.fit, batch.plan.seed)
             choose(fit=report.to_dict())
-        colors = Colors(shared.fitted_sh0, shared.color_precision)
-        groups = replace(groups, colors=colors) if isinstance(groups, DividedGroups) else shared
+        groups = replace(groups, colors=shared.colors)
     replay = update_replay(state.replay, batch.photos, batch.view_ids, len(state.cameras), batch.extend_options.replay)
     return replace(state, groups=groups, replay=replay)
 

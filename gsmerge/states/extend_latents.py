@@ -7,18 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with_group_features, find_neighbors
 from gsmerge.networks.checkpoint import IN_PACKAGE, Checkpoint, load_checkpoint
 from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.plan import Plan
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import MatchOptions
@@ -28,7 +29,6 @@ from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.segment import segment_scene
-from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.states.division import divide_all
 from gsmerge.states.groups import concat_groups, limit_children, make_groups, select_groups, without_members
 from gsmerge.states.state import (
@@ -40,6 +40,7 @@ from gsmerge.states.state import (
     StateNetworks,
     ViewSamples,
 )
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border
@@ -167,9 +168,8 @@ def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatur
 
 def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     """Match, merge and refine the Feature Gaussians of a first batch, as for a scene of its views."""
-    context, networks = new.context, new.networks
+    context = new.context
     assert isinstance(context, NetworkContext)
-    assert networks is not None
     merged = merge(new.features, match(new.features, batch.plan.match, context), context)
     refined = refine(merged, context)
     with stage("decode"):
@@ -177,7 +177,7 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
         return DividedGroups(
             without_members(merged),
             divide_all(refined, new.members, max_k),
-            Heads(networks.weights, described.views, described.group),
+            Heads(cast("NetworkWeights", context.networks), described.views, described.group),
             learned=Learned(without_members(refined), described.views, np.diff(refined.starts)),
         )
 

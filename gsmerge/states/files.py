@@ -29,11 +29,11 @@ from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import merge_settings
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.states.decode import check_fit, decode_state, plan_decode
+from gsmerge.states.decode import check_fit, count_children, decode_state
 from gsmerge.states.extend import extend
 from gsmerge.states.groups import divide_groups
-from gsmerge.states.options import merge_settings
 from gsmerge.states.state import State
 from gsmerge.states.state_file import load_state, save_state
 
@@ -157,10 +157,10 @@ def compact_file(
         "budget": budget,
     }  # fmt: skip
     if dry_run:
-        plan = plan_decode(state, divide_groups(state), k=k, budget=count)
-        most = int(plan.counts.sum()) + state.num_kept
+        counts = count_children(state, divide_groups(state), k=k, budget=count)
+        most = int(counts.per_group.sum()) + state.num_kept
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
-        return document | output | {"notes": [*plan.notes, *notes]}
+        return document | output | {"notes": [*counts.notes, *notes]}
     with atomic_output(out, overwrite=overwrite) as temporary:
         decoded = decode_state(
             state, k=k, budget=count, options=fit_options, seed=settings.seed, threads=settings.threads,

@@ -8,12 +8,12 @@ import numpy as np
 
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
-from gsmerge.moments import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.networks.corrector import Corrector
+from gsmerge.pooling import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
 from gsmerge.stages.decode import divide
 from gsmerge.stages.merge import take
 from gsmerge.states.division import divide_all, divide_by_heads, pick_children
-from gsmerge.states.state import DividedGroups, GroupSet, Heads, Learned, State
+from gsmerge.states.state import Colors, DividedGroups, GroupSet, Heads, Learned, State
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, to_float32
 
 CHILD_FOOTPRINT = 1e-3  # of the group's: children need no least size, as it is in their own
@@ -25,7 +25,7 @@ def without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def bake(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> GroupSet:
-    """Convert groups to moments and children, so that gains, latents and decoder heads are no longer needed."""
+    """Decode groups into pooled Gaussians and children, so that neither gains, latents nor heads are needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
@@ -41,8 +41,8 @@ def make_groups(
     """Make groups without fitted colours; ``parents``: rising group of each child."""
     if learned is not None:
         learned = replace(learned, refined=without_members(learned.refined))
-    precision = np.zeros(len(features), np.float32)
-    return GroupSet(with_child_rows(features, parents), children, features.sh0, precision, learned)
+    colors = Colors(features.sh0, np.zeros(len(features), np.float32))
+    return GroupSet(with_child_rows(features, parents), children, colors, learned)
 
 
 def decoding_to(ones: Gaussians, features: FeatureGaussians) -> FeatureGaussians:
@@ -83,8 +83,7 @@ def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
     children = groups.children[features.members]
     members = np.arange(len(children))
     learned = None if groups.learned is None else groups.learned[rows]
-    colors = groups.fitted_sh0[rows], groups.color_precision[rows]
-    return GroupSet(replace(features, members=members), children, *colors, learned)
+    return GroupSet(replace(features, members=members), children, groups.colors[rows], learned)
 
 
 def concat_groups(sets: list[GroupSet]) -> GroupSet:
@@ -95,8 +94,7 @@ def concat_groups(sets: list[GroupSet]) -> GroupSet:
     return GroupSet(
         replace(features, members=np.arange(len(children))),
         children,
-        np.concatenate([groups.fitted_sh0 for groups in sets]),
-        np.concatenate([groups.color_precision for groups in sets]),
+        Colors.concat([groups.colors for groups in sets]),
         Learned.concat(learned) if learned else None,
     )
 
@@ -121,9 +119,9 @@ def replace_groups(groups: GroupSet, rows: np.ndarray, new_groups: GroupSet) -> 
 
 def with_fitted_colors(groups: GroupSet) -> GroupSet:
     """Return groups and children in the colours fitted to the photos."""
-    offsets = groups.fitted_sh0 - groups.features.sh0
+    offsets = groups.colors.sh0 - groups.features.sh0
     sizes = np.diff(groups.features.starts)
-    features = replace(groups.features, sh0=groups.fitted_sh0)
+    features = replace(groups.features, sh0=groups.colors.sh0)
     children = replace(groups.children, sh0=groups.children.sh0 + offsets.repeat(sizes, 0))
     return replace(groups, features=features, children=children)
 
@@ -155,7 +153,7 @@ def _undecoded_children(groups: DividedGroups, counts: np.ndarray) -> tuple[Gaus
 
 
 def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSet:
-    """Return groups that other batches can join: as moments with up to ``max_k`` children, or with their latents."""
+    """Return groups that other batches can join: decoded, with up to ``max_k`` children, or with their latents."""
     most = np.full(len(groups), max_k)
     if groups.learned is not None and groups.heads is not None:
         children, parents = _undecoded_children(groups, most)
@@ -165,9 +163,7 @@ def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSe
     else:
         ones, _ = children_of(groups, np.ones(len(groups), np.int64), cameras)
         shared = make_groups(decoding_to(ones, groups.features), *children_of(groups, most, cameras))
-    if groups.colors is None:
-        return shared
-    return replace(shared, fitted_sh0=groups.colors.sh0, color_precision=groups.colors.precision)
+    return shared if groups.colors is None else replace(shared, colors=groups.colors)
 
 
 def share(state: State) -> State:
@@ -188,7 +184,7 @@ def divide_groups(state: State, *, fitted_colors: bool = True) -> DividedGroups:
     groups, max_k, networks = state.groups, state.settings.max_k, state.networks
     if isinstance(groups, DividedGroups):
         return groups
-    if fitted_colors and networks is None:
+    if fitted_colors and not state.keeps_latents:
         groups = with_fitted_colors(groups)
     features, members = groups.features, child_members(groups)
     if networks is None or groups.learned is None:

@@ -26,8 +26,8 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.stages import MAX_CHILDREN
-from gsmerge.states.options import SUFFIX
 from gsmerge.states.state import StoredSettings
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
@@ -173,7 +173,7 @@ class GsmFile:
         viewmats = self.array("cameras.viewmats", np.float64, None, 4, 4)
         Ks = self.array("cameras.Ks", np.float64, len(viewmats), 3, 3)
         cameras = self._cameras(viewmats, Ks, width, height)
-        return {"kept": kept if len(kept) else None, "frame": Frame(origin, unit), "cameras": cameras}
+        return {"kept": kept, "frame": Frame(origin, unit), "cameras": cameras}
 
     def _cameras(self, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Cameras:
         """Return the cameras, if they are plausible and the file has enough bytes for their size."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.facts.prepare import Frame
 from gsmerge.facts.views import resize_cameras
-from gsmerge.moments import Members
+from gsmerge.pooling import Members
 from gsmerge.stages.merge import take
 from gsmerge.states.division import Division
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
@@ -124,8 +124,20 @@ class Heads:
 class Colors:
     """Base colours of groups that fit the photos so far."""
 
-    sh0: np.ndarray  # [g,1,3]
-    precision: np.ndarray  # [g], see `GroupSet.color_precision`
+    sh0: np.ndarray  # [g,1,3]; that of the Feature Gaussians stays as exported, for the full fit to start from
+    # [g] how much earlier photos say about each colour: the diagonal of their normal equations, which is the sum of the
+    # squares of the group's blending weights over their half-size pixels
+    precision: np.ndarray
+
+    def __getitem__(self, rows: np.ndarray) -> Colors:
+        """Return those of some groups."""
+        return Colors(self.sh0[rows], self.precision[rows])
+
+    @staticmethod
+    def concat(parts: list[Colors]) -> Colors:
+        """Concatenate the groups of all parts."""
+        sh0, precision = ([getattr(part, name) for part in parts] for name in ("sh0", "precision"))
+        return Colors(np.concatenate(sh0), np.concatenate(precision))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +174,7 @@ class GroupSet:
     features: FeatureGaussians
     # The Gaussians of the finest division, group by group; none where heads with absolute outputs make them
     children: Gaussians
-    # [g,1,3] base colours (sh0) that fit the photos so far. `features.sh0` stays as exported, for the full fit to
-    # start from.
-    fitted_sh0: np.ndarray
-    # [g] how much earlier photos say about each fitted colour: the diagonal of their normal equations, which is the
-    # sum of the squares of the group's blending weights over their half-size pixels
-    color_precision: np.ndarray
+    colors: Colors
     learned: Learned | None = None  # Of states with networks
 
     def __len__(self) -> int:
@@ -197,13 +204,18 @@ class State:
     """
 
     groups: DividedGroups | GroupSet  # Of one batch, divided by its own Gaussians; of several, which later ones join
-    kept: Gaussians | None  # Unseen Gaussians, canonical, merged; None without any
+    kept: Gaussians  # Unseen Gaussians, canonical, merged
     frame: Frame  # From canonical to world
     cameras: Cameras  # The views, canonical
     replay: Replay  # Photos of some of the views
     settings: StoredSettings
     about: Mapping[str, Any]
     networks: StateNetworks | None = None  # None where later batches meet decoded groups
+
+    @property
+    def keeps_latents(self) -> bool:
+        """Whether groups keep their latents for later batches."""
+        return self.networks is not None
 
     def __len__(self) -> int:
         return len(self.groups)
@@ -219,4 +231,4 @@ class State:
     @property
     def num_kept(self) -> int:
         """Number of kept Gaussians that no view sees."""
-        return 0 if self.kept is None else len(self.kept)
+        return len(self.kept)

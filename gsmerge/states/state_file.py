@@ -11,11 +11,11 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.networks.options import CORRECTED, GROUP
+from gsmerge.settings.extend import merge_settings
 from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.states.division import Division
 from gsmerge.states.groups import with_child_rows, without_members
 from gsmerge.states.gsm_file import FEATURE_COLUMNS, GsmFile, float32, read_gsm, write_gsm
-from gsmerge.states.options import merge_settings
 from gsmerge.states.state import (
     Colors,
     DividedGroups,
@@ -44,35 +44,32 @@ def save_state(path: str | PathLike[str], state: State, *, overwrite: bool = Fal
 
     Raises SceneError if the file exists or cannot be written.
     """
-    groups, cameras, frame, networks = state.groups, state.cameras, state.frame, state.networks
-    features, learned, weights = groups.features, groups.learned, None if networks is None else networks.weights
+    groups, cameras, frame = state.groups, state.cameras, state.frame
+    features, weights = groups.features, None
     arrays = {f"features.{name}": float32(getattr(features, name)) for name in FEATURE_COLUMNS}
     arrays |= {"features.views": features.views.astype(np.int32), "frame.origin": frame.origin.astype(np.float64)}
     arrays |= {"cameras.viewmats": cameras.viewmats.astype(np.float64), "cameras.Ks": cameras.Ks.astype(np.float64)}
     if isinstance(groups, GroupSet):
-        kept = groups.children[:0] if state.kept is None else state.kept
-        arrays |= _gaussians("children", groups.children) | dict(
-            zip(COLORS, (groups.fitted_sh0, groups.color_precision), strict=True)
-        )
+        arrays |= _gaussians("children", groups.children)
         arrays["children.counts"] = np.diff(features.starts).astype(np.uint8)
     else:
         division, heads = groups.division, groups.heads
-        kept = division.children[:0] if state.kept is None else state.kept
         arrays |= _gaussians("division", division.children)
         arrays |= {"division.splits": division.splits, "division.slots": division.slots}
         arrays |= {f"division.{name}": getattr(division, name).astype(np.int32) for name in ("uniform", "growth_order")}
         if heads is not None:
             weights = heads.networks
             arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": float32(heads.group)}
-        if groups.colors is not None:
-            arrays |= dict(zip(COLORS, (groups.colors.sh0, groups.colors.precision), strict=True))
-    arrays |= _gaussians("kept", kept)
+    if groups.colors is not None:
+        arrays |= dict(zip(COLORS, (groups.colors.sh0, groups.colors.precision), strict=True))
+    arrays |= _gaussians("kept", state.kept)
     if len(state.replay):
         arrays |= {"replay.images": state.replay.images, "replay.views": state.replay.views.astype(np.int32)}
-    if networks is not None and learned is not None:
+    if state.networks is not None and groups.learned is not None:
+        weights, learned, samples = state.networks.weights, groups.learned, state.networks.samples
         arrays |= {f"refined.{name}": getattr(learned.refined, name) for name in CORRECTED}
         arrays |= {f"heads.{name}": getattr(learned, name).astype(np.int32) for name in HEAD_COUNTS}
-        arrays |= {f"samples.{f.name}": getattr(networks.samples, f.name) for f in fields(ViewSamples)}
+        arrays |= {f"samples.{f.name}": getattr(samples, f.name) for f in fields(ViewSamples)}
     header: dict[str, Any] = {"settings": asdict(state.settings), "unit": frame.unit, "about": dict(state.about)}
     header |= {"width": cameras.width, "height": cameras.height}
     if weights is not None:
@@ -106,7 +103,7 @@ def load_state(path: str | PathLike[str]) -> State:
     groups: DividedGroups | GroupSet
     if divided:
         heads = None if weights is None else _read_heads(file, weights, len(features), len(cameras))
-        colors = Colors(*_read_colors(file, len(features))) if file.has(*COLORS) else None
+        colors = _read_colors(file, len(features)) if file.has(*COLORS) else None
         groups = DividedGroups(features, _read_division(file, features), heads, colors, learned)
     else:
         groups = replace(_read_groups(file, features, settings.max_k, weights), learned=learned)
@@ -184,13 +181,13 @@ def _read_groups(file: GsmFile, features: FeatureGaussians, max_k: int, weights:
     if g and not least <= int(counts.min()) <= int(counts.max()) <= most:
         raise file.error(f"children.counts: expected {least} to {most}, found others")
     children = file.gaussians("children", int(counts.sum()), features.shN.shape[1])
-    return GroupSet(with_child_rows(features, np.arange(g).repeat(counts)), children, *_read_colors(file, g))
+    return GroupSet(with_child_rows(features, np.arange(g).repeat(counts)), children, _read_colors(file, g))
 
 
-def _read_colors(file: GsmFile, num_groups: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base colours that fit the photos, and the weight of the photos for each."""
-    fitted_sh0, precision = COLORS
-    return file.array(fitted_sh0, np.float32, num_groups, 1, 3), file.array(precision, np.float32, num_groups)
+def _read_colors(file: GsmFile, num_groups: int) -> Colors:
+    """Return the base colours that fit the photos."""
+    sh0, precision = COLORS
+    return Colors(file.array(sh0, np.float32, num_groups, 1, 3), file.array(precision, np.float32, num_groups))
 
 
 def _read_learned(file: GsmFile, features: FeatureGaussians, weights: NetworkWeights, num_views: int) -> Learned:

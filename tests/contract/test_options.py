@@ -14,8 +14,8 @@ from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
 from gsmerge.research.generate import GenerateOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import flat_settings
-from gsmerge.states.options import ExtendOptions
 
 COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from sweeps import sweep
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
 COMMANDS = (
@@ -26,10 +26,11 @@ def loaded_after(code: str) -> set[str]:
     return set(listing.splitlines()[-1].split()) & set(HEAVY)
 
 
-@pytest.mark.parametrize(
+@sweep(
     "arguments",
     [["--help"], ["--version"], [], ["compact", "--help-all"], *([name, "--help"] for name in COMMANDS)],
     ids=" ".join,
+    often=4,
 )
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     assert loaded_after(f"from gsmerge.cli import main\nassert main({arguments!r}) == 0") == set()
@@ -52,9 +53,7 @@ def test_import_loads_nothing_heavy() -> None:
     assert loaded_after("import gsmerge") == set()
 
 
-@pytest.mark.parametrize(
-    "settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join
-)
+@sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join)
 def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
     """Which take longer to load than a small scene takes to merge."""
     arguments = ["compact", str(made_scene), "-o", str(tmp_path / "small.ply"), *settings]
@@ -64,7 +63,7 @@ def test_compacting_loads_neither_torch_nor_scipy(settings: list[str], made_scen
     assert modules.isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
 
 
-@pytest.mark.parametrize("settings", [[], ["--fit", "none"]], ids=" ".join)
+@sweep("settings", [[], ["--fit", "none"]], ids=" ".join)
 def test_compacting_needs_neither_torch_nor_scipy(settings: list[str], made_scene: Path, tmp_path: Path) -> None:
     """As if they were not installed; the result is the same to the last bit."""
     outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]

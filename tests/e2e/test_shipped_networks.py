@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from scripts import load_script
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.networks.checkpoint import SHIPPED
@@ -30,7 +31,7 @@ def test_shipped_networks_gain(
     assert psnr[str(SHIPPED)] > psnr["none"] + LEAST_GAIN
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
+@sweep("k", [1, 2, 4])
 def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Path], tmp_path: Path, k: int) -> None:
     """Without one, what networks make more opaque is left out less often as too faint."""
     scene = gsmerge.read_scene(make_scene(tmp_path / "scene", num_views=3, width=96, height=72, seed=123))

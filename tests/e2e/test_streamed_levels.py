@@ -12,8 +12,7 @@ import pytest
 import gsmerge
 from gsmerge import cli
 from gsmerge.io import read_gaussians
-from gsmerge.io.formats.read import read_level
-from gsmerge.io.formats.streamed import read_index
+from gsmerge.io.formats.streamed import read_index, read_level
 
 from .conftest import Run, assert_refused, listing
 

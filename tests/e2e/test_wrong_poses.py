@@ -95,6 +95,7 @@ def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: P
     assert sum("its input views are seen from the cameras in auto.cameras.json" in n for n in found["notes"]) == 1
 
 
+@pytest.mark.slow
 def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None:
     folder = Path(shutil.copytree(exact, tmp_path / "far"))
     turn_cameras(folder, 15, only=2)

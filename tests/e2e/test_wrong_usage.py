@@ -56,6 +56,7 @@ USAGE = {
     "batch room -o out --jobs many": "--jobs*auto*'many'",
     "batch room -o out --jobs 0": "--jobs*'0'",
     "batch room -o out --rerun": "*--rerun*--overwrite",
+    "compact room --device cuda": "*--device*processor",
     "batch room -o out --max-memory 8GB": "*--max-memory*--jobs",
     "batch room/scene.ply alone.ply -o out --name same.ply": "out/same.ply*room/scene.ply*alone.ply*--name",
     "batch room -o out --hint exporter=nobody": "exporter*'nobody'",

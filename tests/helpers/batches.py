@@ -68,8 +68,8 @@ def until(condition: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
 
 def holders(folder: Path) -> list[int]:
     """Processes that have begun to make results."""
-    lines = [path.read_text().split() for path in folder.glob(".batch-*.lock")]
-    return [int(numbers[-1]) for numbers in lines if numbers]
+    texts = [path.read_text() for path in folder.glob(".batch-*.begun")]
+    return [int(text) for text in texts if text.endswith("\n")]
 
 
 class InlinePool(Pool):

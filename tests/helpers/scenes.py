@@ -19,7 +19,7 @@ from gsmerge import Cameras, Gaussians, Scene, compact, render
 from gsmerge.compaction.result import CompactReport, CompactResult
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions
-from gsmerge.fit.schedule import FitPlan, plan_run
+from gsmerge.fit.schedule import FitRun, prepare_fit
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
@@ -278,13 +278,13 @@ def tuned(options: FitOptions, **constants: float) -> FitOptions:
     return replace(options, tuning=replace(options.tuning, **constants))  # type: ignore[arg-type]
 
 
-def plan_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **job: Any) -> FitPlan:
-    """The plan of a fit to photos; ``job``: more of it."""
-    return plan_run(FitJob(photos, options, count, **job))
+def run_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **job: Any) -> FitRun:
+    """A fit to photos, prepared; ``job``: more of it."""
+    return prepare_fit(FitJob(photos, options, count, **job))
 
 
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
-    """Photos of noise: nothing that is learned of one block holds in another."""
+    """Photos of noise: nothing that is learned of one patch holds in another."""
     rng = np.random.default_rng(0)
     made = [rng.choice([0.0, 1.0], p.images.shape).astype(np.float32) for p in photos]
     return replace(photos[0], images=made[0]), replace(photos[1], images=made[1])

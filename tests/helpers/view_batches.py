@@ -64,9 +64,7 @@ def same_state(one: State, other: State) -> None:
         same_groups(one.groups, other.groups)
     elif isinstance(one.groups, DividedGroups) and isinstance(other.groups, DividedGroups):
         same_divided(one.groups, other.groups)
-    assert (one.kept is None) == (other.kept is None)
-    if one.kept is not None and other.kept is not None:
-        assert scenes.identical(one.kept, other.kept)
+    assert scenes.identical(one.kept, other.kept)
     np.testing.assert_array_equal(one.frame.origin, other.frame.origin)
     assert one.frame.unit == other.frame.unit
     for name in ("viewmats", "Ks"):
@@ -115,8 +113,8 @@ def same_groups(one: GroupSet, other: GroupSet) -> None:
     same_features(one.features, other.features)
     same_learned(one.learned, other.learned)
     assert scenes.identical(one.children, other.children)
-    np.testing.assert_array_equal(one.fitted_sh0, other.fitted_sh0)
-    np.testing.assert_array_equal(one.color_precision, other.color_precision)
+    np.testing.assert_array_equal(one.colors.sh0, other.colors.sh0)
+    np.testing.assert_array_equal(one.colors.precision, other.colors.precision)
 
 
 def same_features(one: FeatureGaussians, other: FeatureGaussians) -> None:
@@ -132,7 +130,7 @@ def group(groups: GroupSet, row: int) -> tuple[dict[str, np.ndarray], Gaussians]
     one = take(groups.features, np.array([row]))
     names = [f.name for f in fields(one) if f.name not in ("starts", "members")]
     columns = {name: getattr(one, name) for name in names}
-    columns |= {"fitted_sh0": groups.fitted_sh0[row], "color_precision": groups.color_precision[row]}
+    columns |= {"fitted_sh0": groups.colors.sh0[row], "color_precision": groups.colors.precision[row]}
     return columns, groups.children[one.members]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from messages import refuses
 from scripts import load_script
+from sweeps import sweep
 
 from gsmerge.kernels import build as module
 from gsmerge.kernels.build import build, compiler, find_platform, hash_sources
@@ -21,7 +22,7 @@ PLATFORMS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("tag", PLATFORMS)
+@sweep("tag", PLATFORMS)
 def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
     where = find_platform(tag)
     paths = build(tmp_path, platform=tag)
@@ -35,6 +36,7 @@ def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) ->
         assert [path.read_bytes() for path in build(tmp_path / "again", platform=tag)] == [paths[0].read_bytes()]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "darwin" or shutil.which("gcc") is None, reason="needs gcc, not clang by its name")
 def test_another_compiler_can_be_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_CC", "gcc -Wno-error")

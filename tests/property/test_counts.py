@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scenes import make_features
 from skimage.measure import label as connected_parts
 
-from gsmerge.moments import Members
+from gsmerge.pooling import Members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import split_counts
 from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scenes import assert_same_set, make_features, move_gaussians, random_rotation, rotmat_to_quat
 
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.moments import Members
+from gsmerge.pooling import Members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.types import FeatureGaussians

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features, random_rotation
 
-from gsmerge.moments import Members, pool_members
+from gsmerge.pooling import Members, pool_members
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take

@@ -6,10 +6,10 @@ import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sweeps import sweep
 
 from gsmerge import Scene
 
@@ -41,7 +41,7 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("settings", CASES, ids=str)
+@sweep("settings", CASES, ids=str)
 def test_threads_change_no_bit(settings: dict) -> None:
     actual = [scenes.compacted(ROOM, threads=threads, **settings).gaussians for threads in (1, 2, 8)]
     assert all(scenes.identical(a, b) for a, b in itertools.pairwise(actual))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import normalize, quat_to_rotmat
-from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 
@@ -39,11 +39,11 @@ def test_threads_change_no_bit(views: int) -> None:
     results = []
     for count in (1, 2, 8):
         with use_threads(count):
-            plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+            tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
             rendering = render(gaussians, cameras, with_depths=True)
             results.append([
-                plan.ids, plan.flatten_ids, plan.isect_offsets, plan.conics, rendering.images,
-                rendering.alphas, rendering.depths, splat_adjoint(plan, image), *contributions(plan),
+                tiled.ids, tiled.flatten_ids, tiled.isect_offsets, tiled.conics, rendering.images,
+                rendering.alphas, rendering.depths, splat_adjoint(tiled, image), *contributions(tiled),
             ])  # fmt: skip
     assert len(results[0][1]) > 4 * 2**15
     for other in results[1:]:
@@ -55,11 +55,11 @@ def test_threads_change_no_bit(views: int) -> None:
 @given(seeds)
 def test_adjoint_is_the_transpose(seed: int) -> None:
     gaussians, cameras = scene(300, seed)
-    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     rng = np.random.default_rng(seed)
     colors, image = rng.normal(size=(300, 3)), rng.normal(size=(HEIGHT, WIDTH, 3))
-    forward = float((composite(plan, colors)[0] * image).sum(dtype=np.float64))
-    backward = float((colors * splat_adjoint(plan, image)).sum(dtype=np.float64))
+    forward = float((composite(tiled, colors)[0] * image).sum(dtype=np.float64))
+    backward = float((colors * splat_adjoint(tiled, image)).sum(dtype=np.float64))
     scale = float(np.abs(colors).max() * np.abs(image).sum())
     assert abs(forward - backward) < 1e-6 * scale
 
@@ -69,7 +69,7 @@ def test_adjoint_is_the_transpose(seed: int) -> None:
 def test_order_of_gaussians_does_not_matter(seed: int) -> None:
     gaussians, cameras = scene(300, seed)
     view = cameras.viewmats[0].astype(np.float64), cameras.Ks[0].astype(np.float64)
-    depths = plan_view(prepare(gaussians), *view, WIDTH, HEIGHT).depths
+    depths = tile_view(prepare(gaussians), *view, WIDTH, HEIGHT).depths
     assume(len(np.unique(depths)) == len(depths))  # of equal depths the first in order is in front
     shuffled = gaussians[np.random.default_rng(seed).permutation(300)]
     assert psnr(render(gaussians, cameras).images[0], render(shuffled, cameras).images[0]) > 90
@@ -100,7 +100,7 @@ def test_leaving_out_is_the_same_as_removing(seed: int) -> None:
     gaussians, cameras = scene(300, seed, degree=2)
     keep = np.random.default_rng(seed).random(300) < 0.5
     view = cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT
-    left, removed = plan_view(prepare(gaussians), *view, keep=keep), plan_view(prepare(gaussians[keep]), *view)
+    left, removed = tile_view(prepare(gaussians), *view, keep=keep), tile_view(prepare(gaussians[keep]), *view)
     np.testing.assert_array_equal(composite(left)[0], composite(removed)[0])
     np.testing.assert_array_equal(contributions(left)[0][keep], contributions(removed)[0])
     assert contributions(left)[0][~keep].max() == 0
@@ -110,9 +110,9 @@ def test_leaving_out_is_the_same_as_removing(seed: int) -> None:
 @given(seeds)
 def test_depth_order_and_lists(seed: int) -> None:
     gaussians, cameras = scene(300, seed)
-    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
-    assert (np.diff(plan.ids) > 0).all()
-    for start, end in zip(plan.isect_offsets[:-1], plan.isect_offsets[1:], strict=True):
-        depths = plan.depths[plan.flatten_ids[start:end]]
+    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    assert (np.diff(tiled.ids) > 0).all()
+    for start, end in zip(tiled.isect_offsets[:-1], tiled.isect_offsets[1:], strict=True):
+        depths = tiled.depths[tiled.flatten_ids[start:end]]
         assert (np.diff(depths) >= 0).all()
-        assert len(set(plan.flatten_ids[start:end].tolist())) == end - start
+        assert len(set(tiled.flatten_ids[start:end].tolist())) == end - start

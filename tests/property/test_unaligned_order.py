@@ -7,15 +7,15 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 import scenes
 import unaligned_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
+from sweeps import sweep
 
 from gsmerge import Scene, compact
-from gsmerge.moments import unaligned_members
+from gsmerge.pooling import unaligned_members
 from gsmerge.stages.assign import Owners, find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment
@@ -74,7 +74,7 @@ def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     assert abs(scenes.psnr_of(one, ROOM) - scenes.psnr_of(other, ROOM)) < 0.1
 
 
-@pytest.mark.parametrize("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
+@sweep("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
 def test_threads_change_no_bit(options: dict) -> None:
     scene = unaligned_scenes.voxels(ROOM, 0.06)
     actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]

@@ -12,7 +12,7 @@ import unaligned_scenes
 from gsmerge import Scene, compact
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import draw, fit_colors
-from gsmerge.moments import scene_members
+from gsmerge.pooling import scene_members
 from gsmerge.raster.photos import scene_photos
 
 

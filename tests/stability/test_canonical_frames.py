@@ -11,7 +11,7 @@ from sweeps import sweep
 
 from gsmerge import Scene
 from gsmerge.facts.prepare import scene_frame
-from gsmerge.moments import scene_members
+from gsmerge.pooling import scene_members
 
 UTM = np.array([4e5, 5e6, 120.0])
 

@@ -11,7 +11,7 @@ from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances, project, quat_to_rotmat
-from gsmerge.moments import feature_to_gaussians, scene_members
+from gsmerge.pooling import feature_to_gaussians, scene_members
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, grid_ids
 

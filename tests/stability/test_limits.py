@@ -63,7 +63,8 @@ def test_budgets_without_a_fit_are_met(room: Scene, budget: int, settings: dict[
     scenes.assert_invariants(result.gaussians, room)
 
 
-@sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 10}], ids=str)
 def test_four_hundred_tiny_views(settings: dict[str, Any]) -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(400, 8, 6))
     result = scenes.compacted(scene, **settings)

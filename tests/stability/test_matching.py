@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 from gsmerge import Cameras
-from gsmerge.moments import feature_to_gaussians
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge

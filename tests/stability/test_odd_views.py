@@ -100,7 +100,7 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
 
 @pytest.mark.slow
 def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
-    """Means of five seeds: which blocks are held out depends on the order, and a run of one seed scatters by 0.5 dB."""
+    """Means of five seeds: the order decides which patches are held out, and a run of one seed varies by 0.5 dB."""
     one, other = (
         [scenes.compacted(s, seed=seed).gaussians for seed in range(5)]
         for s in (room, scenes.take_views(room, [2, 0, 1]))

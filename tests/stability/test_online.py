@@ -12,6 +12,10 @@ import scenes
 from view_batches import fed, parts_of, state_of
 
 from gsmerge import Compactor, Scene
+from gsmerge.plan import resolve_fit
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.states.decode import decode_state
+from gsmerge.states.groups import share
 
 SHAPES = {"room": scenes.room, "wall": scenes.wall, "planes": scenes.two_planes}
 FULL = {"fit": "full", "fit_steps": 30}
@@ -81,19 +85,23 @@ def test_batches_in_reverse(wishes: list[dict[str, Any]], made: list[Scene], for
 
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_batches_of_any_size(size: int, made: list[Scene], whole: list[Compactor]) -> None:
-    """For as many Gaussians, no more than 0.5 dB below all views at once, on average over the scenes.
+    """For as many Gaussians, no more than 0.3 dB below all views at once, on average over the scenes.
 
-    0.4 dB after these short fits, which begin with the groups of one batch as its own pixels divide them; no less after
-    200 steps. The fewer the groups that batches leave, the more of these are divided: equal numbers are what compares.
+    Both as others join them: a batch that is alone divides by its own pixels, which is worth 0.4 dB in so short a fit.
+    The fewer the groups that batches leave, the more of these are divided: equal numbers are what compares.
     """
+    options = resolve_fit(CompactOptions().with_settings(FULL))
     batched = [fed(parts_of(scene, size)) for scene in made]
     difference = []
     for scene, one, other in zip(made, whole, batched, strict=True):
         assert len(other) <= 1.1 * len(one)
         count = int(1.5 * len(one))
-        actual = [scenes.psnr_of(c.decode(budget=count, **FULL), scene) for c in (one, other)]
+        states = [share(state_of(compactor)) for compactor in (one, other)]
+        actual = [
+            scenes.psnr_of(decode_state(state, budget=count, options=options).gaussians, scene) for state in states
+        ]
         difference.append(actual[1] - actual[0])
-    assert np.mean(difference) > -0.5
+    assert np.mean(difference) > -0.3
 
 
 def test_as_they_come_batches_need_no_more_gaussians(

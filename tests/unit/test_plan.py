@@ -14,8 +14,8 @@ from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.estimate import estimate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
-from gsmerge.facts.scene_size import measure_size
-from gsmerge.plan import EFFORTS, Plan, choose_networks, make_plan, plan_whole, resolve_fit, steps_for
+from gsmerge.facts.scene_size import SceneSize, measure_size
+from gsmerge.plan import EFFORTS, Plan, choose_for_scene, choose_networks, make_plan, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES
 
@@ -93,7 +93,8 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    assert choose_networks(options_of(**settings), photos=photos, aligned=aligned) == name
+    size = SceneSize(768, 1, 24, 32, aligned=aligned, photos=photos)
+    assert choose_networks(options_of(**settings), size) == name
 
 
 def test_a_plan_has_networks_or_none(scene: Scene) -> None:
@@ -206,7 +207,7 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert "tuning" not in plan.settings
     assert "move_cameras" not in plan.settings
     settings = options_of(effort="draft")
-    settled = plan_whole(measure_size(scene), settings).settings(settings)
+    settled = choose_for_scene(measure_size(scene), settings).settings(settings)
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
 
 
@@ -229,14 +230,18 @@ def test_the_estimate_is_what_the_run_does(
 
     monkeypatch.setattr("gsmerge.compaction.compact.make_plan", record_plan)
     options = options_of(**settings)
-    run, result, whole = estimate(scene, options), compact(scene, options), plan_whole(measure_size(scene), options)
-    assert run["fit_steps"] == whole.fit.steps == result.report.options["fit_steps"]
-    assert run["blocks"] == whole.blocks == len(result.report.choices.get("blocks", "1"))
+    run, result, choices = (
+        estimate(scene, options),
+        compact(scene, options),
+        choose_for_scene(measure_size(scene), options),
+    )
+    assert run["fit_steps"] == choices.fit.steps == result.report.options["fit_steps"]
+    assert run["blocks"] == choices.blocks == len(result.report.choices.get("blocks", "1"))
     count = len(result.gaussians)
     assert run["num_gaussians"] == count if settings in SETTLED else 0.5 * run["num_gaussians"] < count
     assert count <= run["num_gaussians"]
     for plan in plans:  # none of a scene in blocks
-        assert (plan.limits, plan.decode, plan.match.match) == (whole.limits, whole.decode, whole.match)
-        assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (whole.fit.fit, whole.fit.steps, whole.fit.share)
+        assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match)
+        assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
         assert run["k"] == plan.decode.k
         assert (plan.checkpoint is None) == (run["checkpoint"] == "none")

@@ -22,7 +22,7 @@ from gsmerge.alignment.registration.similarities import (
     invert_place,
     round_place,
 )
-from gsmerge.geometry import IDENTITY, Schedule, Similarity, camera_depths, descend, lower_median, motion_matrices
+from gsmerge.geometry import IDENTITY, Damping, Similarity, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.kernels.elementary import exp, log, log1p
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.runtime.threads import parallel_map
@@ -43,7 +43,7 @@ DOUBT = 4.0  # squared residual from which on a match counts less
 MIN_MATCHES = 16  # that agree where two scenes are connected; of unrelated photos up to 5 do
 MIN_SHARE = 0.15  # of the matches
 ROUNDS = 3  # of choosing the matches of a pair that agree, and moving it by them
-SCHEDULE = Schedule(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
+DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
 SIZE = 7  # numbers of a step: turn, shift, logarithm of the scale
 
 Places = Sequence[Similarity | None]
@@ -274,7 +274,7 @@ def _refine(places: Places, matches: Sequence[Matches], spread: float, fixed: in
             moved[i] = apply_after(current_places[i] or IDENTITY, _make_step(vector))
         return fit(moved)
 
-    return descend(fit(places), lambda state: state[1][0], step, SCHEDULE)[0]
+    return descend(fit(places), lambda state: state[1][0], step, DAMPING)[0]
 
 
 def _make_step(step: np.ndarray) -> Similarity:

@@ -39,16 +39,6 @@ _NOT_UNIT = 0.05  # difference of its length from 1 by which four numbers are no
 _Image = tuple[str, int, np.ndarray]  # name, camera id, pose [3,4]
 
 
-def is_colmap(folder: Path) -> bool:
-    """Return whether a folder holds a COLMAP model."""
-    return holds_model(folder, ".bin") or holds_model(folder, ".txt")
-
-
-def holds_model(folder: Path, suffix: str) -> bool:
-    """Return whether a folder holds the files of a COLMAP model with an ending, ``.bin`` or ``.txt``."""
-    return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
-
-
 def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     """Read the cameras of a COLMAP model in the order of its images; SceneError if it is damaged or unknown."""
     folder = source.path

@@ -14,10 +14,9 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project, rotmat_to_quat, sh0_to_rgb
+from gsmerge.io.formats.table import CAMERAS, IMAGES, POINTS
 from gsmerge.types import Cameras, Gaussians
 
-FOLDER, PLACE = "colmap", "sparse/0"  # a folder of this name holds a model, where trainers look for it
-MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 _FOREIGN = ("rigs.bin", "frames.bin")  # which COLMAP writes since 3.12, and would read with ours
 _PINHOLE = 1  # the number of the camera model
 _SEEN = np.dtype([("place", "<f8", 2), ("point", "<i8")])

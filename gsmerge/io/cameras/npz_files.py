@@ -109,7 +109,7 @@ def read_depths(path: Path) -> np.ndarray | None:
     return depths if depths is not None and depths.ndim == 3 and depths.dtype.kind in "fiu" else None
 
 
-class Frame(NamedTuple):
+class DepthFrame(NamedTuple):
     """One view with its depth map, as DA3-Streaming writes each into a file of its own."""
 
     depth: np.ndarray  # ``[h,w]``, along z
@@ -122,8 +122,8 @@ class Frame(NamedTuple):
         return self.depth.shape[1], self.depth.shape[0]
 
 
-def read_frame(path: Path) -> Frame:
-    """Read a frame of DA3-Streaming; SceneError if an array is missing or its shape does not fit the others."""
+def read_depth_frame(path: Path) -> DepthFrame:
+    """Read a frame of DA3-Streaming; SceneError if an array is missing or of another shape than the others."""
     names = ("depth", "image", "intrinsics")
     arrays = read_arrays(path, names)
     missing = [name for name in names if name not in arrays]
@@ -137,7 +137,7 @@ def read_frame(path: Path) -> Frame:
     if image.shape[:2] != depth.shape:
         problem = f"expected an image of the depth map's size {list(depth.shape)}, found {list(image.shape[:2])}"
         raise SceneError(path, problem)
-    return Frame(depth, image, K.astype(np.float64))
+    return DepthFrame(depth, image, K.astype(np.float64))
 
 
 def _first(arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray | None:

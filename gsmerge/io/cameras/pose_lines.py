@@ -19,11 +19,10 @@ from gsmerge.io.bounds import read_lines
 from gsmerge.io.cameras.camera_file import View, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.npz_files import array_shape
+from gsmerge.io.formats.table import FRAMES, POSES
 from gsmerge.io.photo_files import Size
 
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
-POSES = "camera_poses.txt"
-FRAMES = "results_output"
 _FRAME = re.compile(r"frame_(\d{1,9})\.npz")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
 _MOST_COLUMNS = max(_POSE_COLUMNS)

@@ -25,7 +25,6 @@ from gsmerge.io.photo_files import Photos, decode_embedded, photo_size
 from gsmerge.io.pickles import Names, read_pickle
 from gsmerge.types import StrPath
 
-SUFFIX = ".torch"
 _COLUMNS = 18  # fx fy cx cy 0 0, then world to camera, 3x4
 _MAX_INDEX = 1 << 48  # of a number in a storage
 _MAX_AXES = 64  # of an array of NumPy's

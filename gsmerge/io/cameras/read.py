@@ -16,7 +16,6 @@ from gsmerge.io.cameras.camera_file import (
     CameraFile,
 )
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
-from gsmerge.io.cameras.colmap import holds_model, is_colmap, read_colmap
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
 from gsmerge.io.cameras.json_files import (
     VIEWER_CAMERAS,
@@ -26,12 +25,19 @@ from gsmerge.io.cameras.json_files import (
     read_transforms,
     read_world_mirror,
 )
-from gsmerge.io.cameras.npz_files import array_names, holds_poses, is_da3, read_da3, read_dump
-from gsmerge.io.cameras.pose_lines import lists_poses, read_poses
-from gsmerge.io.cameras.re10k import SUFFIX as CHUNK
-from gsmerge.io.cameras.re10k import read_re10k, read_scenes
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import StrPath
 
+
+def _lazy(place: str) -> LazyFunction:
+    """Name a function of this package that is imported when a file of its format is met."""
+    module, name = place.split(".")
+    return LazyFunction(f"{__package__}.{module}", name)
+
+
+CHUNK = ".torch"  # of re10k
+array_names, holds_poses = _lazy("npz_files.array_names"), _lazy("npz_files.holds_poses")
+holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
@@ -40,6 +46,16 @@ CAMERA_PLACES = (
     "results.npz", "cameras.npz", "camera_poses.txt", "0", ".",
 )  # fmt: skip
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
+
+
+def is_colmap(folder: Path) -> bool:
+    """Return whether a folder holds a COLMAP model."""
+    return holds_model(folder, ".bin") or holds_model(folder, ".txt")
+
+
+def holds_model(folder: Path, suffix: str) -> bool:
+    """Return whether a folder holds the files of a COLMAP model with an ending, ``.bin`` or ``.txt``."""
+    return (folder / f"cameras{suffix}").is_file() and (folder / f"images{suffix}").is_file()
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -62,7 +78,7 @@ def find_other_cameras(folder: Path) -> Path | None:
 
 def _holds_cameras(path: Path) -> bool:
     if path.suffix == ".npz":
-        return holds_poses(path)
+        return bool(holds_poses(path))
     try:
         return len(read_cameras(path)) > 0
     except SceneError:
@@ -97,7 +113,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         path = inside
     if not path.is_dir():
         check_file(path)
-        if path.suffix in (".bin", ".txt") and not lists_poses(path):
+        if path.suffix in (".bin", ".txt") and not _lazy("pose_lines.lists_poses")(path):
             if not is_colmap(path.parent):
                 raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
             path = path.parent
@@ -111,7 +127,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
 def read_all_cameras(path: Path) -> Iterator[CameraFile]:
     """Read the cameras of a path as :func:`read_cameras`; of a ``.torch`` chunk, those of each of its scenes."""
     if path.suffix.lower() == CHUNK and os.path.isfile(path):
-        yield from (_RE10K.convert(path, scene) for scene in read_scenes(path))
+        yield from (_RE10K.convert(path, scene) for scene in _lazy("re10k.read_scenes")(path))
     else:
         yield read_cameras(path)
 
@@ -122,21 +138,22 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
     return _SHARP.cameras(source) if _SHARP.recognise(source) else None
 
 
+_READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
 _SHARP = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
 _RE10K = CameraFormat(
-    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, read_re10k, W2C_OPENCV,
-    "divided by the size",
+    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, _lazy("re10k.read_re10k"),
+    W2C_OPENCV, "divided by the size",
 )  # fmt: skip
 # In the order of trial: the first of a file's ending that recognises it
 CAMERA_FORMATS = (
-    CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(read_colmap, suffix=".bin"),
+    CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin")),
-    CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(read_colmap, suffix=".txt"),
+    CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses"),
-    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", read_poses,
+    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"),
                  C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms,
@@ -149,12 +166,13 @@ CAMERA_FORMATS = (
                  lambda file: "position" in file.first or "rotation" in file.first),
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
-    CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz", read_dump,
-                 C2W_OPENCV, "pixels, or divided by the size; may be missing",
+    CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz",
+                 _lazy("npz_files.read_dump"), C2W_OPENCV, "pixels, or divided by the size; may be missing",
                  lambda file: "c2w" in array_names(file.path)),
-    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", read_da3,
-                 W2C_OPENCV, "pixels, or divided by the size; may be missing", lambda file: is_da3(file.path)),
-    CameraFormat("npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", read_da3,
+    CameraFormat("DA3 npz", "`results.npz` of Depth Anything 3", ".npz", _READ_DA3,
+                 W2C_OPENCV, "pixels, or divided by the size; may be missing",
+                 lambda file: _lazy("npz_files.is_da3")(file.path)),
+    CameraFormat("npz of poses", "`.npz` of what VGGT or AnySplat (camera-to-world) returns", ".npz", _READ_DA3,
                  W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     _RE10K,
     CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-inside-a-ply))", ".ply", read_embedded,

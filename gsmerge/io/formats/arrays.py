@@ -24,6 +24,7 @@ SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files of plain colours
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 _UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite

@@ -15,11 +15,11 @@ from plyfile import PlyData, PlyListProperty
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays
+from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.types import Gaussians
 
 CHUNK = 256  # Gaussians that share a range
-PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 RANGES = (
     *(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz"),
     *(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz"),
@@ -28,11 +28,6 @@ COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
 _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # of each byte
 MAX_DEGREE = 3  # of the harmonics that are written
-
-
-def is_compressed(data: PlyData) -> bool:
-    """Return whether a PLY file holds packed Gaussians (``.compressed.ply``)."""
-    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(PACKED)
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:

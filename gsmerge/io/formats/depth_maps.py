@@ -24,18 +24,19 @@ from gsmerge.io.cameras.npz_files import (
     array_shape,
     holds_poses,
     read_da3,
+    read_depth_frame,
     read_depths,
     read_dump,
-    read_frame,
 )
-from gsmerge.io.cameras.pose_lines import FRAMES, POSES, list_frames, pose_of_frame
+from gsmerge.io.cameras.pose_lines import list_frames, pose_of_frame
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, to_stored
+from gsmerge.io.formats.table import FRAMES as FRAMES
+from gsmerge.io.formats.table import POSES, is_frame
 from gsmerge.io.photo_files import PhotoReader, Photos, keep_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.runtime.threads import parallel_map
 
-SUFFIX = ".npz"
 PLACES = (  # in a folder, besides the frames
     "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "predictions.npz", "views.npz",
 )  # fmt: skip
@@ -52,16 +53,6 @@ def find_depth_maps(folder: Path) -> list[Path]:
     """
     whole = next((folder / place for place in PLACES if holds_depth_maps(folder / place)), None)
     return list_frames(folder) if whole is None else [whole]
-
-
-def is_frame(path: Path) -> bool:
-    """Return whether a file is a frame of DA3-Streaming."""
-    return path.suffix == SUFFIX and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
-
-
-def own_cameras(path: Path) -> Path:
-    """Return the file of the cameras from which depth maps are unprojected."""
-    return path.parent.parent / POSES if is_frame(path) else path
 
 
 def holds_depth_maps(path: Path) -> bool:
@@ -102,10 +93,10 @@ def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
 
 def read_images(frames: Sequence[Path]) -> Photos:
     """Read the images of DA3-Streaming's frames; if there are many, they are read again at each use."""
-    width, height = read_frame(frames[0]).size
+    width, height = read_depth_frame(frames[0]).size
 
     def read(view: int) -> np.ndarray:
-        frame = read_frame(frames[view])
+        frame = read_depth_frame(frames[view])
         if frame.size != (width, height):
             problem = f"expected a depth map of {width} x {height} pixels as in {frames[0].name}"
             raise SceneError(frames[view], f"{problem}, found {frame.size[0]} x {frame.size[1]}")
@@ -117,7 +108,7 @@ def read_images(frames: Sequence[Path]) -> Photos:
 
 def _read_frame(path: Path) -> tuple[np.ndarray, CameraFile]:
     """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image."""
-    frame = read_frame(path)
+    frame = read_depth_frame(path)
     view = View(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
     return frame.depth[None], make_camera_file(path, "", C2W_OPENCV, [view], frame.image[None])
 

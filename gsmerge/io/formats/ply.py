@@ -19,10 +19,11 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
-from gsmerge.io.formats.compressed import is_compressed, packed_rows
 from gsmerge.kernels.elementary import log, log1p
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
 
+_PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
 MAX_DEGREE = 3  # of the harmonics that results have: splat-transform 3.7 and gsply refuse a .ply with more
 MAX_READ_DEGREE = 4
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
@@ -44,8 +45,8 @@ _SIZES = {
 def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
-    compressed = is_compressed(data)
-    rows = packed_rows(path, data) if compressed else _vertex(path, data).data
+    compressed = _is_compressed(data)
+    rows = _PACKED_ROWS(path, data) if compressed else _vertex(path, data).data
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     return arrays.StoredRows(
@@ -93,6 +94,11 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
         raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
     return len(names)
+
+
+def _is_compressed(data: PlyData) -> bool:
+    """Return whether a PLY file holds packed Gaussians (``.compressed.ply``)."""
+    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(arrays.PACKED)
 
 
 def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:

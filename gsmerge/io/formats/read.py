@@ -11,15 +11,17 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
-from gsmerge.io.formats import arrays, depth_maps, ply, streamed
+from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.table import DEPTHS, PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, gather, make_array
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, StrPath
 
+_READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
 OpacityChoice = Literal["auto", "logit", "raw"]
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
@@ -131,12 +133,12 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     is_depth = input_format(paths[0]) is DEPTHS
-    parts = depth_maps.read_frames(paths) if is_depth else parallel_map(ply.read_rows, paths)
+    parts = _READ_FRAMES(paths) if is_depth else parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the columns of {paths[0].name}, found others, so they are no parts of one scene"
             raise SceneError(path, problem, "name one of the files")
-    return _convert_files(paths, parts, opacity)
+    return convert_files(paths, parts, opacity)
 
 
 def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
@@ -157,16 +159,11 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
         raise SceneError(path, problem, "name the file that it was made of")
     if chosen.read is ply.read_rows:
         return read_ply(path, opacity=opacity)
-    return _convert_files([path], [chosen.read(path)], "auto")
+    return convert_files([path], [chosen.read(path)], "auto")
 
 
-def read_level(path: Path, level: int, index: streamed.StreamedIndex | None = None) -> GaussianFile:
-    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
-    return _convert_files([path], [streamed.read_rows(path, level, index)], "auto")
-
-
-def _convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
-    """Convert the rows of files, one after the other; facts that cannot be added are those of the first file."""
+def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: OpacityChoice) -> GaussianFile:
+    """Convert the rows of files, one after the other; facts that are not sums are those of the first."""
     path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
     names = tuple(dtype.names or ())
     num_higher = sum(name.startswith("f_rest_") for name in names) // 3

@@ -20,15 +20,18 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import morton_codes, quat_to_rotmat
-from gsmerge.io.atomic import remove_stale
+from gsmerge.io.atomic import AddOutput, atomic_outputs, remove_stale
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
+from gsmerge.io.formats.arrays import MIP_COMMENT
+from gsmerge.io.formats.read import GaussianFile, convert_files
+from gsmerge.io.formats.table import INDEX
+from gsmerge.io.formats.write import check_readable
 from gsmerge.kernels.elementary import exp, log1p
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, StrPath
 
-INDEX = "lod-meta.json"  # the name by which loaders recognise the format
 VERSION = 1
 MAX_DEGREE = sog.MAX_DEGREE
 # Gaussians in a chunk: all of them have harmonics of their own in its palette, and its .85 MB are one download
@@ -52,6 +55,72 @@ class Leaf:
 
 # Errors [leaves, levels] of leaves, no smaller from level to level; 0 is the finest level's
 LeafErrors = Callable[[Sequence[Leaf]], np.ndarray]
+
+
+def write_levels(
+    path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
+) -> None:
+    """Write levels of detail as Streamed SOG: an index, and chunks in folders beside it.
+
+    A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
+    an index that is replaced are removed.
+
+    Args:
+        path: The index, a ``lod-meta.json``; its folder is made if it is missing.
+        levels: Finite values, the finest level first.
+        overwrite: Replace an existing index.
+        comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
+
+    Raises:
+        UsageError: If the name is another one.
+        SceneError: If the file exists or cannot be written.
+        ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
+        >>> levels = [result.gaussians, *(level.gaussians for level in result.coarser)]
+        >>> gsmerge.write_levels("demo/web/lod-meta.json", levels, overwrite=True)
+    """
+    path = Path(path)
+    if path.name != INDEX:
+        raise UsageError(f"{path}: expected the name {INDEX}, by which viewers recognise the format")
+    with atomic_outputs(overwrite=overwrite) as add:
+        add_levels(add, path, add(path), levels, comments)
+    remove_unused_chunks(path)
+
+
+def add_levels(
+    add: AddOutput,
+    path: Path,
+    index: Path,
+    levels: Sequence[Gaussians],
+    comments: Sequence[str] = (),
+    *,
+    environment: Gaussians | None = None,
+    measure: LeafErrors | None = None,
+) -> list[tuple[Path, list[Path]]]:
+    """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
+
+    ``environment`` and ``measure`` are as of :func:`streamed_files`. Returns, for each level, the final path
+    of its first chunk's ``meta.json``, and the present paths of all its files; an environment's are the finest level's.
+    """
+    for gaussians in levels if environment is None else (*levels, environment):
+        check_readable(gaussians, comments)
+    firsts: dict[str, Path] = {}
+    written: dict[str, list[Path]] = {}
+    mip = MIP_COMMENT in comments
+    for name, data in streamed_files(levels, mip=mip, environment=environment, measure=measure).items():
+        if name == INDEX:
+            index.write_bytes(data)
+            continue
+        target, level = path.parent / name, "0" if name.startswith(ENVIRONMENT) else name.partition("_")[0]
+        same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
+        written.setdefault(level, []).append(target if same else add(target))
+        if not same:
+            written[level][-1].write_bytes(data)
+        if target.name == sog.META:
+            firsts.setdefault(level, target)
+    return [(firsts[level], files) for level, files in written.items()]
 
 
 def streamed_files(
@@ -273,6 +342,11 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
     name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {len(index.levels)} level(s)"
     rows = arrays.to_stored([content.packed for content in contents], name, sizes, mip=contents[0].mip)
     return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
+
+
+def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
+    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. SceneError as in :func:`read_gaussians`."""
+    return convert_files([path], [read_rows(path, level, index)], "auto")
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:

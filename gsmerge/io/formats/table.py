@@ -9,10 +9,15 @@ from functools import partial
 from pathlib import Path
 
 from gsmerge.errors import UsageError
-from gsmerge.io.cameras import colmap_model
-from gsmerge.io.formats import compressed, depth_maps, glb, ply, sog, splat, spz, streamed, usd
+from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians, StrPath
+
+INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
+FOLDER, PLACE = "colmap", "sparse/0"  # a folder of this name holds a COLMAP model, where trainers look for it
+MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
+FRAMES, POSES = "results_output", "camera_poses.txt"  # DA3-Streaming's folder of frames, and the poses beside it
 
 
 @dataclass(frozen=True)
@@ -36,53 +41,60 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
+def _lazy(place: str) -> LazyFunction:
+    """Name a function of this package that is imported when a file of its format is met."""
+    module, name = place.split(".")
+    return LazyFunction(f"{__package__}.{module}", name)
+
+
 _SPZ, _SOG = (17.0, 18.5, 18.9, 19.2, 20.0), (13.0, 22.0, 36.5, 56.5)
-_USD = (56.0, 92.0, 152.0, 236.0)
+_USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0),
 )  # fmt: skip
 LEVELS = Format(
-    streamed.INDEX, "levels of detail in chunks, each a .sog without its zip", streamed.read_rows, None,
-    streamed.MAX_DEGREE, each=_SOG,
+    INDEX, "levels of detail in chunks, each a .sog without its zip", _lazy("streamed.read_rows"), None,
+    3, each=_SOG,
 )  # fmt: skip
-COLMAP = Format(colmap_model.POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
+COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
 FILES = (  # of endings that end alike the longest first
     Format(
         ".compressed.ply", "ranges for every 256 neighbours; rows in another order", ply.read_rows,
-        compressed.compressed_bytes, compressed.MAX_DEGREE, each=(16.3, 25.3, 40.4, 61.4),
+        _lazy("compressed.compressed_bytes"), 3, each=(16.3, 25.3, 40.4, 61.4),
     ),
     PLY,
-    Format(".spz", "Niantic's format, version 3", spz.read_rows, spz.spz_bytes, spz.MAX_DEGREES[3], 3, each=_SPZ),
+    Format(".spz", "Niantic's format, version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3, 3, each=_SPZ),
     Format(
-        ".spz", "Niantic's format, version 4, compressed with Zstandard", spz.read_rows,
-        partial(spz.spz_bytes, version=4), spz.MAX_DEGREES[4], 4, spz.zstandard, _SPZ,
+        ".spz", "Niantic's format, version 4, compressed with Zstandard", _lazy("spz.read_rows"),
+        partial(_lazy("spz.spz_bytes"), version=4), 4, 4, _lazy("spz.zstandard"), _SPZ,
     ),
     Format(
-        ".sog", "WebP textures in a zip; rows in another order", sog.read_rows, sog.sog_bytes, sog.MAX_DEGREE,
+        ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
         each=_SOG,
     ),
-    Format(".splat", "antimatter15's format", splat.read_rows, splat.splat_bytes, splat.MAX_DEGREE, each=(32.0,)),
+    Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(
-        ".glb", "binary glTF with KHR_gaussian_splatting", glb.read_rows, glb.glb_bytes, glb.MAX_DEGREE,
-        holds=glb.holds_gaussians, each=(52.1, 88.1, 148.1, 232.2),
+        ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
+        holds=_lazy("glb.holds_gaussians"), each=(52.1, 88.1, 148.1, 232.2),
     ),
     Format(
-        ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, usd.usdc_bytes, usd.MAX_DEGREE,
-        require=usd.require_usd, each=_USD,
+        ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, _lazy("usd.usdc_bytes"), 3,
+        require=_REQUIRE_USD, each=_USD,
     ),
     Format(
-        ".usda", "USD as text", None, usd.usda_bytes, usd.MAX_DEGREE,
-        require=usd.require_usd, each=(176.0, 301.0, 509.0, 801.0),
+        ".usda", "USD as text", None, _lazy("usd.usda_bytes"), 3,
+        require=_REQUIRE_USD, each=(176.0, 301.0, 509.0, 801.0),
     ),
     Format(
-        ".usdz", "USD, a .usdc in an archive", None, usd.usdz_bytes, usd.MAX_DEGREE, require=usd.require_usd, each=_USD,
+        ".usdz", "USD, a .usdc in an archive", None, _lazy("usd.usdz_bytes"), 3, require=_REQUIRE_USD, each=_USD,
     ),
 )  # fmt: skip
 DEPTHS = Format(
-    depth_maps.SUFFIX, "depth maps with images and cameras: a Gaussian for each pixel", depth_maps.read_rows, None, -1,
-    holds=depth_maps.holds_depth_maps, each=(6.0,),
+    ".npz", "depth maps with images and cameras: a Gaussian for each pixel", _lazy("depth_maps.read_rows"), None, -1,
+    holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
 )  # fmt: skip
+SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS)
 OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FILES))
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
@@ -126,6 +138,11 @@ def input_format(path: StrPath) -> Format:
     return next((row for row in FORMATS if row.names(path)), PLY)
 
 
+def is_frame(path: Path) -> bool:
+    """Return whether a file has one of DA3-Streaming's frames."""
+    return DEPTHS.names(path) and path.parent.name == FRAMES and (path.parent.parent / POSES).is_file()
+
+
 def may_hold_gaussians(path: Path) -> bool:
     """Return whether the ending, and for endings with several uses the content, is that of Gaussians."""
     return path.suffix.lower() in SCENE_SUFFIXES and input_format(path).holds(path)
@@ -140,13 +157,13 @@ def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, 
     rows = [row for row in FORMATS if row.names(path) and row.max_degree >= 0]
     if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):
         rows = []
-    if not rows and not cameras and Path(path).name in (colmap_model.FOLDER, colmap_model.POINTS):
+    if not rows and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if not rows:
         *first, last = OUTPUT_FORMATS
-        index = f", or the name {streamed.INDEX}" if levels else ""
-        folder = f", or a folder named {colmap_model.FOLDER}" if cameras else ""
+        index = f", or the name {INDEX}" if levels else ""
+        folder = f", or a folder named {FOLDER}" if cameras else ""
         raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
     chosen = next((row for row in rows if row.version in (None, spz_version)), None)
     if chosen is None:

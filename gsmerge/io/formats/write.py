@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsmerge.errors import UsageError
-from gsmerge.io.atomic import AddOutput, atomic_output, atomic_outputs
-from gsmerge.io.formats import ply, sog, streamed
-from gsmerge.io.formats.arrays import MIP_COMMENT
+from gsmerge.io.atomic import atomic_output
+from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
@@ -23,6 +21,16 @@ def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str |
     if chosen is PLY:
         return f"harmonics above degree {chosen.max_degree} are left out: few programs read a .ply with them"
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
+
+
+def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
+    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
+    lost = lost_harmonics(out, sh_degree, spz_version)
+    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
+    if COLMAP.names(out) and not place.is_dir():
+        files = "the photos" if photos is None or not photos.is_dir() else photos
+        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
+    return notes
 
 
 def write_gaussians(
@@ -65,76 +73,9 @@ def write_gaussians(
         degree = min(gaussians.sh_degree, chosen.max_degree)
         write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)
         return
-    _check_readable(gaussians, comments)
+    check_readable(gaussians, comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(chosen.encode(gaussians, comments))
-
-
-def write_levels(
-    path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
-) -> None:
-    """Write levels of detail as Streamed SOG: an index, and chunks in folders beside it.
-
-    A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
-    an index that is replaced are removed.
-
-    Args:
-        path: The index, a ``lod-meta.json``; its folder is made if it is missing.
-        levels: Finite values, the finest level first.
-        overwrite: Replace an existing index.
-        comments: Lines as in :func:`write_gaussians`; only "SplatRenderMode: mip" is kept.
-
-    Raises:
-        UsageError: If the name is another one.
-        SceneError: If the file exists or cannot be written.
-        ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
-
-    Example:
-        >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
-        >>> levels = [result.gaussians, *(level.gaussians for level in result.coarser)]
-        >>> gsmerge.write_levels("demo/web/lod-meta.json", levels, overwrite=True)
-    """
-    path = Path(path)
-    if path.name != streamed.INDEX:
-        raise UsageError(f"{path}: expected the name {streamed.INDEX}, by which viewers recognise the format")
-    with atomic_outputs(overwrite=overwrite) as add:
-        add_levels(add, path, add(path), levels, comments)
-    streamed.remove_unused_chunks(path)
-
-
-def add_levels(
-    add: AddOutput,
-    path: Path,
-    index: Path,
-    levels: Sequence[Gaussians],
-    comments: Sequence[str] = (),
-    *,
-    environment: Gaussians | None = None,
-    measure: streamed.LeafErrors | None = None,
-) -> list[tuple[Path, list[Path]]]:
-    """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
-
-    For ``environment`` and ``measure`` see :func:`streamed.streamed_files`. Returns for each level the final path of
-    the ``meta.json`` of its first chunk, and the temporary paths of all its files. The files of an environment belong
-    to the finest level.
-    """
-    for gaussians in levels if environment is None else (*levels, environment):
-        _check_readable(gaussians, comments)
-    firsts: dict[str, Path] = {}
-    written: dict[str, list[Path]] = {}
-    mip = MIP_COMMENT in comments
-    for name, data in streamed.streamed_files(levels, mip=mip, environment=environment, measure=measure).items():
-        if name == streamed.INDEX:
-            index.write_bytes(data)
-            continue
-        target, level = path.parent / name, "0" if name.startswith(streamed.ENVIRONMENT) else name.partition("_")[0]
-        same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
-        written.setdefault(level, []).append(target if same else add(target))
-        if not same:
-            written[level][-1].write_bytes(data)
-        if target.name == sog.META:
-            firsts.setdefault(level, target)
-    return [(firsts[level], files) for level, files in written.items()]
 
 
 def write_ply(
@@ -168,7 +109,7 @@ def write_ply(
         >>> result = gsmerge.compact("demo", effort="draft", budget=300)
         >>> gsmerge.write_ply("demo/small.ply", result.gaussians, overwrite=True)
     """
-    _check_readable(gaussians, comments)
+    check_readable(gaussians, comments)
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     if not 0 <= degree <= gaussians.sh_degree:
         raise ValueError(f"sh_degree: expected 0 to {gaussians.sh_degree}, got {sh_degree}")
@@ -176,8 +117,8 @@ def write_ply(
         file.writelines(ply.ply_blocks(gaussians, degree, comments, normals=normals))
 
 
-def _check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for Gaussians or comments that the readers would refuse."""
+def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
+    """Raise ValueError for what the readers refuse."""
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log, power
-from gsmerge.moments import MAX_OPACITY, principal_axes
 from gsmerge.plan import Plan
+from gsmerge.pooling import MAX_OPACITY, principal_axes
 from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads

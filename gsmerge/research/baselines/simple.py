@@ -17,7 +17,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.plan import Plan
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
@@ -31,7 +31,7 @@ PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
 MAX_OUTPUT = 300  # characters of the program's own output in an error
 PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
-MAX_PLANNED = 2_000_000  # Gaussians in the plans of the views under way: each plan is as large as they are
+MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
@@ -100,10 +100,10 @@ def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> np.ndarray:
-        sums, _ = contributions(plan_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
+        sums, _ = contributions(tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height))
         return sums
 
-    total, step = np.zeros(len(splats)), max(1, MAX_PLANNED // max(len(splats), 1))
+    total, step = np.zeros(len(splats)), max(1, MAX_TILED // max(len(splats), 1))
     for first in range(0, len(cameras), step):
         for sums in parallel_map(one_view, range(first, min(first + step, len(cameras)))):
             total += sums

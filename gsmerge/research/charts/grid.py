@@ -15,8 +15,7 @@ from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.batch.jobs import Job
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import read_table
-from gsmerge.io.cameras.colmap import is_colmap
-from gsmerge.io.cameras.read import find_cameras
+from gsmerge.io.cameras.read import find_cameras, is_colmap
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.batch_command import check_failures, damage_notes, print_plan, run_jobs
+from gsmerge.cli.batch_command import check_failures, print_plan, run_jobs
 from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes
 from gsmerge.cli.paths import write_texts
@@ -83,13 +83,11 @@ def chart(args: opt.Args) -> None:
     if args.draw_only:
         _draw(args, [], 0)
         return
-    from gsmerge.batch.records import RecordIndex
-    from gsmerge.batch.schedule import pending_jobs
+    from gsmerge.batch.workload import pending_jobs
 
     jobs, options, notes = _make_jobs(args, scenes)
-    notes += damage_notes(RecordIndex(out).read_on())
     if args.dry_run:
-        print_plan(args, jobs, options, notes, "runs")
+        print_plan(args, jobs, options, "runs", notes)
         return
     say_notes(notes, quiet=args.silent)
     pending, failed = pending_jobs(jobs, out, options), list[tuple[str, str]]()

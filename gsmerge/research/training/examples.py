@@ -17,8 +17,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrections import COLOR
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import (
     TrainingScene,
@@ -122,10 +122,10 @@ def scene_name(path: Path) -> str:
 def make_example(
     training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None = None
 ) -> Example:
-    """Make an example: segment and encode a scene without networks; if a loss uses a fit, also merge and fit it.
+    """Make an example: segment and encode a scene without networks; if a loss uses a fit, merge and fit it as well.
 
-    ``density`` is in superpixels per pixel; ``progress`` is called with (step, steps) of the fit. SceneError if the fit
-    does not improve held-out parts of the photos.
+    ``density`` is in superpixels per pixel; ``progress`` is called with (step, steps) of the fit. A SceneError if the
+    fit does not improve held-out patches of the photos.
     """
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members

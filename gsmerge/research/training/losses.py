@@ -19,10 +19,10 @@ from torch.nn import functional
 
 from gsmerge.fit.loss import loss_ssim
 from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
-from gsmerge.moments import Members, pool_members, principal_axes
 from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
+from gsmerge.pooling import Members, pool_members, principal_axes
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR
 from gsmerge.research.training.modules import Networks

@@ -2,7 +2,7 @@
 
 The geometry of the stages is done on tensors here, so that gradients pass from a stage's results to what earlier ones
 made of them. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
-:mod:`gsmerge.moments`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters,
+:mod:`gsmerge.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours, clusters,
 order of axes, views and what these say of a group.
 """
 
@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsmerge.moments import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import (
     NetworkContext,
     encode_features,
@@ -35,6 +34,7 @@ from gsmerge.networks.tensors import (
     skew_vectors,
 )
 from gsmerge.networks.tokens import GroupFeatures
+from gsmerge.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
@@ -68,7 +68,7 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]`` (rising) and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.moments.principal_axes`; gradients follow from first-order perturbation theory.
+    Values are those of :func:`gsmerge.pooling.principal_axes`; gradients follow from first-order perturbation theory.
     Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
@@ -85,7 +85,7 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def differentiate_base(features: FeatureGaussians) -> Gaussians:
-    """Decode Feature Gaussians like :func:`gsmerge.moments.feature_to_gaussians`, differentiable."""
+    """Decode Feature Gaussians like :func:`gsmerge.pooling.feature_to_gaussians`, differentiable."""
     scales, quats = differentiate_axes(features.covars)
     depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
     opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)

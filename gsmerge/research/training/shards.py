@@ -30,7 +30,7 @@ from safetensors.numpy import save
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.moments import Members
+from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
 from gsmerge.research.training.processes import ALONE, Processes

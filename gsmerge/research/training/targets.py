@@ -17,7 +17,7 @@ from torch import Tensor
 from gsmerge.errors import SceneError
 from gsmerge.fit import FitJob, visible_mask
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.schedule import plan_run
+from gsmerge.fit.schedule import prepare_fit
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, rotate_vectors, skew_vectors
 from gsmerge.networks.tokens import compute_group_features
@@ -51,7 +51,7 @@ def fit_targets(
     """Compute the targets for every K of ``options.levels`` by fitting analytic Feature Gaussians to photos.
 
     ``name`` is the scene's, for errors; ``progress`` is called with (step, steps) of the fits. A SceneError if the fit
-    does not improve held-out parts of the photos.
+    does not improve held-out patches of the photos.
     """
     masks, (full, half) = covered_pixels(coverage(training)), (training.photos(), training.photos(2))
     masks[: len(training.scene)] = True  # of the other photos, only what the scene covers counts
@@ -86,7 +86,7 @@ def _fit_level(
     mask = start.opacities >= DecodeOptions().min_opacity
     mask[mask.copy()] = visible_mask(start[mask], photos[1], fit.min_contribution)
     job = FitJob(photos, fit, seed=options.seed, progress=progress)
-    fitted, report = fit_full(start[mask], plan_run(job))
+    fitted, report = fit_full(start[mask], prepare_fit(job))
     if not report.accepted:
         problem = f"expected a scene that the fit makes better ({report.stopped})"
         raise SceneError(name, problem, "leave it out")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.raster import plan_view, prepare
+from gsmerge.raster import prepare, tile_view
 from gsmerge.raster.photos import NEAR, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
@@ -125,9 +125,9 @@ def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
-    plan = plan_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
+    tiled = tile_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
     reached = np.zeros(len(example.base), bool)
-    reached[plan.ids[np.unique(plan.flatten_ids)]] = True
+    reached[tiled.ids[np.unique(tiled.flatten_ids)]] = True
     return _whole_clusters(example, reached)
 
 
@@ -141,7 +141,7 @@ def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
-    """Return the camera of a rectangle of a photo, as arguments of :func:`gsmerge.raster.plan_view`."""
+    """Return the camera of a rectangle of a photo, as arguments of :func:`gsmerge.raster.tile_view`."""
     K = photos.Ks[photo].copy()
     K[:2, 2] -= box.left, box.top
     return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}

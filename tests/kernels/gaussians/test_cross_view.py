@@ -10,8 +10,8 @@ from scenes import arc, make_scene, room
 
 from gsmerge.geometry import project
 from gsmerge.kernels.gaussians.cross_view import sum_cross_view
-from gsmerge.moments import Members, scene_members
 from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
+from gsmerge.pooling import Members, scene_members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, Scene
 

@@ -10,7 +10,7 @@ from slow_renderer import Reference, render_arrays
 from sweeps import sweep
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, plan_view, prepare, render, splat_adjoint
+from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
@@ -78,16 +78,16 @@ def test_needles_match() -> None:
 @sweep("channels", [1, 3, 4, 5, 8], often=2)
 def test_adjoint_matches_the_weights(channels: int) -> None:
     gaussians, cameras = random_gaussians(200, 11), turned_camera()
-    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     image = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, channels))
     expected = np.einsum("nhw,hwc->nc", reference(gaussians, cameras).weights, image)
-    np.testing.assert_allclose(splat_adjoint(plan, image), expected, atol=0.02)
-    assert np.median(np.abs(splat_adjoint(plan, image) - expected)) < 1e-5
+    np.testing.assert_allclose(splat_adjoint(tiled, image), expected, atol=0.02)
+    assert np.median(np.abs(splat_adjoint(tiled, image) - expected)) < 1e-5
 
 
 def test_contributions_match_the_weights() -> None:
     gaussians, cameras = random_gaussians(200, 12), turned_camera()
-    mass, peak = contributions(plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT))
+    mass, peak = contributions(tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT))
     weights = reference(gaussians, cameras).weights
     np.testing.assert_allclose(mass, weights.sum((1, 2)), atol=0.02)
     np.testing.assert_allclose(peak, weights.max((1, 2)), atol=0.01)
@@ -96,6 +96,6 @@ def test_contributions_match_the_weights() -> None:
 def test_any_colours_are_blended_as_they_are() -> None:
     gaussians, cameras = random_gaussians(200, 13), turned_camera()
     colors = np.random.default_rng(0).normal(size=(200, 3)) * 10
-    plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
-    image, _ = composite(plan, colors)
+    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    image, _ = composite(tiled, colors)
     assert_alike(image / 10, np.einsum("nhw,nc->hwc", reference(gaussians, cameras).weights, colors) / 10)

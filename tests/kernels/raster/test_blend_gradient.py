@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from messages import refuses
-from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
 from sweeps import sweep
+from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge import Gaussians
-from gsmerge.raster import ViewPlan, composite, plan_view, prepare
+from gsmerge.raster import TiledView, composite, prepare, tile_view
 from gsmerge.raster.gradient import (
     Gradients,
     color_gradients,
-    plan_gradients,
+    view_gradients,
 )
 from gsmerge.runtime.threads import use_threads
 
@@ -27,10 +27,10 @@ torch = pytest.importorskip("torch", reason="torch is not installed")
 FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 
-def gradients_of_plan(plan: ViewPlan, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
-    image, transmittance = composite(plan, colors, BACKGROUND)
-    return plan_gradients(
-        plan, normal(HEIGHT, WIDTH, 3), grad_left,
+def gradients_of_view(tiled: TiledView, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
+    image, transmittance = composite(tiled, colors, BACKGROUND)
+    return view_gradients(
+        tiled, normal(HEIGHT, WIDTH, 3), grad_left,
         image=image, transmittance=transmittance, colors=colors, with_viewmat=True,
     )  # fmt: skip
 
@@ -40,7 +40,7 @@ def gradients_of_plan(plan: ViewPlan, colors: np.ndarray, grad_left: np.ndarray 
 def test_any_colours_dilations_and_transmittances(eps2d: float, with_left: bool) -> None:
     gaussians, cameras, colors = random_gaussians(40, 0, 1), turned_cameras(1), normal(40, 3, seed=2)
     grad_left = normal(HEIGHT, WIDTH, seed=3) if with_left else None
-    actual = gradients_of_plan(plan_of(gaussians, eps2d=eps2d), colors, grad_left)
+    actual = gradients_of_view(turned_view(gaussians, eps2d=eps2d), colors, grad_left)
     names = ("means", "quats", "scales", "opacities")
     inputs = [getattr(gaussians, name).double() for name in names] + [torch.from_numpy(colors).double()]
     inputs = [tensor.requires_grad_() for tensor in [*inputs, cameras.viewmats[0].clone()]]
@@ -59,10 +59,10 @@ def test_opacities_in_place_of_the_gaussians_own() -> None:
     gaussians, colors = random_gaussians(40, 0, 4).numpy(), normal(40, 3)
     keep = np.arange(40) % 4 > 0
     given = gaussians.opacities * 0.7
-    actual = gradients_of_plan(plan_of(gaussians, opacities=given, keep=keep), colors, None)
+    actual = gradients_of_view(turned_view(gaussians, opacities=given, keep=keep), colors, None)
     assert keep[actual.ids].all()
     kept = replace(gaussians, opacities=np.where(keep, given, 0))
-    expected = gradients_of_plan(plan_of(kept), colors, None)
+    expected = gradients_of_view(turned_view(kept), colors, None)
     for name in FIELDS:
         np.testing.assert_array_equal(full(actual, name, 40), full(expected, name, 40))
 
@@ -81,13 +81,13 @@ def test_finite_differences() -> None:
             tints = colors + step.astype(np.float32)
         else:
             moved = replace(start, **{name: getattr(start, name) + step.astype(np.float32)})
-        image, left = composite(plan_of(moved), tints, BACKGROUND)
+        image, left = composite(turned_view(moved), tints, BACKGROUND)
         return float((image * grad_image).sum() + (left * grad_left).sum())
 
-    plan = plan_of(start)
-    image, left = composite(plan, colors, BACKGROUND)
-    actual = plan_gradients(
-        plan, grad_image.astype(np.float32), grad_left.astype(np.float32),
+    tiled = turned_view(start)
+    image, left = composite(tiled, colors, BACKGROUND)
+    actual = view_gradients(
+        tiled, grad_image.astype(np.float32), grad_left.astype(np.float32),
         image=image, transmittance=left, colors=colors,
     )  # fmt: skip
     for name in FIELDS:
@@ -100,7 +100,7 @@ def test_finite_differences() -> None:
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["gsmerge.raster.view_plan"], "PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.raster.tiled_view"], "PIECE", 200)
     monkeypatch.setattr(sys.modules["gsmerge.raster.gradient"], "WORTH", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
@@ -109,13 +109,13 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
 
     def run(count: int) -> list[np.ndarray]:
         with use_threads(count):
-            plan = plan_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
-            assert len(plan.flatten_ids) > 2000
-            image, left = composite(plan)
-            shape = plan_gradients(
-                plan, grads[..., :3], grads[..., 3], image=image, transmittance=left, with_viewmat=True
+            tiled = tile_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
+            assert len(tiled.flatten_ids) > 2000
+            image, left = composite(tiled)
+            shape = view_gradients(
+                tiled, grads[..., :3], grads[..., 3], image=image, transmittance=left, with_viewmat=True
             )
-            return [*vars(shape).values(), *vars(color_gradients(plan, shape.colors)).values()]
+            return [*vars(shape).values(), *vars(color_gradients(tiled, shape.colors)).values()]
 
     for one, other in zip(run(1), run(threads), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -140,25 +140,25 @@ CHANGES: dict[str, Callable[[Gaussians], dict[str, np.ndarray]]] = {
 def test_finite_input_gives_finite_gradients(change: str, eps2d: float, antialiased: bool) -> None:
     gaussians = random_gaussians(60, 2, 11).numpy()
     gaussians = replace(gaussians, **CHANGES[change](gaussians))
-    plan = plan_of(gaussians, eps2d=eps2d, antialiased=antialiased)
-    actual = gradients_of_plan(plan, normal(60, 3), normal(HEIGHT, WIDTH))
+    tiled = turned_view(gaussians, eps2d=eps2d, antialiased=antialiased)
+    actual = gradients_of_view(tiled, normal(60, 3), normal(HEIGHT, WIDTH))
     for name in (*FIELDS, "viewmat"):
         assert np.isfinite(getattr(actual, name)).all(), name
-    for array in vars(color_gradients(plan, actual.colors)).values():
+    for array in vars(color_gradients(tiled, actual.colors)).values():
         assert np.isfinite(array).all()
 
 
 def test_a_view_of_nothing() -> None:
     gaussians = random_gaussians(5).numpy()
-    plan = plan_of(replace(gaussians, means=gaussians.means - 100))
-    actual = gradients_of_plan(plan, normal(5, 3), None)
+    tiled = turned_view(replace(gaussians, means=gaussians.means - 100))
+    actual = gradients_of_view(tiled, normal(5, 3), None)
     assert len(actual.ids) == len(actual.means) == len(actual.colors) == 0
     assert (actual.viewmat == 0).all()
 
 
 @pytest.mark.parametrize("name", ["grad_image", "grad_transmittance", "image", "transmittance", "colors"])
 def test_other_shapes_are_refused(name: str) -> None:
-    plan = plan_of(random_gaussians(5))
+    tiled = turned_view(random_gaussians(5))
     arrays = {
         "grad_image": normal(HEIGHT, WIDTH, 3),
         "grad_transmittance": normal(HEIGHT, WIDTH),
@@ -168,4 +168,4 @@ def test_other_shapes_are_refused(name: str) -> None:
     }
     arrays[name] = arrays[name][:-1]
     with refuses(ValueError, name, list(arrays[name].shape)):
-        plan_gradients(plan, **arrays)
+        view_gradients(tiled, **arrays)

@@ -12,7 +12,7 @@ from slow_renderer import render_arrays
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.raster.list_weights import collect, spread
-from gsmerge.raster import ViewPlan, composite, plan_view, prepare, splat_adjoint
+from gsmerge.raster import TiledView, composite, prepare, splat_adjoint, tile_view
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
 
@@ -24,9 +24,9 @@ def of_case(case: tuple[int, int, float]) -> Gaussians:
     return random_gaussians(case[0], case[1], opacity=case[2])
 
 
-def planned(gaussians: Gaussians) -> tuple[ViewPlan, ViewWeights]:
-    plan = plan_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    return plan, view_weights(plan)
+def tile_and_weigh(gaussians: Gaussians) -> tuple[TiledView, ViewWeights]:
+    tiled = tile_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    return tiled, view_weights(tiled)
 
 
 def entry_pixels(weights: ViewWeights) -> np.ndarray:
@@ -55,8 +55,8 @@ CASES = [(200, 0, 0.5), (3000, 1, 0.05), (3000, 2, 3.0), (1, 3, 0.5)]
 
 @pytest.mark.parametrize("case", CASES)
 def test_entries_are_sound(case: tuple[int, int, float]) -> None:
-    plan, weights = planned(of_case(case))
-    assert len(weights.starts) == len(plan.flatten_ids) + 1
+    tiled, weights = tile_and_weigh(of_case(case))
+    assert len(weights.starts) == len(tiled.flatten_ids) + 1
     assert weights.starts[0] == 0
     assert (np.diff(weights.starts) >= 0).all()
     assert weights.starts[-1] == len(weights.lanes) == len(weights.weights)
@@ -68,30 +68,30 @@ def test_entries_are_sound(case: tuple[int, int, float]) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_apply_matches_composite_and_the_dense_matrix(case: tuple[int, int, float]) -> None:
     gaussians = of_case(case)
-    plan, weights = planned(gaussians)
+    tiled, weights = tile_and_weigh(gaussians)
     colors = np.random.default_rng(0).normal(size=(len(gaussians), 3))
     image = apply(weights, colors)
-    assert_allclose(image, composite(plan, colors)[0], atol=2e-5)
+    assert_allclose(image, composite(tiled, colors)[0], atol=2e-5)
     assert_allclose(image, (dense(weights, len(gaussians)) @ colors).reshape(HEIGHT, WIDTH, 3), atol=2e-5)
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_transposed_matches_the_adjoint_and_the_dense_matrix(channels: int) -> None:
     gaussians = random_gaussians(400, 5)
-    plan, weights = planned(gaussians)
+    tiled, weights = tile_and_weigh(gaussians)
     image = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, channels))
     sums = apply_transposed(weights, image)
-    assert sums.shape == (len(plan.ids), channels)
-    assert_allclose(sums, splat_adjoint(plan, image)[plan.ids], atol=2e-4)
+    assert sums.shape == (len(tiled.ids), channels)
+    assert_allclose(sums, splat_adjoint(tiled, image)[tiled.ids], atol=2e-4)
     expected = dense(weights, 400).T @ image.reshape(-1, channels)
-    assert_allclose(sums, expected[plan.ids], atol=2e-4)
-    left_out = np.setdiff1d(np.arange(400), plan.ids)
+    assert_allclose(sums, expected[tiled.ids], atol=2e-4)
+    left_out = np.setdiff1d(np.arange(400), tiled.ids)
     assert not expected[left_out].any()
 
 
 def test_weights_match_the_slow_renderer() -> None:
     gaussians = random_gaussians(200, 7)
-    _, weights = planned(gaussians)
+    _, weights = tile_and_weigh(gaussians)
     expected = render_arrays(gaussians, np.eye(4), K, WIDTH, HEIGHT).weights
     error = np.abs(dense(weights, 200).T - expected.reshape(200, -1))
     assert np.quantile(error, 0.999) < 1e-5
@@ -104,15 +104,15 @@ def test_needles_lose_no_pixel() -> None:
     needles = replace(gaussians, scales=np.array([[0.7, 1e-4, 1e-4]], np.float32).repeat(300, 0))
     slanted = np.abs(quat_to_rotmat(needles.quats)[:, :2, 0]).min(1)
     assert (slanted > 0.1).sum() > 100
-    plan, weights = planned(needles)
+    tiled, weights = tile_and_weigh(needles)
     colors = np.random.default_rng(0).normal(size=(300, 3))
-    assert_allclose(apply(weights, colors), composite(plan, colors)[0], atol=2e-5)
+    assert_allclose(apply(weights, colors), composite(tiled, colors)[0], atol=2e-5)
 
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_nothing_in_view(count: int) -> None:
     gaussians = random_gaussians(5, 9)[:count]
-    _, weights = planned(replace(gaussians, means=gaussians.means - 10))
+    _, weights = tile_and_weigh(replace(gaussians, means=gaussians.means - 10))
     assert len(weights.lanes) == 0
     assert not apply(weights, np.ones((count, 3))).any()
     assert apply_transposed(weights, np.ones((HEIGHT, WIDTH, 3))).shape == (0, 3)

@@ -7,7 +7,7 @@ import pytest
 from slow_renderer import footprints
 
 from gsmerge import Gaussians
-from gsmerge.raster import plan_view, prepare
+from gsmerge.raster import prepare, tile_view
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
@@ -29,16 +29,16 @@ def slow_footprints(gaussians: Gaussians, viewmat: np.ndarray, K: np.ndarray, *s
 
 
 def test_footprints() -> None:
-    """Position, precision and rows of what a plan holds; a row is listed if a pixel column could reach 1/255."""
+    """Position, precision and rows of what a tiled view holds; a row is listed if a pixel column could reach 1/255."""
     n, width, height = 300, 60, 40
     gaussians = random_gaussians(n, 0, spread=0.6, depth=3, sizes=1.0)
     K, viewmat = np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]), np.eye(4)
-    plan = plan_view(prepare(gaussians), viewmat, K, width, height)
+    tiled = tile_view(prepare(gaussians), viewmat, K, width, height)
     positions, covars, depths = slow_footprints(gaussians, viewmat, K, width, height)
-    ids = plan.ids
-    mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = plan.conics.T.astype(np.float64)
+    ids = tiled.ids
+    mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = tiled.conics.T.astype(np.float64)
     np.testing.assert_allclose(np.stack([mean_x, mean_y], 1), positions[ids], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(plan.depths, depths[ids], rtol=1e-5)
+    np.testing.assert_allclose(tiled.depths, depths[ids], rtol=1e-5)
     conics = np.linalg.inv(covars + 0.3 * np.eye(2))[ids]
     np.testing.assert_allclose(2 * rate_x**2, conics[:, 0, 0], rtol=1e-3)
     np.testing.assert_allclose(-2 * rate_x**2 * slope, conics[:, 0, 1], rtol=1e-2, atol=1e-4)
@@ -46,7 +46,9 @@ def test_footprints() -> None:
     np.testing.assert_allclose(np.exp(lnop), gaussians.opacities[ids], rtol=1e-5)
 
     rows = np.arange(height)[:, None] + 0.5
-    reached = (lnop - rate_y * (rows - mean_y) ** 2 >= np.log(1 / 255)) & np.isin(np.arange(len(ids)), plan.flatten_ids)
+    reached = (lnop - rate_y * (rows - mean_y) ** 2 >= np.log(1 / 255)) & np.isin(
+        np.arange(len(ids)), tiled.flatten_ids
+    )
     listed = (rows - 0.5 >= first) & (rows - 0.5 <= last)
     assert (listed | ~reached).all()
     assert (listed == reached)[:, reached.any(0)].mean() > 0.999
@@ -57,7 +59,7 @@ def test_no_gaussian_that_adds_light_is_missing() -> None:
     n, width, height = 2000, 50, 40
     gaussians = random_gaussians(n, 1, spread=2.0, depth=2, sizes=1.5)
     K, viewmat = np.array([[50.0, 0, 25], [0, 50.0, 20], [0, 0, 1]]), np.eye(4)
-    plan = plan_view(prepare(gaussians), viewmat, K, width, height)
+    tiled = tile_view(prepare(gaussians), viewmat, K, width, height)
     positions, covars, depths = slow_footprints(gaussians, viewmat, K, width, height)
     conics = np.linalg.inv(covars + 0.3 * np.eye(2))
     ys, xs = np.mgrid[:height, :width] + 0.5
@@ -65,8 +67,8 @@ def test_no_gaussian_that_adds_light_is_missing() -> None:
     distances = ((offsets @ conics) * offsets).sum(-1)
     alphas = gaussians.opacities[:, None] * np.exp(-0.5 * distances)
     visible = (alphas.max(1) > 1.001 / 255) & (depths > 0.01)
-    drawn = set(plan.ids[np.unique(plan.flatten_ids)].tolist())
+    drawn = set(tiled.ids[np.unique(tiled.flatten_ids)].tolist())
     assert set(np.flatnonzero(visible).tolist()) <= drawn
     # boxes have corners that their ellipses do not fill, and culling only looks at the longest axis
     assert visible.sum() > 0.9 * len(drawn)
-    assert len(drawn) > 0.6 * len(plan.ids)
+    assert len(drawn) > 0.6 * len(tiled.ids)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from messages import refuses
-from plan_gradients_of import assert_near, full, normal, plan_of
 from slow_renderer import (
     random_gaussians,
     turned_cameras,
     view_colors,
 )
+from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge.kernels.raster import sh
 from gsmerge.raster.gradient import (
@@ -40,12 +40,12 @@ def test_view_colors(degree: int) -> None:
 @pytest.mark.parametrize("degree", range(5))
 def test_gradient_of_colours_of_every_degree(degree: int) -> None:
     gaussians, viewmat = random_gaussians(150, degree, degree), turned_cameras(1).viewmats[0]
-    plan = plan_of(gaussians)
-    grad_colors = normal(len(plan.ids), 3)
-    actual = color_gradients(plan, grad_colors)
+    tiled = turned_view(gaussians)
+    grad_colors = normal(len(tiled.ids), 3)
+    actual = color_gradients(tiled, grad_colors)
     means, sh0, shN = (getattr(gaussians, name).double().requires_grad_() for name in ("means", "sh0", "shN"))
     colors = view_colors(means, torch.cat([sh0, shN], 1), viewmat)
-    (colors[torch.from_numpy(plan.ids).long()] * torch.from_numpy(grad_colors)).sum().backward()
+    (colors[torch.from_numpy(tiled.ids).long()] * torch.from_numpy(grad_colors)).sum().backward()
     for name, tensor in (("means", means), ("sh0", sh0), ("shN", shN)):
         expected = np.zeros(tensor.shape) if tensor.grad is None else tensor.grad.numpy()
         assert_near(full(actual, name, 150), expected, 1e-5)
@@ -55,17 +55,17 @@ def test_gradient_of_colours_of_every_degree(degree: int) -> None:
 @pytest.mark.parametrize(("number", "enough"), [(100, False), (200, True)])
 def test_gradients_are_written_into_used_memory(number: int, enough: bool, degree: int) -> None:
     """Where it is large enough; the answer is the same."""
-    plan, other = plan_of(random_gaussians(150, degree, degree)), plan_of(random_gaussians(number, degree, 5))
-    assert (len(other.ids) > len(plan.ids)) == enough
+    tiled, other = turned_view(random_gaussians(150, degree, degree)), turned_view(random_gaussians(number, degree, 5))
+    assert (len(other.ids) > len(tiled.ids)) == enough
     used = color_gradients(other, normal(len(other.ids), 3))
-    expected = color_gradients(plan, normal(len(plan.ids), 3))
-    actual = color_gradients(plan, normal(len(plan.ids), 3), used=used)
+    expected = color_gradients(tiled, normal(len(tiled.ids), 3))
+    actual = color_gradients(tiled, normal(len(tiled.ids), 3), used=used)
     for one, again in zip(vars(expected).values(), vars(actual).values(), strict=True):
         np.testing.assert_array_equal(one, again)
     assert np.shares_memory(actual.sh0, used.sh0) == enough
 
 
 def test_gradients_of_other_numbers_of_colours_are_refused() -> None:
-    plan = plan_of(random_gaussians(5))
+    tiled = turned_view(random_gaussians(5))
     with refuses(ValueError, "grad_colors", [4, 3], [5, 3]):
-        color_gradients(plan, normal(len(plan.ids) + 1, 3))
+        color_gradients(tiled, normal(len(tiled.ids) + 1, 3))

@@ -12,7 +12,7 @@ from messages import refuses
 from gsmerge.fit.fit_state import State, start_state
 from gsmerge.fit.prepared_step import OF_STEP, StepTables
 from gsmerge.kernels.raster.step import PHASES, STEP, fit_phase
-from gsmerge.raster.view_plan import camera_numbers
+from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 37, 21

@@ -12,6 +12,7 @@ from tiny_scene import Tiny, write_npz
 
 from gsmerge.batch.find import find_scenes
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.scene.files import find_scene_files
 
 OUT = Path("out")
 
@@ -150,15 +151,13 @@ def locked(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("locked")
-def test_a_folder_that_cannot_be_read_is_passed_by() -> None:
+def test_a_folder_that_cannot_be_read_is_a_scene_that_fails() -> None:
     touch("all/a.ply", "all/locked/b.ply", "all/z/c.ply")
-    errors: list[SceneError] = []
-    found = find_scenes(["all", "all/*"], OUT, errors)
-    assert list(dict.fromkeys(map(str, found))) == ["all/a.ply", "all/z/c.ply"]
-    assert {error.path for error in errors} == {"all/locked"}
-    for given in (["all/locked"], ["all"], ["all/locked/**/*.ply"]):
-        with refuses(SceneError, "all/locked", "Permission denied"):
-            list(find_scenes(given, OUT))
+    assert actual("all") == ["all/a.ply", "all/locked", "all/z/c.ply"]
+    for given in ("all/locked", "all/lock*", "all/locked/**/*.ply"):
+        assert actual(given) == ["all/locked"]
+    with refuses(SceneError, "all/locked", "Permission denied"):
+        find_scene_files(Path("all/locked"))
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ from gsmerge.io import atomic
 
 
 def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
-    with lock_result(tmp_path, "a.ply", wait=False) as lock:
-        assert lock is not None
-        assert not lock.is_left
+    with lock_result(tmp_path, "a.ply", wait=False) as begun:
+        assert begun is not None
+        assert not begun.exists()
         with lock_result(tmp_path, "a.ply", wait=False) as second:
             assert second is None
         with lock_result(tmp_path, "b.ply", wait=False) as other:
@@ -36,19 +36,30 @@ def test_a_lock_is_of_one_process_and_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_lock_that_is_left_says_that_a_process_has_begun(tmp_path: Path) -> None:
-    path = leave_lock(tmp_path)
-    with lock_result(tmp_path, "room.ply", wait=True) as lock:
-        assert lock is not None
-        assert lock.is_left
-        lock.is_left = False
-    assert not path.exists()
+def test_a_mark_that_is_left_says_that_a_process_has_begun(tmp_path: Path) -> None:
+    path = leave_mark(tmp_path)
+    with lock_result(tmp_path, "room.ply", wait=True) as begun:
+        assert begun == path
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_lock_that_cannot_be_removed_is_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Windows, which removes no open file."""
+
+    def refuse(path: Path, *_: Any, **__: Any) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    for _ in range(2):
+        with lock_result(tmp_path, "room.ply", wait=False) as begun:
+            assert begun is not None
+    assert [path.suffix for path in tmp_path.iterdir()] == [".lock"]
 
 
 def test_a_full_disk_is_named(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is written first; an error of the system in the middle of writing names no file."""
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    for name in ("gsmerge.batch.run.ResultLock.leave_if_killed", "gsmerge.batch.jobs.compact_files"):
+    for name in ("gsmerge.batch.run.mark", "gsmerge.batch.jobs.compact_files"):
         out = tmp_path / name
 
         def fail(*_: object, **__: object) -> None:
@@ -84,7 +95,7 @@ def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> No
 def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with (
-        pytest.raises(SceneError, match="Not a directory"),
+        pytest.raises(SceneError, match="File exists"),
         lock_result(tmp_path / "file", "a.ply", wait=False),
     ):
         pass
@@ -230,12 +241,14 @@ def test_what_another_run_has_done_meanwhile_with_other_settings_is_left_to_it(s
 
 def test_what_another_run_works_on_is_left_to_it(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
-    with lock_result(out, "room.ply", wait=False):
+    with lock_result(out, "room.ply", wait=False) as begun:
+        assert begun is not None
+        runs.mark(begun)
         (out / left_by_a_dead_process()).touch()
         assert make_result(job, started, wait=False) is None
         assert record_loss(job, started, "died") is None
         remove_unfinished(started, [job])
-        assert len(results(out)) == 2  # the lock, and the file that the other process may yet clean up
+        assert len(results(out)) == 3  # lock, mark, and the file that the other process may yet clean up
     assert not (out / "batch.jsonl").exists()
 
 
@@ -272,7 +285,7 @@ KILLS = {
     "while it writes": ("gsmerge.compaction.files.write_gaussians", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.batch.run.append_line", True),
-    "before the lock is gone": ("gsmerge.batch.run.Path.unlink", True),
+    "before the mark is gone": ("gsmerge.batch.run.Path.unlink", True),
 }
 
 
@@ -303,7 +316,7 @@ make_result(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert list(out.glob(".batch-*"))
     after = run(scene, out)
-    recorded = moment == "before the lock is gone"
+    recorded = moment == "before the mark is gone"
     assert after["status"] == (SKIPPED if recorded else DONE)
     assert results(out) == undisturbed
     assert statuses(out) == {"room.ply": [DONE]}
@@ -383,19 +396,18 @@ def status(call: Any) -> str:
     return str(actual["status"])
 
 
-def leave_lock(out: Path) -> Path:
-    """Leave the lock of a process that was killed while it worked on the scene."""
-    with lock_result(out, "room.ply", wait=False) as lock:
-        assert lock is not None
-        lock.leave_if_killed()
-    (path,) = out.glob(".batch-*")
-    return path
+def leave_mark(out: Path) -> Path:
+    """Leave the mark of a process that was killed while it worked on the scene."""
+    with lock_result(out, "room.ply", wait=False) as begun:
+        assert begun is not None
+        runs.mark(begun)
+    return begun
 
 
 def kill(out: Path) -> Path:
-    """Leave all that such a process leaves; return the lock."""
+    """Leave all that such a process leaves; return the mark."""
     (out / left_by_a_dead_process()).touch()
-    return leave_lock(out)
+    return leave_mark(out)
 
 
 def test_who_is_given_up_leaves_a_record_and_nothing_else(scene: Path, out: Path) -> None:
@@ -416,11 +428,11 @@ def test_who_is_stopped_leaves_nothing(scene: Path, out: Path) -> None:
     assert list(out.iterdir()) == []
 
 
-def test_who_is_stopped_between_result_and_record_leaves_the_lock_that_says_whose_it_is(scene: Path, out: Path) -> None:
+def test_who_is_stopped_between_result_and_record_leaves_the_mark_that_says_whose_it_is(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
-    lock = kill(out)
+    mark = kill(out)
     (out / "room.ply").write_bytes(b"ours")
     remove_unfinished(started, [job])
-    assert sorted(out.iterdir()) == sorted([lock, out / "room.ply"])
+    assert sorted(out.iterdir()) == sorted([mark, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
     assert list(results(out)) == ["room.ply"]

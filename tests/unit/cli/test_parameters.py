@@ -10,8 +10,8 @@ from messages import refuse_all, refuses
 from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import flat_settings
-from gsmerge.states.options import ExtendOptions
 
 KNOWN = flat_settings(CompactOptions)
 

@@ -20,7 +20,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit
 from gsmerge.fit.photo_sizes import fit_photos
-from gsmerge.plan import plan_whole
+from gsmerge.plan import choose_for_scene
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
 from gsmerge.types import Cameras, PicturedScene, Scene
@@ -125,7 +125,7 @@ def test_views_that_repeat_others(scene: Scene) -> None:
 
 
 def count_blocks(scene: Scene, **settings: Any) -> int:
-    return plan_whole(measure_size(scene), CompactOptions().with_settings(settings)).blocks
+    return choose_for_scene(measure_size(scene), CompactOptions().with_settings(settings)).blocks
 
 
 def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:

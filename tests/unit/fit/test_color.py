@@ -43,7 +43,7 @@ def recolored(gaussians: Gaussians, offset: float) -> Gaussians:
 def test_wrong_colours_come_back(gaussians: Gaussians, photos: Photos) -> None:
     noise = 0.1 * np.random.default_rng(0).normal(size=gaussians.sh0.shape).astype(np.float32)
     spoilt = replace(gaussians, sh0=gaussians.sh0 + noise / SH_C0)
-    # one block in twenty is held out
+    # one patch in twenty is held out
     result, report = fitted(
         spoilt, photos, scenes.tuned(replace(FEW, holdout=0.0125), prior_weight=0.01, iterations=18)
     )
@@ -115,7 +115,7 @@ def test_pull_holds_the_colours(gaussians: Gaussians, photos: Photos) -> None:
 
 
 @pytest.mark.parametrize("size", [(8, 6), (32, 24), (40, 40)])
-def test_small_photos_still_have_a_held_out_part(size: tuple[int, int]) -> None:
+def test_small_photos_still_have_a_held_out_patch(size: tuple[int, int]) -> None:
     """Whatever the seed draws, acceptance must rest on some pixel."""
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
     photos = scene_photos(scene)

@@ -196,7 +196,7 @@ def test_unseen_ones_have_no_error_and_are_the_last_to_be_halved(gaussians: Gaus
     np.testing.assert_array_equal(grown.x[:5], state.x[:5])
 
 
-# held-out blocks
+# held-out patches
 
 
 @pytest.mark.parametrize("size", [(96, 64), (33, 17), (8, 6), (2, 2), (1, 5)])
@@ -210,7 +210,7 @@ def test_every_view_holds_something_out(size: tuple[int, int]) -> None:
             assert set(np.unique(weight).tolist()) == {0.0, 1.0}
 
 
-def test_share_of_the_blocks() -> None:
+def test_share_of_the_patches() -> None:
     photos = scene_photos(scenes.make_scene(scenes.wall(), scenes.arc(4, 128, 128)))
     box_shares = [1 - np.mean(training_weights(photos, share, 0)) for share in (0.05, 0.25, 0.6)]
     assert box_shares == pytest.approx([0.06, 0.25, 0.6], abs=0.12)

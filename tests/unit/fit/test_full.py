@@ -20,13 +20,12 @@ from gsmerge.fit.schedule import (
     Schedule,
     Step,
     affordable_steps,
-    plan_run,
+    prepare_fit,
     step_sizes,
 )
-from gsmerge.fit.scores import score_state
 from gsmerge.fit.steps import Optimiser, make_optimiser
-from gsmerge.fit.survey import survey_photos
-from gsmerge.raster import plan_view, splat_adjoint
+from gsmerge.fit.survey import score_state, survey_photos
+from gsmerge.raster import splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import Tuning
 
@@ -40,7 +39,7 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.plan_for(photos, replace(LONG, dropout=0.0)))
+    result, report = fit_full(start, scenes.run_for(photos, replace(LONG, dropout=0.0)))
     assert (report.method, report.accepted, report.steps) == ("full", True, 160)
     assert report.holdout_after > report.holdout_before + 4
     assert scenes.psnr_of(result, scene) > scenes.psnr_of(start, scene) + 6
@@ -51,7 +50,7 @@ def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     box = {"max_mean_shift": 0.5, "max_scale_change": 0.1, "max_opacity_change": 0.2, "min_scale": 0}
     start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.plan_for(photos, scenes.tuned(QUICK, **box)))
+    result, report = fit_full(start, scenes.run_for(photos, scenes.tuned(QUICK, **box)))
     assert report.accepted
     unit = np.sort(start.scales, 1)[:, 1:].prod(1) ** 0.5
     assert (np.linalg.norm(result.means - start.means, axis=1) <= 0.501 * unit).all()
@@ -64,10 +63,10 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
     state, least = start_state(truth), QUICK.tuning.single_view_share
 
     def shares_of(some: Pair) -> np.ndarray:
-        plan = scenes.plan_for(some, QUICK)
-        survey = survey_photos(truth, plan)
+        run = scenes.run_for(some, QUICK)
+        survey = survey_photos(truth, run)
         actual, _ = limit_moves(survey, QUICK.tuning)
-        assert survey.score == score_state(state, plan, some[1])
+        assert survey.score == score_state(state, run, some[1])
         return actual
 
     def with_views(views: list[int]) -> Pair:
@@ -79,7 +78,7 @@ def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) 
     assert box_shares.max() == 1
     np.testing.assert_array_equal(shares_of(alone), np.full(len(truth), least, np.float32))
     whole = np.ones((alone[1].height, alone[1].width, 1))
-    shown = splat_adjoint(plan_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
+    shown = splat_adjoint(tile_view(state.splats, **alone[1].camera(0)), whole)[:, 0]
     np.testing.assert_allclose(shares_of(with_views([0, 0])), np.where(shown > 0, 1, least), atol=1e-6)
 
 
@@ -87,13 +86,13 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
     """Of the photo that it is nearest to, whatever the box says."""
     start = scenes.spoil(truth)
     thin = replace(start, scales=start.scales * np.array([0.02, 1, 1], np.float32))
-    _, min_sizes = limit_moves(survey_photos(thin, scenes.plan_for(photos, QUICK)), QUICK.tuning)
+    _, min_sizes = limit_moves(survey_photos(thin, scenes.run_for(photos, QUICK)), QUICK.tuning)
     views = photos[0].viewmats
     depths = start.means @ views[:, 2, :3].T + views[:, 2, 3]
     np.testing.assert_allclose(np.exp(min_sizes), 0.5 * depths.min(1) / photos[0].Ks[0, 0, 0], rtol=1e-4)
     free = scenes.tuned(QUICK, min_scale=0.0)
-    kept, report = fit_full(thin, scenes.plan_for(photos, QUICK))
-    needles, other = fit_full(thin, scenes.plan_for(photos, free))
+    kept, report = fit_full(thin, scenes.run_for(photos, QUICK))
+    needles, other = fit_full(thin, scenes.run_for(photos, free))
     assert report.accepted
     assert other.accepted
     assert (kept.scales >= np.exp(min_sizes)[:, None] * (1 - 1e-5)).all()
@@ -102,21 +101,21 @@ def test_nothing_becomes_thinner_than_half_a_pixel(truth: Gaussians, photos: Pai
 
 def test_steps_draw_as_viewers_do(photos: Pair) -> None:
     """With and without compensation, as when enlarged twice, and from afar; before that always in one way."""
-    plan = plan_run(FitJob(photos, LONG))
-    modes = [plan.draw_mode(step, 0.8) for step in range(1, 17)]
+    run = prepare_fit(FitJob(photos, LONG))
+    modes = [run.draw_mode(step, 0.8) for step in range(1, 17)]
     afar = DrawMode(1, 0.3)
     assert set(modes) == {DrawMode(0, 0.3, antialiased=True), DrawMode(0, 0.3), DrawMode(0, 0.075), afar}
     assert modes.count(afar) == 3
-    assert modes[0] == plan.draw_mode(17, 0.8)
-    assert {plan.draw_mode(step, 0.49) for step in range(1, 17)} == {DrawMode(1, 0.075)}
-    assert afar not in {plan_run(FitJob(photos, QUICK)).draw_mode(step, 0.8) for step in range(1, 17)}
+    assert modes[0] == run.draw_mode(17, 0.8)
+    assert {run.draw_mode(step, 0.49) for step in range(1, 17)} == {DrawMode(1, 0.075)}
+    assert afar not in {prepare_fit(FitJob(photos, QUICK)).draw_mode(step, 0.8) for step in range(1, 17)}
 
 
 @pytest.mark.parametrize(("name", "field"), [("opacity_reg", "opacities"), ("scale_reg", "scales")])
 def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: str, field: str) -> None:
     start = scenes.spoil(truth)
     free, pulled = (
-        fit_full(start, scenes.plan_for(photos, scenes.tuned(QUICK, **{name: prior_weight})))[0]
+        fit_full(start, scenes.run_for(photos, scenes.tuned(QUICK, **{name: prior_weight})))[0]
         for prior_weight in (0.0, 0.05)
     )
     assert np.log(getattr(pulled, field)).mean() < np.log(getattr(free, field)).mean() - 0.02
@@ -128,7 +127,7 @@ def test_pulls_make_them_fade_and_shrink(truth: Gaussians, photos: Pair, name: s
 @pytest.mark.parametrize("extra", [0, 1, 30, 70])
 def test_count_asked_for_is_met(truth: Gaussians, photos: Pair, extra: int) -> None:
     start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.plan_for(photos, LONG, count=len(start) + extra))
+    result, report = fit_full(start, scenes.run_for(photos, LONG, count=len(start) + extra))
     assert report.accepted
     assert len(result) == len(start) + extra
 
@@ -138,7 +137,7 @@ def test_a_fit_is_judged_before_it_grows(truth: Gaussians, photos: Pair) -> None
     start = truth[::8]
     options = replace(LONG, half_res_share=0.5, dropout=0.0)
     (_, grown), (_, same) = (
-        fit_full(start, scenes.plan_for(photos, options, count=count)) for count in (8 * len(start), 0)
+        fit_full(start, scenes.run_for(photos, options, count=count)) for count in (8 * len(start), 0)
     )
     assert grown.accepted
     assert grown.holdout_after == same.holdout_after
@@ -147,12 +146,12 @@ def test_a_fit_is_judged_before_it_grows(truth: Gaussians, photos: Pair) -> None
 @pytest.mark.parametrize(("views", "dropout"), [(20, 0.05), (21, 0.0)])
 def test_dropout_needs_many_looks_at_each_view(photos: Pair, views: int, dropout: float) -> None:
     many = tuple(one[[view % len(one) for view in range(views)]] for one in photos)
-    assert plan_run(FitJob(many, FitOptions(fit_steps=600))).dropout == dropout
+    assert prepare_fit(FitJob(many, FitOptions(fit_steps=600))).dropout == dropout
 
 
 def test_more_than_double_is_grown_in_turns(truth: Gaussians, photos: Pair) -> None:
     start = truth[::4]
-    result, report = fit_full(start, scenes.plan_for(photos, LONG, count=3 * len(start) + 5))
+    result, report = fit_full(start, scenes.run_for(photos, LONG, count=3 * len(start) + 5))
     assert report.accepted
     assert len(result) == 3 * len(start) + 5
 
@@ -162,10 +161,10 @@ def test_views_take_turns_and_dropout_follows_the_growth(
 ) -> None:
     """Every view once before any again; the steps after the growth drop out of all Gaussians."""
     start, taken = scenes.spoil(truth), list[Step]()
-    plan = scenes.plan_for(photos, FitOptions(fit_steps=320, judged=False), len(start) + 20, seed=3)
+    run = scenes.run_for(photos, FitOptions(fit_steps=320, judged=False), len(start) + 20, seed=3)
     monkeypatch.setattr(Optimiser, "step", lambda self, state, step: taken.append(step) or 0.0)
-    assert len(fit_full(start, plan)[0]) == len(start) + 20
-    assert plan.dropout == DROPOUT > 0
+    assert len(fit_full(start, run)[0]) == len(start) + 20
+    assert run.dropout == DROPOUT > 0
     assert [step.number for step in taken] == list(range(1, 321))
     assert (len(taken[0].kept), len(taken[-1].kept)) == (len(start), len(start) + 20)
     assert 0.8 < np.concatenate([step.kept for step in taken]).mean() < 1
@@ -175,7 +174,7 @@ def test_views_take_turns_and_dropout_follows_the_growth(
 
 def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    assert len(fit_full(start, scenes.plan_for(photos, QUICK, count=2 * len(start)))[0]) == len(start)
+    assert len(fit_full(start, scenes.run_for(photos, QUICK, count=2 * len(start)))[0]) == len(start)
     assert start_share(QUICK) == 1
     assert start_share(replace(LONG, fit="none")) == 1
     assert 0 < start_share(LONG) < 1
@@ -186,7 +185,7 @@ def test_short_runs_do_not_grow(truth: Gaussians, photos: Pair) -> None:
 
 def test_fit_that_makes_it_worse_returns_the_same(truth: Gaussians, noise: Pair) -> None:
     grey = replace(truth, sh0=np.zeros_like(truth.sh0))
-    result, report = fit_full(grey, scenes.plan_for(noise, LONG, count=2 * len(grey)))
+    result, report = fit_full(grey, scenes.run_for(noise, LONG, count=2 * len(grey)))
     assert (report.method, report.accepted) == ("none", False)
     assert report.holdout_after <= report.holdout_before
     assert result is grey
@@ -198,25 +197,25 @@ def test_input_is_left_alone(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
     before = [getattr(start, name).copy() for name in scenes.FIELDS]
     images = [p.images.copy() for p in photos]
-    fit_full(start, scenes.plan_for(photos, QUICK))
+    fit_full(start, scenes.run_for(photos, QUICK))
     assert all(np.array_equal(getattr(start, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
     for photo, image in zip(photos, images, strict=True):
         np.testing.assert_array_equal(photo.images, image)
 
 
 def test_perfect_start_is_not_spoilt(scene: Scene, truth: Gaussians, photos: Pair) -> None:
-    result, report = fit_full(truth, scenes.plan_for(photos, LONG))
+    result, report = fit_full(truth, scenes.run_for(photos, LONG))
     assert report.accepted == (report.holdout_after > report.holdout_before)
     assert report.accepted or result is truth
     actual, expected = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (result, truth))
     assert np.abs(actual - expected).mean() < 0.01
 
 
-def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
+def test_held_out_patches_teach_nothing_while_they_judge(truth: Gaussians, photos: Pair) -> None:
     """All steps at half size: what the photos show there does not matter. (SSIM's windows do reach into them.)"""
     options = scenes.tuned(replace(QUICK, half_res_share=1.0), ssim_lambda=0.0)
     start = scenes.spoil(truth)
-    weights = plan_run(FitJob(photos, options)).weights
+    weights = prepare_fit(FitJob(photos, options)).weights
     painted = photos[1].images.copy()
     for image, weight in zip(painted, weights, strict=True):
         image[weight == 0] = 1 - image[weight == 0]
@@ -227,8 +226,8 @@ def test_held_out_blocks_teach_nothing_while_they_judge(truth: Gaussians, photos
 
 def run_steps(gaussians: Gaussians, photos: Pair, options: FitOptions) -> np.ndarray:
     """The state after some steps, without a judge."""
-    plan, state = scenes.plan_for(photos, options), start_state(gaussians)
-    schedule, optimiser = Schedule(plan), make_optimiser(plan)
+    run, state = scenes.run_for(photos, options), start_state(gaussians)
+    schedule, optimiser = Schedule(run), make_optimiser(run)
     for step in range(options.fit_steps):
         optimiser.step(state, schedule.draw(step + 1, step / options.fit_steps, len(gaussians)))
     return state.x
@@ -240,7 +239,7 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
     scene, truth = scenes.self_made(degree)
     behind = replace(truth[:4], means=truth.means[:4] - 100, sh0=np.full((4, 1, 3), 4.0, np.float32))
     start = Gaussians.concat([scenes.spoil(truth), behind])
-    result, report = fit_full(start, scenes.plan_for(scenes.pair_of(scene), QUICK))
+    result, report = fit_full(start, scenes.run_for(scenes.pair_of(scene), QUICK))
     assert report.accepted
     for name in scenes.FIELDS:
         np.testing.assert_allclose(getattr(result, name)[-4:], getattr(behind, name), rtol=1e-5, atol=1e-6)
@@ -252,7 +251,7 @@ def test_unseen_ones_stay_as_they_are(degree: int) -> None:
 def test_harmonics_are_inherited_by_grown_ones() -> None:
     scene, truth = scenes.self_made(1)
     start = scenes.spoil(truth)
-    result, report = fit_full(start, scenes.plan_for(scenes.pair_of(scene), LONG, count=len(start) + 20))
+    result, report = fit_full(start, scenes.run_for(scenes.pair_of(scene), LONG, count=len(start) + 20))
     assert report.accepted
     assert len(result) == len(start) + 20
     assert np.array_equal(result.shN[: len(start)], start.shN)
@@ -264,7 +263,7 @@ def test_harmonics_are_inherited_by_grown_ones() -> None:
 
 def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
     """Hardly any: a few steps, and still judged."""
-    result, report = fit_full(scenes.spoil(truth), scenes.plan_for(photos, replace(LONG, time_budget=1e-6)))
+    result, report = fit_full(scenes.spoil(truth), scenes.run_for(photos, replace(LONG, time_budget=1e-6)))
     assert PROBE < report.steps <= PROBE + 1
     assert report.accepted == (report.holdout_after > report.holdout_before)
     if report.accepted:
@@ -274,7 +273,7 @@ def test_time_budget_ends_the_run(truth: Gaussians, photos: Pair) -> None:
 
 def test_steps_follow_the_time_budget(photos: Pair) -> None:
     def steps(budget: float, seconds: float) -> int:
-        return affordable_steps(seconds, plan_run(FitJob(photos, replace(LONG, time_budget=budget))))
+        return affordable_steps(seconds, prepare_fit(FitJob(photos, replace(LONG, time_budget=budget))))
 
     probe, most = PROBE, MAX_STEPS
     assert steps(1e-9, 1.0) == probe + 1
@@ -307,7 +306,7 @@ def test_rates_decay() -> None:
 
 def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
     calls: list[tuple[int, int, float]] = []
-    fit_full(scenes.spoil(truth), scenes.plan_for(photos, QUICK, progress=lambda *call: calls.append(call)))
+    fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK, progress=lambda *call: calls.append(call)))
     assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
     assert calls[-1][2] > calls[0][2]  # of the photos
     assert np.isfinite(np.array(calls, float)).all()
@@ -317,14 +316,14 @@ def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
 
 
 def test_pieces_of_a_step_change_no_bit(truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = fit_full(scenes.spoil(truth), scenes.plan_for(photos, QUICK))
+    one = fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))
     monkeypatch.setattr(steps, "ROWS", 17)
-    assert scenes.identical(fit_full(scenes.spoil(truth), scenes.plan_for(photos, QUICK))[0], one[0])
+    assert scenes.identical(fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK))[0], one[0])
 
 
 def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    one, two, other = (fit_full(start, scenes.plan_for(photos, QUICK, seed=seed)) for seed in (5, 5, 6))
+    one, two, other = (fit_full(start, scenes.run_for(photos, QUICK, seed=seed)) for seed in (5, 5, 6))
     assert scenes.identical(one[0], two[0])
     assert one[1] == two[1]
     assert not scenes.identical(one[0], other[0])
@@ -334,7 +333,7 @@ def test_seed_repeats_and_matters(truth: Gaussians, photos: Pair) -> None:
 def test_tiny_photos(size: tuple[int, int]) -> None:
     scene = scenes.make_scene(scenes.wall(), scenes.arc(2, *size))
     start = replace(scene.gaussians, means=scene.gaussians.means.astype(np.float32))
-    result, report = fit_full(start, scenes.plan_for(scenes.pair_of(scene), QUICK))
+    result, report = fit_full(start, scenes.run_for(scenes.pair_of(scene), QUICK))
     assert len(result) == len(start)
     assert np.isfinite([report.holdout_before, report.holdout_after]).all()
     for name in scenes.FIELDS:

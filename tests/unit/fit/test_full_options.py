@@ -12,11 +12,10 @@ from gsmerge import Gaussians
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.poses import start_poses
-from gsmerge.fit.schedule import DROPOUT, FEW_VIEWS, MANY_STEPS, Schedule, plan_run
-from gsmerge.fit.steps import make_optimiser
+from gsmerge.fit.schedule import DROPOUT, FEW_VIEWS, MANY_STEPS, Schedule, prepare_fit
+from gsmerge.fit.steps import make_optimiser, start_poses
 from gsmerge.geometry import motion_matrices, motion_vectors, project_points
-from gsmerge.raster import plan_view
+from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import gradients_of
 from gsmerge.raster.photos import Photos
@@ -39,13 +38,13 @@ def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
     masks = tuple(np.ones(photos.images.shape[:3], np.float32) for photos in rubbish)
     for mask in masks:
         mask[:, :, : mask.shape[2] // 3] = 0
-    whole, _ = fit_full(start, scenes.plan_for(rubbish, options))
+    whole, _ = fit_full(start, scenes.run_for(rubbish, options))
     weighed, even = (
         tuple(replace(photos, weights=np.maximum(mask, least)) for photos, mask in zip(rubbish, masks, strict=True))
         for least in np.array([0, 1], np.float32)
     )
-    masked, report = fit_full(start, scenes.plan_for(weighed, options))
-    again, _ = fit_full(start, scenes.plan_for(even, options))
+    masked, report = fit_full(start, scenes.run_for(weighed, options))
+    again, _ = fit_full(start, scenes.run_for(even, options))
     assert report.accepted
     assert scenes.psnr_of(masked, scene) > scenes.psnr_of(whole, scene) + 2
     assert np.array_equal(again.means, whole.means)
@@ -59,13 +58,13 @@ def test_dropout_where_there_are_few_views(photos: tuple[Photos, Photos]) -> Non
     many = Photos(*(np.concatenate([a, a]) for a in (photos[0].images, photos[0].viewmats, photos[0].Ks)), eps2d=0.3)
     pair = many, replace(photos[1], images=np.concatenate([photos[1].images] * 2))
     assert len(photos[0]) <= FEW_VIEWS < len(many)
-    assert plan_run(FitJob(photos, LONG)).dropout == DROPOUT > 0
-    assert plan_run(FitJob(photos, replace(LONG, fit_steps=MANY_STEPS - 1))).dropout == 0
-    assert plan_run(FitJob(pair, LONG)).dropout == 0
-    assert plan_run(FitJob(pair, replace(LONG, dropout=0.15))).dropout == 0.15
-    assert plan_run(FitJob(photos, replace(LONG, dropout=0.0))).dropout == 0
+    assert prepare_fit(FitJob(photos, LONG)).dropout == DROPOUT > 0
+    assert prepare_fit(FitJob(photos, replace(LONG, fit_steps=MANY_STEPS - 1))).dropout == 0
+    assert prepare_fit(FitJob(pair, LONG)).dropout == 0
+    assert prepare_fit(FitJob(pair, replace(LONG, dropout=0.15))).dropout == 0.15
+    assert prepare_fit(FitJob(photos, replace(LONG, dropout=0.0))).dropout == 0
     very_long = replace(LONG, fit_steps=LONG_STEPS)
-    assert 0 < plan_run(FitJob(pair, very_long)).dropout < plan_run(FitJob(photos, very_long)).dropout
+    assert 0 < prepare_fit(FitJob(pair, very_long)).dropout < prepare_fit(FitJob(photos, very_long)).dropout
 
 
 def test_shorter_runs_have_more_steps_on_half_size_photos() -> None:
@@ -87,8 +86,8 @@ def test_dropout_leaves_out_its_share(truth: Gaussians, photos: tuple[Photos, Ph
     """What is left out learns nothing from the step."""
     moved = []
     for share in (0.0, 0.5):
-        state, plan = start_state(truth), scenes.plan_for(photos, replace(QUICK, dropout=share))
-        make_optimiser(plan).step(state, Schedule(plan).draw(1, 0.0, len(truth)))
+        state, run = start_state(truth), scenes.run_for(photos, replace(QUICK, dropout=share))
+        make_optimiser(run).step(state, Schedule(run).draw(1, 0.0, len(truth)))
         moved.append(state.m.any(1).mean())
     assert moved[0] > 0.6
     assert moved[1] == pytest.approx(0.5 * moved[0], abs=0.1)
@@ -107,7 +106,7 @@ def spoil(photos: Pair, size: float = 0.01) -> Pair:
 
 def squared_error(truth: Gaussians, photos: Photos, view: int) -> tuple[float, np.ndarray]:
     """Of a view, and its gradient by the viewmat."""
-    drawn = plan_view(start_state(truth).splats, **photos.camera(view))
+    drawn = tile_view(start_state(truth).splats, **photos.camera(view))
     colors = view_colors(drawn)
     image, left = blend(drawn, colors, np.zeros(3, np.float32))
     residual = image - photos.images[view]
@@ -129,8 +128,8 @@ def test_steps_of_a_pose_lower_the_loss(view: int, truth: Gaussians, photos: Pai
 
 def test_the_fit_finds_the_cameras(truth: Gaussians, photos: Pair) -> None:
     wrong, start = spoil(photos), scenes.spoil(truth)
-    free, report = fit_full(start, scenes.plan_for(wrong, FREE))
-    fixed, other = fit_full(start, scenes.plan_for(wrong, replace(FREE, move_cameras=False)))
+    free, report = fit_full(start, scenes.run_for(wrong, FREE))
+    fixed, other = fit_full(start, scenes.run_for(wrong, replace(FREE, move_cameras=False)))
     assert other.viewmats is None
     pixels = [project_points(truth.means, one, photos[0].Ks)[0] for one in (
         photos[0].viewmats, wrong[0].viewmats, report.viewmats,

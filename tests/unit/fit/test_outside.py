@@ -22,7 +22,7 @@ from gsmerge.fit.outside import (
 )
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_centres
-from gsmerge.raster import composite, plan_view, prepare
+from gsmerge.raster import composite, prepare, tile_view
 from gsmerge.raster.photos import Photos, render_photos
 from gsmerge.runtime.record import record_run
 
@@ -80,8 +80,8 @@ def test_gradients_are_those_of_the_weighted_opacity(outside: Photos, truth: Gau
 
     def loss(change: float) -> float:
         changed = replace(spoilt, opacities=np.append(spoilt.opacities[:-1], np.float32(0.3 + change)))
-        plan = plan_view(prepare(changed), **outside.camera(view))
-        return float((outside.weights[view] * (1 - composite(plan)[1])).mean(dtype=np.float64))
+        tiled = tile_view(prepare(changed), **outside.camera(view))
+        return float((outside.weights[view] * (1 - composite(tiled)[1])).mean(dtype=np.float64))
 
     assert g.ids[-1] == len(truth)
     assert g.opacities[-1] == pytest.approx((loss(step) - loss(-step)) / (2 * step), rel=1e-3)
@@ -102,7 +102,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
     start = scenes.spoil(truth)
     whole = replace(outside, weights=np.sign(outside.weights))
-    fitted, without = (fit_full(start, scenes.plan_for(shown, LONG, outside=views))[0] for views in (whole, None))
+    fitted, without = (fit_full(start, scenes.run_for(shown, LONG, outside=views))[0] for views in (whole, None))
     kept, grown = score_fog(prepare(fitted), outside), score_fog(prepare(without), outside)
     assert kept < 0.02
     assert grown > 4 * kept

@@ -16,7 +16,7 @@ from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions, fit, fit_photos
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale
-from gsmerge.fit.schedule import affordable_steps, plan_run
+from gsmerge.fit.schedule import affordable_steps, prepare_fit
 from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, MASKED, score_photos
 from gsmerge.runtime.record import record_run
@@ -152,11 +152,11 @@ def test_some_views_have_their_own_photos(scene: Scene) -> None:
 
 def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
     options = FitOptions(fit_steps=200, photo_scale=2)
-    plan = plan_run(FitJob(fit_photos(with_large(scene, 2), options), options))
-    sizes = [plan.draw_mode(step + 1, step / 200).size for step in range(200)]
+    run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options))
+    sizes = [run.draw_mode(step + 1, step / 200).size for step in range(200)]
     assert [sizes.count(size) for size in (1, 0, 2)] == [103, 57, 40]
     assert sizes[:100] == [1] * 100
-    usual = plan_run(FitJob(scenes.pair_of(scene), options))
+    usual = prepare_fit(FitJob(scenes.pair_of(scene), options))
     sizes = [usual.draw_mode(step + 1, step / 200).size for step in range(200)]
     assert sizes[:100] == [1] * 100
     assert [sizes[140:].count(size) for size in (0, 1)] == [49, 11]
@@ -164,18 +164,20 @@ def test_steps_look_at_half_full_and_larger_photos(scene: Scene) -> None:
 
 def test_the_users_share_of_half_size_steps_stays(scene: Scene) -> None:
     options = FitOptions(half_res_share=0.8, photo_scale=2)
-    assert plan_run(FitJob(fit_photos(with_large(scene, 2), options), options)).half_part == 0.8
+    assert prepare_fit(FitJob(fit_photos(with_large(scene, 2), options), options)).half_part == 0.8
 
 
 def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
-    plan = plan_run(FitJob(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG))
-    assert all((weight == 1).all() for weight in plan.step_weights[2])
+    run = prepare_fit(FitJob(fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2)), LONG))
+    assert all((weight == 1).all() for weight in run.step_weights[2])
 
 
 def test_time_budget_counts_larger_photos(scene: Scene) -> None:
     options = replace(LONG, time_budget=1.0)
     steps = [
-        affordable_steps(0.06, plan_run(FitJob(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o)))
+        affordable_steps(
+            0.06, prepare_fit(FitJob(fit_photos(with_large(scene, s), replace(options, photo_scale=s)), o))
+        )
         for s, o in ((1, replace(options, half_res_share=0.6)), (2, options), (3, options))
     ]
     assert steps[0] > steps[1] > steps[2]
@@ -186,10 +188,10 @@ def test_result_shows_larger_photos_better(truth: Gaussians, scene: Scene) -> No
     near = large_photos(large, 2)
     near = replace(near, images=np.stack([near.image(view) for view in range(len(near))]))
     usual, sharp = (
-        fit_full(start, scenes.plan_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
+        fit_full(start, scenes.run_for(fit_photos(large, replace(LONG, photo_scale=scale)), LONG))[0]
         for scale in (1, 2)
     )
-    assert scenes.identical(usual, fit_full(start, scenes.plan_for(scenes.pair_of(scene), LONG))[0])
+    assert scenes.identical(usual, fit_full(start, scenes.run_for(scenes.pair_of(scene), LONG))[0])
     views = range(len(near))
     assert score_photos(sharp, near, views).psnr > score_photos(usual, near, views).psnr + 0.3
 

@@ -12,7 +12,7 @@ import scenes
 from gsmerge import Gaussians
 from gsmerge.fit import FitJob, FitOptions, prepared_step, steps
 from gsmerge.fit.fit_state import State, start_state
-from gsmerge.fit.schedule import Schedule, plan_run
+from gsmerge.fit.schedule import Schedule, prepare_fit
 from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import use_threads
@@ -26,8 +26,8 @@ def take_steps(
 ) -> tuple[State, list[float], Optimiser]:
     """The state, the errors and the optimiser after steps from a spoiled start."""
     options = FitOptions(fit_steps=STEPS, holdout=0.2, dropout=dropout, half_res_share=0.5)
-    plan = plan_run(FitJob(photos, options))
-    optimiser, schedule, state = make_optimiser(plan), Schedule(plan), start_state(scenes.spoil(truth))
+    run = prepare_fit(FitJob(photos, options))
+    optimiser, schedule, state = make_optimiser(run), Schedule(run), start_state(scenes.spoil(truth))
     state.fixed[0] = fixed
     with use_threads(threads):
         draws = [schedule.draw(number + 1, number / STEPS, len(state.x)) for number in range(STEPS)]
@@ -64,8 +64,8 @@ def test_bits_are_those_of_single_calls(truth: Gaussians, photos: Pair, dropout:
 def test_all_low_passes_draw_the_same(truth: Gaussians, photos: Pair, single: Any) -> None:
     states = []
     for _ in range(2):
-        plan = plan_run(FitJob(photos, FitOptions(fit_steps=320, half_res_share=0.0, holdout=0.2)))
-        optimiser, schedule, state = make_optimiser(plan), Schedule(plan), start_state(scenes.spoil(truth))
+        run = prepare_fit(FitJob(photos, FitOptions(fit_steps=320, half_res_share=0.0, holdout=0.2)))
+        optimiser, schedule, state = make_optimiser(run), Schedule(run), start_state(scenes.spoil(truth))
         draws = [schedule.draw(number, 0.5, len(state.x)) for number in range(1, 17)]
         for draw in draws:
             optimiser.step(state, draw)
@@ -98,7 +98,7 @@ def test_fixed_gaussians_and_harmonics_are_left_to_single_calls(truth: Gaussians
 def test_buffers_follow_the_state_and_the_threads(truth: Gaussians, photos: Pair) -> None:
     state, _, optimiser = take_steps(truth, photos)
     tables = optimiser.tables
-    draw = Schedule(optimiser.plan).draw(1, 0.9, len(state.x))
+    draw = Schedule(optimiser.run).draw(1, 0.9, len(state.x))
     with use_threads(2):
         optimiser.step(state, draw)
     assert optimiser.tables is tables

@@ -14,9 +14,8 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import outside_views, score_fog
-from gsmerge.fit.scores import score_images
-from gsmerge.fit.survey import survey_photos, visible_mask
-from gsmerge.raster import composite, contributions, plan_view, prepare
+from gsmerge.fit.survey import score_images, survey_photos, visible_mask
+from gsmerge.raster import composite, contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
 
@@ -30,7 +29,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     result, report = fit(start, FitJob(photos, QUICK, seed=4))
     outside = outside_views(prepare(start), photos[1], QUICK)
     assert outside is not None
-    expected, own = fit_full(start, scenes.plan_for(photos, QUICK, seed=4, outside=outside))
+    expected, own = fit_full(start, scenes.run_for(photos, QUICK, seed=4, outside=outside))
     assert report == replace(own, fog=score_fog(prepare(result), outside))
     assert scenes.identical(result, expected)
 
@@ -97,16 +96,16 @@ def test_nothing_to_fit(truth: Gaussians, photos: Pair, method: str) -> None:
 
 
 def test_a_survey_is_what_its_parts_are(truth: Gaussians, photos: Pair) -> None:
-    plan, pictures = scenes.plan_for(photos, QUICK), list[np.ndarray]()
-    survey = survey_photos(truth, plan)
+    run, pictures = scenes.run_for(photos, QUICK), list[np.ndarray]()
+    survey = survey_photos(truth, run)
     half, state = photos[1], start_state(truth)
     np.testing.assert_array_equal(survey.visible(1 / 255), visible_mask(truth, half, 1 / 255))
     sums = np.zeros((len(half), len(truth)))
     for view in range(len(half)):
-        drawn = plan_view(state.splats, **half.camera(view))
+        drawn = tile_view(state.splats, **half.camera(view))
         pictures.append(composite(drawn, state.colors)[0])
         sums[view] = contributions(drawn)[0]
-    assert survey.score == score_images(pictures, plan, half)
+    assert survey.score == score_images(pictures, run, half)
     np.testing.assert_array_equal(survey.sums, sums.sum(0))
     np.testing.assert_array_equal(survey.squares, (sums**2).sum(0))
     rows = np.arange(0, len(truth), 3)

@@ -19,7 +19,7 @@ from gsmerge.measure.camera_path import (
     orbit,
     outside_camera,
     parse_path,
-    plan_path,
+    sample_path,
     spline,
     viewing_depth,
     wide_orbit,
@@ -161,7 +161,7 @@ def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn:
 
 @pytest.mark.parametrize("kind", ["orbit", "orbit:30", "spline"])
 def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
-    path, back = (plan_path(parse_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
+    path, back = (sample_path(parse_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
     if kind == "spline":  # even speed is another one farther away: the ends are the same cameras
         path, back = path[[0, -1]], back[[0, -1]]
     np.testing.assert_allclose(back.viewmats[:, :3, :3], path.viewmats[:, :3, :3], atol=1e-12)
@@ -170,7 +170,7 @@ def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
 
 
 def test_a_spline_that_steps_back_has_even_speed(walk: Cameras) -> None:
-    steps = pose_steps(plan_path(CameraPath("spline", back=0.5), walk, DEPTH, 400), 1.5 * DEPTH)
+    steps = pose_steps(sample_path(CameraPath("spline", back=0.5), walk, DEPTH, 400), 1.5 * DEPTH)
     assert steps.max() / steps.min() < 1.03
 
 
@@ -218,12 +218,12 @@ def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
     means = np.random.default_rng(1).uniform(-4, 4, (500, 3))
     motion = motion_matrices(np.array([[0.3, -1.1, 0.7, 4, -2, 1]]))[0]
     moved = replace(walk, viewmats=walk.viewmats @ np.linalg.inv(motion))
-    path = plan_path(parse_path(kind), walk, viewing_depth(walk, means), 30)
+    path = sample_path(parse_path(kind), walk, viewing_depth(walk, means), 30)
     depth = viewing_depth(moved, means @ motion[:3, :3].T + motion[:3, 3])
-    other = plan_path(parse_path(kind), moved, depth, 30)
+    other = sample_path(parse_path(kind), moved, depth, 30)
     np.testing.assert_allclose(other.viewmats @ motion, path.viewmats, atol=1e-9)
 
 
 def test_a_path_has_two_frames_at_least(walk: Cameras) -> None:
     with refuses(ValueError, "frames", 2, 1):
-        plan_path(CameraPath("orbit"), walk, DEPTH, 1)
+        sample_path(CameraPath("orbit"), walk, DEPTH, 1)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from messages import refuses
 from numpy.typing import NDArray
+from sweeps import sweep
 
 from gsmerge.errors import GsmergeError, SceneError
 from gsmerge.io.bounds import read_budget
@@ -132,8 +133,8 @@ def plain_lpips(image: Array, reference: Array, tree: dict[str, Any], net: str) 
 # The network, with made-up weights
 
 
-@pytest.mark.parametrize("net", NETS)
-@pytest.mark.parametrize("shape", [(64, 64), (50, 37), (31, 48)])
+@sweep("net", NETS, often=2)
+@sweep("shape", [(64, 64), (50, 37), (31, 48)], often=2)
 def test_distance_is_the_plain_one(package: Path, net: str, shape: tuple[int, int]) -> None:
     first, second = FIRST[: shape[0], : shape[1]], SECOND[: shape[0], : shape[1]]
     assert lpips(first, second, net) == pytest.approx(plain_lpips(first, second, made_up(net), net), rel=1e-5)

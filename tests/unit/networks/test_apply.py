@@ -8,7 +8,6 @@ import pytest
 from network_fixtures import SMALL, Made, made, noisy, untrained
 
 from gsmerge.geometry import covariances
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.apply import (
     NetworkContext,
     decode_gaussians,
@@ -21,6 +20,7 @@ from gsmerge.networks.apply import (
 from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match

@@ -10,7 +10,6 @@ from scenes import make_features
 
 from gsmerge import geometry
 from gsmerge.geometry import covariances, quat_to_rotmat
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.corrections import (
     COLOR,
     LOGIT,
@@ -23,6 +22,7 @@ from gsmerge.networks.corrections import (
     residual_limits,
 )
 from gsmerge.networks.options import FEATURE, RESIDUAL, Bounds
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians
 
 EACH = np.arange(20)  # its own group

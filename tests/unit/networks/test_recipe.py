@@ -15,8 +15,8 @@ from gsmerge import Scene
 from gsmerge.errors import UsageError
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.states.extend import extend
-from gsmerge.states.options import ExtendOptions
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
 

@@ -9,7 +9,7 @@ import scenes
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
 from gsmerge.raster.photos import NEAR, scene_photos, score_photos, scored_tiles
-from gsmerge.raster.view_plan import plan_view, prepare
+from gsmerge.raster.tiled_view import prepare, tile_view
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +23,15 @@ def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
     scales = splats.scales * rng.choice([0.2, 1, 30], (len(splats), 1)).astype(np.float32)
     splats = type(splats)(**{**vars(splats), "scales": scales})
     photos = scene_photos(scene)
-    whole = plan_view(splats, **photos.camera(1))
+    whole = tile_view(splats, **photos.camera(1))
     for tiles in (rng.random((8, 10)) < 0.2, np.zeros((8, 10), bool), np.ones((8, 10), bool)):
-        part = plan_view(splats, **photos.camera(1), tiles=tiles)
+        part = tile_view(splats, **photos.camera(1), tiles=tiles)
         pixels = tiles.repeat(16, 0).repeat(16, 1)
         for expected, actual in zip(composite(whole), composite(part), strict=True):
             np.testing.assert_array_equal(actual[pixels], expected[pixels])
         assert (len(part.ids) == len(whole.ids)) is bool(tiles.all())
     with pytest.raises(ValueError, match="tiles"):
-        plan_view(splats, **photos.camera(1), tiles=np.ones((8, 8), bool))
+        tile_view(splats, **photos.camera(1), tiles=np.ones((8, 8), bool))
 
 
 def test_four_views_score_every_place_once() -> None:

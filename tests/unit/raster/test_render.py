@@ -8,7 +8,7 @@ import pytest
 from messages import refuse_all
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, plan_view, prepare, render, render_in_turn, splat_adjoint
+from gsmerge.raster import composite, contributions, prepare, render, render_in_turn, splat_adjoint, tile_view
 from gsmerge.types import SH_C0
 
 FOCAL = 100.0
@@ -76,9 +76,9 @@ def test_no_gaussians_leave_the_background() -> None:
 
 def test_what_is_behind_or_too_faint_is_not_seen() -> None:
     gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
-    plan = plan_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
-    assert len(plan.ids) == 0
-    assert len(plan.flatten_ids) == 0
+    tiled = tile_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
+    assert len(tiled.ids) == 0
+    assert len(tiled.flatten_ids) == 0
 
 
 def test_antialiasing_dims_what_is_small() -> None:
@@ -98,19 +98,19 @@ def test_colours_depend_on_the_viewing_direction() -> None:
 
 
 def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
-    plan = plan_view(prepare(balls((0, 0, 1, 0.02, 0.8, -3.0))), np.eye(4), camera().Ks[0], 21, 11)
-    assert composite(plan)[0].max() == 0
-    image, transmittance = composite(plan, np.array([[-3.0, 0.0, 7.0]]))
+    tiled = tile_view(prepare(balls((0, 0, 1, 0.02, 0.8, -3.0))), np.eye(4), camera().Ks[0], 21, 11)
+    assert composite(tiled)[0].max() == 0
+    image, transmittance = composite(tiled, np.array([[-3.0, 0.0, 7.0]]))
     assert image[5, 10].tolist() == pytest.approx([-2.4, 0, 5.6], abs=1e-5)
     assert transmittance[5, 10] == pytest.approx(0.2, abs=1e-6)
 
 
 def test_left_out_ones_and_other_opacities() -> None:
     splats = prepare(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
-    alone = plan_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
+    alone = tile_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
     assert alone.ids.tolist() == [1]
     assert contributions(alone)[1].tolist() == pytest.approx([0, 0.5], abs=1e-5)
-    fainter = plan_view(splats, np.eye(4), camera().Ks[0], 21, 11, opacities=np.array([0.25, 0.5]))
+    fainter = tile_view(splats, np.eye(4), camera().Ks[0], 21, 11, opacities=np.array([0.25, 0.5]))
     assert contributions(fainter)[1].tolist() == pytest.approx([0.25, 0.375], abs=1e-5)
 
 
@@ -122,8 +122,8 @@ def test_geographic_coordinates_keep_their_detail() -> None:
     viewmats[:, :3, 3] = -shift
     there = Cameras(viewmats, camera().Ks, 21, 11)
     np.testing.assert_allclose(render(moved, there).images, render(rows, camera()).images, atol=1e-5, rtol=0)
-    plan = plan_view(prepare(moved), viewmats[0], camera().Ks[0], 21, 11)
-    np.testing.assert_allclose(composite(plan)[0], render(rows, camera()).images[0], atol=1e-5)
+    tiled = tile_view(prepare(moved), viewmats[0], camera().Ks[0], 21, 11)
+    np.testing.assert_allclose(composite(tiled)[0], render(rows, camera()).images[0], atol=1e-5)
 
 
 def test_nothing_is_copied_that_need_not_be() -> None:
@@ -186,18 +186,18 @@ def test_every_view_has_its_own_image() -> None:
 
 def test_messages() -> None:
     gaussians, splats, K = balls((0, 0, 1, 0.02, 0.8, 1.0)), prepare(balls((0, 0, 1, 0.02, 0.8, 1.0))), camera().Ks[0]
-    plan = plan_view(splats, np.eye(4), K, 21, 11)
+    tiled = tile_view(splats, np.eye(4), K, 21, 11)
     refuse_all(ValueError, [
         (lambda: render(gaussians, camera(), (0.1, 0.2)), "", "background", (0.1, 0.2)),
         (lambda: render(gaussians, camera(), near=0), "", "near", 0),
         (lambda: render(gaussians, camera(), near=2, far=1), "", "near", 2, 1),
-        (lambda: plan_view(splats, np.eye(3), K, 21, 11), "", "[4,4]", [3, 3]),
-        (lambda: plan_view(splats, np.eye(4), K, 0, 11), "", "0 x 11"),
-        (lambda: plan_view(splats, np.eye(4), -np.eye(3), 21, 11), "", "focal", -1.0),
-        (lambda: plan_view(splats, np.eye(4), K, 21, 11, opacities=np.ones(2)), "", "1 opacities", "2 and 1"),
-        (lambda: plan_view(splats, np.eye(4), K, 21, 11, keep=np.ones(2, bool)), "", "keep", "1 and 2"),
-        (lambda: composite(plan, np.ones((2, 3))), "colors", [1, 3], [2, 3]),
-        (lambda: splat_adjoint(plan, np.ones((11, 20, 3))), "image", [11, 20, 3]),
+        (lambda: tile_view(splats, np.eye(3), K, 21, 11), "", "[4,4]", [3, 3]),
+        (lambda: tile_view(splats, np.eye(4), K, 0, 11), "", "0 x 11"),
+        (lambda: tile_view(splats, np.eye(4), -np.eye(3), 21, 11), "", "focal", -1.0),
+        (lambda: tile_view(splats, np.eye(4), K, 21, 11, opacities=np.ones(2)), "", "1 opacities", "2 and 1"),
+        (lambda: tile_view(splats, np.eye(4), K, 21, 11, keep=np.ones(2, bool)), "", "keep", "1 and 2"),
+        (lambda: composite(tiled, np.ones((2, 3))), "colors", [1, 3], [2, 3]),
+        (lambda: splat_adjoint(tiled, np.ones((11, 20, 3))), "image", [11, 20, 3]),
     ])  # fmt: skip
 
 
@@ -236,13 +236,13 @@ def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> 
     gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)
 
     def draw() -> tuple[list[np.ndarray], list[list[int]]]:
-        plan = plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
-        lists = np.split(plan.ids[plan.flatten_ids], plan.isect_offsets[1:-1])
-        return [*composite(plan), *contributions(plan)], [part.tolist() for part in lists]
+        tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
+        lists = np.split(tiled.ids[tiled.flatten_ids], tiled.isect_offsets[1:-1])
+        return [*composite(tiled), *contributions(tiled)], [part.tolist() for part in lists]
 
     whole, all_lists = draw()
-    monkeypatch.setattr("gsmerge.raster.view_plan.MANY", 0)
-    monkeypatch.setattr("gsmerge.raster.view_plan.MANY_EACH", 0)
+    monkeypatch.setattr("gsmerge.raster.tiled_view.MANY", 0)
+    monkeypatch.setattr("gsmerge.raster.tiled_view.MANY_EACH", 0)
     drawn, lists = draw()
     assert sum(map(len, lists)) < 0.6 * sum(map(len, all_lists))
     for part, every in zip(lists, all_lists, strict=True):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import project
@@ -139,7 +140,7 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
     monkeypatch.setattr(module, "compact", compact)
 
 
-@pytest.mark.parametrize(
+@sweep(
     ("change", "words"),
     [
         (lambda g: replace(g, sh0=g.sh0 + 0.5), "unchanged"),
@@ -149,6 +150,7 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
         (lambda g: replace(g, quats=2 * g.quats), "unit quaternions"),
         (lambda g: replace(g, opacities=g.opacities * 0), "outside of 0 to 1"),
     ],
+    often=2,
 )
 def test_what_does_not_hold_is_noticed(change: Any, words: str, load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, change)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.plan import plan_whole
+from gsmerge.plan import choose_for_scene
 from gsmerge.runtime import estimate, memory
 from gsmerge.runtime.estimate import memory_bytes, memory_problem, wall_seconds, work_seconds
 from gsmerge.runtime.memory import machine_memory, peak_memory
@@ -22,7 +22,7 @@ def seconds(
 ) -> float:
     options = CompactOptions().with_settings(settings)
     size = SceneSize(views * VIEW, views, 320, 480, aligned=True, photos=photos)
-    plain = plan_whole(size, options).settings(options)
+    plain = choose_for_scene(size, options).settings(options)
     return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps, num_drawn=num_drawn)
 
 

@@ -12,8 +12,8 @@ import unaligned_scenes
 import gsmerge
 from gsmerge import Scene
 from gsmerge.facts.prepare import prepare
-from gsmerge.moments import scene_members
 from gsmerge.plan import make_plan
+from gsmerge.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import contradicted_share, encode, weaken_contradicted

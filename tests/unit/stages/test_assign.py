@@ -13,7 +13,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.moments import scene_members, unaligned_members
+from gsmerge.pooling import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions

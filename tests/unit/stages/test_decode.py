@@ -10,7 +10,7 @@ from messages import refuses
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
-from gsmerge.moments import Members, feature_to_gaussians, scene_members
+from gsmerge.pooling import Members, feature_to_gaussians, scene_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import deal_visible, decode, mixed_counts, split_counts
 from gsmerge.stages.encode import encode

@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 from gsmerge import Scene
-from gsmerge.moments import scene_members
+from gsmerge.pooling import scene_members
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.types import FeatureGaussians, Groups, grid_ids
 

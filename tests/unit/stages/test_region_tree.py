@@ -10,7 +10,7 @@ import scenes
 from messages import refuses
 
 from gsmerge import Scene
-from gsmerge.moments import Members, scene_members
+from gsmerge.pooling import Members, scene_members
 from gsmerge.research.baselines.simple import most_important
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages import segment as module

@@ -13,7 +13,7 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.plan import make_plan
 from gsmerge.stages.segment import (
-    SuperpixelPlan,
+    SuperpixelChoices,
     count_limits,
     default_count,
     largest_count,
@@ -28,7 +28,7 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def planned(scene: Scene, **settings: object) -> tuple[Scene, SuperpixelPlan]:
+def scene_and_choices(scene: Scene, **settings: object) -> tuple[Scene, SuperpixelChoices]:
     options = CompactOptions().with_settings({"fit": "none"} | settings)
     prepared = prepare(scene, options.prepare)
     return prepared.scene, make_plan(prepared, options).superpixels
@@ -40,35 +40,39 @@ def test_gaussians_follow_the_number_of_superpixels(scene: Scene) -> None:
     sh0 = scene.gaussians.sh0.copy()
     sh0[scene.pixels_per_view : 2 * scene.pixels_per_view] = 0  # of the same grey, or the photo would not count
     grey = replace(scene, images=images, gaussians=replace(scene.gaussians, sh0=sh0))
-    canonical, plan = planned(grey, **ADAPTIVE, k=2)
-    segmentation = segment_scene(canonical, plan, None)
+    canonical, choices = scene_and_choices(grey, **ADAPTIVE, k=2)
+    segmentation = segment_scene(canonical, choices, None)
     groups = segmentation.groups
-    assert groups.counts[1] < plan.limits.per_view < groups.counts[0]
+    assert groups.counts[1] < choices.limits.per_view < groups.counts[0]
     assert not segmentation.exact
-    assert segmentation.count == round(plan.limits.default * len(groups) / (3 * plan.limits.per_view))
+    assert segmentation.count == round(choices.limits.default * len(groups) / (3 * choices.limits.per_view))
     for view, count in enumerate(groups.counts):
         assert np.unique(groups.labels[view]).tolist() == list(range(count))
 
 
 def test_a_fit_begins_with_a_share_of_the_number(scene: Scene) -> None:
-    whole = segment_scene(*planned(scene, **ADAPTIVE), None)
-    canonical, plan = planned(scene, **ADAPTIVE, fit="full")
-    assert plan.start_share < 1
-    segmentation = segment_scene(canonical, plan, None)
+    whole = segment_scene(*scene_and_choices(scene, **ADAPTIVE), None)
+    canonical, choices = scene_and_choices(scene, **ADAPTIVE, fit="full")
+    assert choices.start_share < 1
+    segmentation = segment_scene(canonical, choices, None)
     assert segmentation.count == pytest.approx(whole.count, rel=0.02)
-    assert len(segmentation.groups) < 1.02 * plan.start_share * segmentation.count
+    assert len(segmentation.groups) < 1.02 * choices.start_share * segmentation.count
 
 
 def test_what_exceeds_a_limit_is_cut_to_it(scene: Scene) -> None:
-    canonical, plan = planned(scene, **ADAPTIVE)
-    limit = segment_scene(canonical, plan, None).count - 20
-    limited = segment_scene(canonical, replace(plan, limits=replace(plan.limits, max_count=limit)), None)
+    canonical, choices = scene_and_choices(scene, **ADAPTIVE)
+    limit = segment_scene(canonical, choices, None).count - 20
+    limited = segment_scene(canonical, replace(choices, limits=replace(choices.limits, max_count=limit)), None)
     assert (limited.count, limited.exact, len(limited.groups)) == (limit, True, limit)
 
 
 def test_an_exact_number_is_met(scene: Scene) -> None:
-    assert segment_scene(*planned(scene, **ADAPTIVE | {"superpixels": 40}), None).groups.counts == (40, 40, 40)
-    assert len(segment_scene(*planned(scene, **ADAPTIVE), 100).groups) == 100
+    assert segment_scene(*scene_and_choices(scene, **ADAPTIVE | {"superpixels": 40}), None).groups.counts == (
+        40,
+        40,
+        40,
+    )
+    assert len(segment_scene(*scene_and_choices(scene, **ADAPTIVE), 100).groups) == 100
     assert len(scenes.compacted(scene, **ADAPTIVE, budget=90).gaussians) == 90
 
 

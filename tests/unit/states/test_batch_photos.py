@@ -15,11 +15,13 @@ from view_batches import fed, random_gaussians, room, same_group, state_of
 from gsmerge import Cameras, Gaussians, Scene
 from gsmerge.fit import FitOptions
 from gsmerge.fit.color import Drawn, draw, fit_colors
-from gsmerge.moments import feature_to_gaussians, scene_members, unaligned_members
-from gsmerge.raster import contributions, plan_view, prepare
+from gsmerge.pooling import feature_to_gaussians, scene_members, unaligned_members
+from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos, photos_of, scene_photos
 from gsmerge.raster.weights import apply
-from gsmerge.states.batch import (
+from gsmerge.states.groups import moments_of, share
+from gsmerge.states.state import GroupSet, Replay
+from gsmerge.states.view_batch import (
     MARGIN,
     REACH,
     BatchPhotos,
@@ -31,8 +33,6 @@ from gsmerge.states.batch import (
     update_replay,
     view_ids,
 )
-from gsmerge.states.groups import moments_of, share
-from gsmerge.states.state import GroupSet, Replay
 from gsmerge.types import SH_C0, FeatureGaussians
 
 
@@ -91,8 +91,8 @@ def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: t
     photos = photos_of(black, cameras, level)
     splats = prepare(gaussians)
     for view in range(2):
-        plan = plan_view(splats, **photos.camera(view))
-        peaks = contributions(plan)[1]
+        tiled = tile_view(splats, **photos.camera(view))
+        peaks = contributions(tiled)[1]
         drawn = np.flatnonzero(peaks > 0)
         assert len(drawn) > 0
         missed = drawn[~actual[view][drawn]]
@@ -165,7 +165,7 @@ def groups(scene: Scene) -> GroupSet:
     actual = share(state_of(fed([scene], fit_colors=False))).groups
     noise = np.random.default_rng(0).normal(0, 0.1 / SH_C0, actual.features.sh0.shape).astype(np.float32)
     sh0 = actual.features.sh0 + noise
-    return replace(actual, features=replace(actual.features, sh0=sh0), fitted_sh0=sh0)
+    return replace(actual, features=replace(actual.features, sh0=sh0), colors=replace(actual.colors, sh0=sh0))
 
 
 @pytest.fixture(scope="module")
@@ -247,19 +247,19 @@ def test_only_colours_in_view_and_what_holds_them_change(groups: GroupSet, batch
         assert same_group(actual, int(row), groups, int(row))
     np.testing.assert_array_equal(actual.features.sh0, groups.features.sh0)
     assert scenes.identical(actual.children, groups.children)
-    assert (actual.color_precision[seen] >= groups.color_precision[seen]).all()
-    assert float(actual.color_precision.sum()) > 0
+    assert (actual.colors.precision[seen] >= groups.colors.precision[seen]).all()
+    assert float(actual.colors.precision.sum()) > 0
 
 
 def test_what_is_held_is_the_diagonal_of_the_equations(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     """Squares of the blending weights in half-size photos."""
     actual, _ = fit_batch_colors(groups, batch_photos, FEW)
-    views = draw(replace(feature_to_gaussians(groups.features), sh0=groups.fitted_sh0), batch_photos.photos(2)).views
+    views = draw(replace(feature_to_gaussians(groups.features), sh0=groups.colors.sh0), batch_photos.photos(2)).views
     for g in range(0, len(groups), 7):
         expected = sum(float((dense(view, g, len(groups)) ** 2).sum()) for view in views)
-        assert float(actual.color_precision[g]) == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        assert float(actual.colors.precision[g]) == pytest.approx(expected, rel=1e-3, abs=1e-5)
     twice, _ = fit_batch_colors(actual, batch_photos, FEW)
-    np.testing.assert_allclose(twice.color_precision, 2 * actual.color_precision, rtol=1e-5)
+    np.testing.assert_allclose(twice.colors.precision, 2 * actual.colors.precision, rtol=1e-5)
 
 
 @pytest.mark.parametrize("tint", [(0.1, 0.0, -0.1), (-0.06, 0.1, 0.04)])
@@ -276,11 +276,11 @@ def test_one_batch_after_the_other_is_near_all_at_once(
     for batch in (some(tinted, 0, 2, 4), some(tinted, 1, 3, 5)):
         after, report = fit_batch_colors(after, batch, steady)
         assert report.accepted
-        unknown = np.zeros_like(groups.color_precision)
-        forgetful, _ = fit_batch_colors(replace(forgetful, color_precision=unknown), batch, steady)
-    assert rms(after.fitted_sh0, joint.fitted_sh0) < 0.8 * rms(forgetful.fitted_sh0, joint.fitted_sh0)
-    assert rms(after.fitted_sh0, joint.fitted_sh0) < 0.7 * rms(joint.fitted_sh0, groups.fitted_sh0)
-    np.testing.assert_allclose(after.color_precision, joint.color_precision, rtol=1e-4, atol=1e-4)
+        unknown = replace(forgetful.colors, precision=np.zeros_like(groups.colors.precision))
+        forgetful, _ = fit_batch_colors(replace(forgetful, colors=unknown), batch, steady)
+    assert rms(after.colors.sh0, joint.colors.sh0) < 0.8 * rms(forgetful.colors.sh0, joint.colors.sh0)
+    assert rms(after.colors.sh0, joint.colors.sh0) < 0.7 * rms(joint.colors.sh0, groups.colors.sh0)
+    np.testing.assert_allclose(after.colors.precision, joint.colors.precision, rtol=1e-4, atol=1e-4)
 
 
 def test_views_that_see_nothing_say_nothing(groups: GroupSet, batch_photos: BatchPhotos) -> None:
@@ -289,8 +289,8 @@ def test_views_that_see_nothing_say_nothing(groups: GroupSet, batch_photos: Batc
     away = replace(away, viewmats=turn @ away.viewmats)
     actual, report = fit_batch_colors(groups, BatchPhotos(batch_photos.images[:1], away), FEW)
     assert not report.accepted
-    np.testing.assert_array_equal(actual.fitted_sh0, groups.fitted_sh0)
-    np.testing.assert_array_equal(actual.color_precision, groups.color_precision)
+    np.testing.assert_array_equal(actual.colors.sh0, groups.colors.sh0)
+    np.testing.assert_array_equal(actual.colors.precision, groups.colors.precision)
 
 
 NOTHING = Replay(np.zeros((0, 2, 3, 3), np.uint8), np.zeros(0, np.int64))

@@ -154,7 +154,7 @@ def test_without_photos(pairs: list[Scene]) -> None:
     compactor = fed(bare)
     state = state_of(compactor)
     assert len(state.replay) == sum(len(pair) for pair in pairs)
-    assert state.groups.color_precision.any()
+    assert state.groups.colors.precision.any()
     assert len(compactor) < sum(len(fed([pair])) for pair in bare)
     both = scenes.take_views(room(), range(4))
     plain, fitted = (compactor.decode(fit=fit) for fit in ("none", "full"))

@@ -10,9 +10,9 @@ import scenes
 from view_batches import fed, group, parts_of, room, same_group, state_of
 
 from gsmerge.settings.stages import MatchOptions
-from gsmerge.states.extend_moments import find_partners, merge_into
+from gsmerge.states.extend_decoded import find_partners, merge_into
 from gsmerge.states.groups import limit_children, select_groups, share
-from gsmerge.states.state import GroupSet
+from gsmerge.states.state import Colors, GroupSet
 
 
 @pytest.fixture(scope="module")
@@ -117,8 +117,8 @@ def test_colours_that_photos_held_stay(sides: tuple[GroupSet, GroupSet], actual:
     new, rows = joined_pairs(sides, actual)
     color_precision = np.zeros(len(sides[0]), np.float32)
     color_precision[rows[::2]] = 5.0
-    before = replace(sides[0], fitted_sh0=sides[0].fitted_sh0 + 0.3, color_precision=color_precision)
+    before = replace(sides[0], colors=Colors(sides[0].colors.sh0 + 0.3, color_precision))
     after = merge_into(before, new, rows, 4)
-    np.testing.assert_array_equal(after.color_precision, color_precision)
-    np.testing.assert_array_equal(after.fitted_sh0[rows[::2]], before.fitted_sh0[rows[::2]])
-    np.testing.assert_array_equal(after.fitted_sh0[rows[1::2]], after.features.sh0[rows[1::2]])
+    np.testing.assert_array_equal(after.colors.precision, color_precision)
+    np.testing.assert_array_equal(after.colors.sh0[rows[::2]], before.colors.sh0[rows[::2]])
+    np.testing.assert_array_equal(after.colors.sh0[rows[1::2]], after.features.sh0[rows[1::2]])

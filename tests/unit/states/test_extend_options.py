@@ -6,8 +6,8 @@ import pytest
 from messages import refuses
 
 from gsmerge import Compactor
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.states.compactor import merge_settings
-from gsmerge.states.options import ExtendOptions
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from view_batches import decoded, group, one_batch, random_gaussians, same_group
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry import covariances
-from gsmerge.moments import feature_to_gaussians, gaussian_members
 from gsmerge.networks.apply import encode_features
 from gsmerge.networks.corrector import ANALYTIC
+from gsmerge.pooling import feature_to_gaussians, gaussian_members
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.states.groups import (
@@ -29,7 +29,7 @@ from gsmerge.states.groups import (
     share,
     with_fitted_colors,
 )
-from gsmerge.states.state import GroupSet
+from gsmerge.states.state import Colors, GroupSet
 from gsmerge.types import SH_C0, FeatureGaussians
 
 ALL = DecodeOptions(min_opacity=0.0)
@@ -51,8 +51,8 @@ def uneven(some: Made) -> FeatureGaussians:
 def groups(some: Made, uneven: FeatureGaussians) -> GroupSet:
     actual = bake(uneven, some.members, ANALYTIC, 4)
     rng = np.random.default_rng(1)
-    fitted_sh0 = actual.fitted_sh0 + rng.normal(0, 0.1, actual.fitted_sh0.shape).astype(np.float32)
-    return replace(actual, fitted_sh0=fitted_sh0, color_precision=rng.random(len(actual), np.float32))
+    fitted_sh0 = actual.colors.sh0 + rng.normal(0, 0.1, actual.colors.sh0.shape).astype(np.float32)
+    return replace(actual, colors=Colors(fitted_sh0, rng.random(len(actual), np.float32)))
 
 
 def assert_close(one: Gaussians, other: Gaussians, rtol: float = 1e-4) -> None:
@@ -152,8 +152,8 @@ def test_children_of_one_member_each_are_left_as_they_are(groups: GroupSet) -> N
 def test_solved_colours_move_groups_and_children_alike(groups: GroupSet) -> None:
     """Real photos differ from what exports say, whatever the number of Gaussians."""
     actual = with_fitted_colors(groups)
-    np.testing.assert_array_equal(actual.features.sh0, groups.fitted_sh0)
-    offsets, sizes = groups.fitted_sh0 - groups.features.sh0, np.diff(groups.features.starts)
+    np.testing.assert_array_equal(actual.features.sh0, groups.colors.sh0)
+    offsets, sizes = groups.colors.sh0 - groups.features.sh0, np.diff(groups.features.starts)
     expected = groups.children.sh0 + offsets.repeat(sizes, 0)
     np.testing.assert_allclose(actual.children.sh0, expected, atol=1e-6)
     same = replace(actual, features=groups.features, children=replace(actual.children, sh0=groups.children.sh0))
@@ -237,18 +237,19 @@ def test_colours_of_one_batch_are_fitted_for_later_ones(pixels: Scene) -> None:
     plain = replace(state, groups=replace(state.groups, colors=None))
     assert scenes.identical(decoded(state, k=2), decoded(plain, k=2))
     shared = share(state)
-    np.testing.assert_array_equal(shared.groups.fitted_sh0, state.groups.colors.sh0)
+    np.testing.assert_array_equal(shared.groups.colors.sh0, state.groups.colors.sh0)
     as_came, fitted = divide_groups(shared, fitted_colors=False), divide_groups(shared)
     np.testing.assert_array_equal(as_came.features.sh0, shared.groups.features.sh0)
-    np.testing.assert_array_equal(fitted.features.sh0, shared.groups.fitted_sh0)
+    np.testing.assert_array_equal(fitted.features.sh0, shared.groups.colors.sh0)
     assert scenes.psnr_of(decoded(shared, k=1), pixels) > scenes.psnr_of(decoded(state, k=1), pixels)
 
 
 def test_unsolved_colours_are_there_too(pixels: Scene) -> None:
     state = share(one_batch(pixels, superpixels="5%", checkpoint="none", fit_colors=False))
-    state = replace(state, groups=replace(state.groups, fitted_sh0=state.groups.fitted_sh0 + 0.2 / SH_C0))
+    colors = replace(state.groups.colors, sh0=state.groups.colors.sh0 + 0.2 / SH_C0)
+    state = replace(state, groups=replace(state.groups, colors=colors))
     as_came, fitted = divide_groups(state, fitted_colors=False), divide_groups(state)
     np.testing.assert_array_equal(as_came.features.sh0, state.groups.features.sh0)
-    np.testing.assert_array_equal(fitted.features.sh0, state.groups.fitted_sh0)
+    np.testing.assert_array_equal(fitted.features.sh0, state.groups.colors.sh0)
     moved = fitted.division.children.sh0 - as_came.division.children.sh0
     np.testing.assert_allclose(moved, 0.2 / SH_C0, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Files that 0.1 wrote: of ``encode``, with networks, and of ``extend``, as moments and with latents."""
+"""Files that 0.1 wrote: of ``encode``, with networks, and of ``extend``, decoded and with latents."""
 
 from __future__ import annotations
 

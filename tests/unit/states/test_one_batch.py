@@ -16,7 +16,7 @@ from view_batches import decoded, one_batch
 
 from gsmerge import Gaussians, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.states.decode import DecodePlan, plan_decode
+from gsmerge.states.decode import DecodeCounts, count_children
 from gsmerge.states.state import DividedGroups, State
 from gsmerge.states.state_file import load_state, save_state
 
@@ -43,8 +43,8 @@ def bare_state(bare: Scene) -> State:
     return one_batch(bare, superpixels=SHARE)
 
 
-def plan_of(state: State, **wish: Any) -> DecodePlan:
-    return plan_decode(state, groups_of(state), **wish)
+def counts_of(state: State, **wish: Any) -> DecodeCounts:
+    return count_children(state, groups_of(state), **wish)
 
 
 def groups_of(state: State) -> DividedGroups:
@@ -161,31 +161,31 @@ def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: Scene) -> N
 
 def test_a_budget_of_the_decoder_is_met_and_dealt_where_it_helps(state: State) -> None:
     groups = len(state)
-    counts = plan_of(state, budget=groups + 50).counts
+    counts = counts_of(state, budget=groups + 50).per_group
     assert counts.sum() == groups + 50
-    more = plan_of(state, budget=groups + 80).counts
+    more = counts_of(state, budget=groups + 80).per_group
     assert (more >= counts).all()
-    share = plan_of(state, budget="10%").counts.sum()
+    share = counts_of(state, budget="10%").per_group.sum()
     assert share == state.settings.num_input // 10
 
 
 def test_more_than_there_is_to_divide_is_told(state: State) -> None:
-    plan = plan_of(state, budget=state.settings.num_input)
-    assert plan.counts.sum() == most_of(state) - state.num_kept
-    assert len(plan.notes) == 1
-    assert names(plan.notes[0], most_of(state))
+    counts = counts_of(state, budget=state.settings.num_input)
+    assert counts.per_group.sum() == most_of(state) - state.num_kept
+    assert len(counts.notes) == 1
+    assert names(counts.notes[0], most_of(state))
     assert len(decoded(state, budget=state.settings.num_input)) <= most_of(state)
 
 
 def test_auto_takes_what_compact_would_without_photos(bare: Scene, bare_state: State) -> None:
     expected = len(unfitted(bare, budget="auto"))
     assert bare_state.settings.knee_count == expected
-    plan = plan_of(bare_state, budget="auto")
-    assert plan.counts.sum() == max(expected, len(bare_state))
+    counts = counts_of(bare_state, budget="auto")
+    assert counts.per_group.sum() == max(expected, len(bare_state))
     fewer = replace(bare_state, settings=replace(bare_state.settings, knee_count=len(bare_state) - 1))
-    plan = plan_of(fewer, budget="auto")
-    assert plan.counts.tolist() == [1] * len(bare_state)
-    assert names(plan.notes[0], "fewer", "groups")
+    counts = counts_of(fewer, budget="auto")
+    assert counts.per_group.tolist() == [1] * len(bare_state)
+    assert names(counts.notes[0], "fewer", "groups")
 
 
 def test_the_result_does_not_depend_on_the_threads(pixels: Scene, state: State) -> None:

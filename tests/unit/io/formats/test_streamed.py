@@ -26,8 +26,7 @@ from gsmerge.io import output_format, read_gaussians, read_ply, write_gaussians
 from gsmerge.io.atomic import temporary_path
 from gsmerge.io.formats import sog, streamed
 from gsmerge.io.formats.arrays import Columns
-from gsmerge.io.formats.read import read_level
-from gsmerge.io.formats.write import write_levels
+from gsmerge.io.formats.streamed import read_level, write_levels
 
 from .test_sog import webp
 from .test_write import needs_program, program, psnr

@@ -12,6 +12,7 @@ import scenes
 from messages import noted, refuses
 from plyfile import PlyData
 from slow_readers import corners, drawn, read_back
+from sweeps import sweep
 from tiny_scene import Tiny
 
 from gsmerge import Scene
@@ -81,7 +82,7 @@ def test_they_are_smaller(ending: str, scene: Scene, tmp_path: Path) -> None:
     assert (tmp_path / f"b{ending}").stat().st_size < (tmp_path / "a.ply").stat().st_size / 2
 
 
-@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
+@sweep("ending", OUTPUT_FORMATS, often=4)
 def test_the_same_gaussians_give_the_same_bytes(ending: str, scene: Scene, tmp_path: Path) -> None:
     for name in "ab":
         write_gaussians(tmp_path / f"{name}{ending}", drawn(scene, 0))

@@ -9,6 +9,7 @@ import matplotlib
 import pytest
 from experiments import make_grid, make_proxies, make_record
 from matplotlib.axes import Axes
+from sweeps import sweep
 
 from gsmerge.research.charts import require_matplotlib
 from gsmerge.research.charts.figures import (
@@ -165,7 +166,7 @@ def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert b"<dc:date>" not in drawn["stages"]
 
 
-@pytest.mark.parametrize("name", ["a $\\frac{$ b", "$x$", "_\\$", "=1|x"])
+@sweep("name", ["a $\\frac{$ b", "$x$", "_\\$", "=1|x"])
 def test_names_are_no_formulas_in_drawings(name: str, tmp_path: Path) -> None:
     records = [replace(r, settings={**r.settings, "checkpoint": name}) for r in make_grid() if r.method != "input"]
     records += [replace(r, settings=dict(r.settings)) for r in make_grid() if r.method == "gsmerge"]

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from messages import noted, refuses
 
-from gsmerge.batch.schedule import Schedule, estimate_seconds
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.grid import (
@@ -240,15 +239,3 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
     others += [key(hints=ReadHints(order="none")), key(grid=Grid(budgets=("1%",)))]
     others += [key(measured=EvaluateOptions((), photo_side=476))]
     assert len({key(), *others}) == 7
-
-
-def estimate(scene: Path, grid: Grid | None = None) -> float:
-    jobs, _ = make_jobs(sources(scene), grid or Grid(), EvaluateOptions(()))
-    return estimate_seconds(jobs[1:], Schedule(1, 2))
-
-
-def test_estimates_grow_with_the_work(made_scene: Path) -> None:
-    usual = estimate(made_scene)
-    assert estimate(made_scene, Grid(fit=("none",))) < usual < estimate(made_scene, Grid(efforts=("best",)))
-    costs = [estimate(made_scene, Grid(methods=(name,))) for name in ("random", "greedy", "unmerged-fit")]
-    assert costs == sorted(costs)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge import Cameras
 from gsmerge.research.generate import GenerateOptions, SyntheticScene, make_scene
@@ -117,7 +118,7 @@ def test_rooms_see_little_of_one_another(large: Built) -> None:
     assert max(shares) < 0.3
 
 
-@pytest.mark.parametrize(("seed", "views"), [(LARGE, LARGE_VIEWS), (0, 3), (1, 30), (2, 60), (3, 90)])
+@sweep(("seed", "views"), [(LARGE, LARGE_VIEWS), (0, 3), (1, 30), (2, 60), (3, 90)])
 def test_the_walk_keeps_clear_of_everything(seed: int, views: int) -> None:
     case = built(seed, views)
     cube, faces = Pinhole(16, 16, 8.0), [np.eye(3), axis_rotation(0, np.pi / 2), axis_rotation(0, -np.pi / 2)]

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from gsmerge.kernels.library import _able_targets
 
 SCENE = """
@@ -24,6 +26,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.slow
 def test_scenes_do_not_depend_on_the_processor() -> None:
     targets = [target.name for target in _able_targets()]
     scenes = {

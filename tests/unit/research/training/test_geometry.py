@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, Made, made
 from scenes import arc, make_scene, room
+from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import FEATURE
 from gsmerge.networks.tensors import quat_to_rotmat
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.research.training import Example, make_example, make_training_scene
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import (
@@ -147,8 +148,8 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("fixed_choices")
-@pytest.mark.parametrize(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
-@pytest.mark.parametrize("k", [1, 2, 4])
+@sweep(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
+@sweep("k", [1, 2, 4])
 def test_gradients_are_central_differences(example: Example, outputs: str, start: str, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
     options = replace(TINY, outputs=outputs, merger_start=start)

@@ -213,6 +213,7 @@ def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_streamed_run_is_repeated_and_resumed_to_the_bit(shards: list[Shard], tmp_path: Path) -> None:
     options = replace(PAPER, steps=8, save_every=4, buffer=1, refresh=1)
     train(shards, shards[:1], tmp_path / "whole", options, threads=1)

@@ -1,23 +1,94 @@
-"""Match photos of any size with the views of a grid, whose pictures are its rows' own colours."""
+"""Estimate the cameras of rows whose file has none, or poses alone, and find the photos that show them.
+
+Photos of any size are matched with the views of a grid, whose pictures are its rows' own colours.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from gsmerge.alignment import TRIMS
+from gsmerge import alignment
+from gsmerge.errors import SceneError
 from gsmerge.geometry import correlation
-from gsmerge.io.photo_files import PhotoTransform, Size, decode_image, image_size, resize_and_crop, resize_to
+from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.image_names import list_images
+from gsmerge.io.photo_files import (
+    Photos,
+    PhotoTransform,
+    Size,
+    decode_image,
+    decode_images,
+    image_size,
+    resize_and_crop,
+    resize_to,
+)
 from gsmerge.runtime.threads import parallel_map
 
 _SIDE = 128  # pixels of the pictures' longer side that are compared
 _MAX_PHOTOS = 100  # that are looked at
 _MIN_ALIKE, _MIN_ALIKE_EACH = 0.7, 0.4  # correlation of greys with the views' on average, and in each
 _CLEARLY = 0.02  # by which other photos must be more alike than those in order
+
+
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile:
+    """Estimate the focal length of cameras whose file has poses alone; SceneError if that fails."""
+    estimated = alignment.estimate_focal(ply, camera_file, photos)
+    if estimated is None:
+        reason = "no focal length fits the Gaussians" if len(photos) else "no photos that show them"
+        raise missing_intrinsics(camera_file.path, f", and {reason}")
+    return estimated
+
+
+def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile | None:
+    """Estimate cameras of the photos in a folder; None where rows and photos do not tell.
+
+    SceneError where the rows are a grid whose views no photo shows.
+    """
+    paths = list_images(folder)
+    size = image_size(paths[0]) if paths else (0, 0)
+    names = [photo.relative_to(folder).as_posix() for photo in paths]
+    rows = ply.gaussians, ply.valid
+    cameras = alignment.estimate_cameras(path, *rows, names, *size)
+    if cameras is not None:
+        return cameras
+    cameras = estimate_grid(ply, path, paths, folder)
+    if cameras is None:
+        return alignment.estimate_with_photos(path, *rows, names, size, partial(decode_images, paths))
+    if paths and cameras.photo_map is None:
+        grid = f"{len(cameras)} views of {cameras.widths[0]} x {cameras.heights[0]} pixels"
+        problem = f"expected photos of the {grid} whose grid the Gaussians are"
+        raise SceneError(folder, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
+    return cameras
+
+
+def estimate_grid(
+    ply: GaussianFile, path: Path, paths: Sequence[Path] = (), folder: Path = Path()
+) -> CameraFile | None:
+    """Estimate the cameras of rows that are a grid, and find its photos among some of a folder; None for other rows."""
+    grid = alignment.estimate_from_rows(path, ply.gaussians, ply.valid)
+    if grid is None:
+        return None
+    cameras, pictures = grid
+    match = match_photos(pictures, paths)
+    if match is None:
+        return cameras
+    Ks = cameras.Ks.copy()
+    Ks[:, :2, 2] += match.trim
+    return replace(
+        cameras,
+        Ks=Ks,
+        widths=cameras.widths + 2 * match.trim,
+        heights=cameras.heights + 2 * match.trim,
+        names=tuple(paths[photo].relative_to(folder).as_posix() for photo in match.chosen),
+        photo_map=(match.size, match.transform),
+    )
 
 
 @dataclass(frozen=True)
@@ -39,7 +110,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     size = max(sizes, key=sizes.count)
     fits = [
         (trim, transform)
-        for trim in (0, *TRIMS)
+        for trim in (0, *alignment.TRIMS)
         for transform in _transforms(size, width + 2 * trim, height + 2 * trim)
     ]
     ratio = _SIDE / max(width, height)

@@ -1,20 +1,20 @@
-"""Batches for a state whose groups are decoded: they enter as moments, which add up, and children."""
+"""Batches for a state whose groups are decoded as they enter: as pooled Gaussians, which add up, and children."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from gsmerge.fit import visible_mask
-from gsmerge.moments import feature_to_gaussians
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.pipeline import merge_views
+from gsmerge.pooling import feature_to_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
-from gsmerge.states.batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.states.division import divide_all
 from gsmerge.states.groups import (
     bake,
@@ -25,8 +25,12 @@ from gsmerge.states.groups import (
     with_fitted_colors,
     without_members,
 )
-from gsmerge.states.state import DividedGroups, GroupSet, Heads, State
+from gsmerge.states.state import Colors, DividedGroups, GroupSet, Heads, State
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
+
+if TYPE_CHECKING:
+    from gsmerge.networks.weights import NetworkWeights
 
 
 def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatures:
@@ -38,10 +42,10 @@ def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatur
 @stage("decode")
 def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     """Divide Feature Gaussians into groups of a state, with the networks that correct them."""
-    heads, networks = None, batch.plan.networks
-    if isinstance(new.context, NetworkContext) and networks is not None:
-        described = new.context.describe(new.features)
-        heads = Heads(networks, described.views, described.group)
+    heads, context = None, new.context
+    if isinstance(context, NetworkContext):
+        described = context.describe(new.features)
+        heads = Heads(cast("NetworkWeights", context.networks), described.views, described.group)
     return DividedGroups(without_members(new.features), divide_all(new.features, new.members, max_k), heads)
 
 
@@ -72,7 +76,7 @@ def _join(
         return concat_groups([groups, alone]), counts
 
 
-MOMENTS = StateKind(REACH, _encode, _decode, _divide, _join)
+DECODED = StateKind(REACH, _encode, _decode, _divide, _join)
 
 
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
@@ -102,6 +106,7 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) ->
     pairs = np.tile(np.arange(len(rows)), 2)
     features = merge(both.features, Matches(pairs, len(rows)))
     children = both.children[features.members]
-    fitted_sh0 = np.where((old.color_precision > 0)[:, None, None], old.fitted_sh0, features.sh0)
-    merged = GroupSet(replace(features, members=np.arange(len(children))), children, fitted_sh0, old.color_precision)
+    precision = old.colors.precision
+    colors = Colors(np.where((precision > 0)[:, None, None], old.colors.sh0, features.sh0), precision)
+    merged = GroupSet(replace(features, members=np.arange(len(children))), children, colors)
     return replace_groups(groups, rows, limit_children(merged, max_k))

@@ -1,4 +1,4 @@
-"""Plan of a view: projection, depth order and tile lists."""
+"""A view, tiled: projection, depth order and tile lists."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Splats:
 
 
 @dataclass(frozen=True, eq=False)
-class ViewPlan:
+class TiledView:
     """Gaussians projected into one view, sorted by depth and listed by tile."""
 
     splats: Splats
@@ -60,7 +60,7 @@ class ViewPlan:
 
     @property
     def lists(self) -> tuple[Array, Array, Array, int]:
-        """First arguments of the kernels that process the lists of tiles; the last is the number of tiles per row."""
+        """First arguments of the kernels that walk the tiles' lists; the last is the number of tiles per row."""
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
@@ -103,12 +103,12 @@ def pieces(count: int, threads: int) -> list[tuple[int, int]]:
     return [(count * i // num, count * (i + 1) // num) for i in range(num)]
 
 
-def tile_ranges(plan: ViewPlan, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
+def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tuple[int, int]]:
     """Split tiles into ranges with about equally many intersections, at least about ``least``, for the pool."""
-    count = len(plan.flatten_ids)
+    count = len(tiled.flatten_ids)
     num = num_pieces(count, threads, least)
-    cuts = np.searchsorted(plan.isect_offsets, count * np.arange(1, num) / num)
-    edges = np.unique(np.concatenate([[0], cuts, [len(plan.isect_offsets) - 1]]))
+    cuts = np.searchsorted(tiled.isect_offsets, count * np.arange(1, num) / num)
+    edges = np.unique(np.concatenate([[0], cuts, [len(tiled.isect_offsets) - 1]]))
     return list(pairwise(edges.tolist()))
 
 
@@ -239,7 +239,7 @@ def check_range(near: float, far: float, eps2d: float) -> None:
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
 
 
-def plan_view(
+def tile_view(
     splats: Splats,
     viewmat: ArrayLike,
     K: ArrayLike,
@@ -254,16 +254,17 @@ def plan_view(
     keep: Array | None = None,
     tiles: Array | None = None,
     band: tuple[int, int] | None = None,
-) -> ViewPlan:
+) -> TiledView:
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
-    ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far`` are exclusive, in
-    world units; ``eps2d`` is the dilation in the image, pixels squared. ``antialiased`` lowers the opacity by what the
-    dilation adds to a Gaussian (Mip-Splatting's 2D filter). ``opacities [n]`` replace those of the Gaussians; Gaussians
-    where ``keep [n]`` is False are left out; only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be
-    complete. With a ``band``, first and last + 1, only these lines of tiles are planned, as a picture of their own. The
-    size of the plan is proportional to the visible Gaussians, not to n. Raises ValueError if a size or a number is out
-    of range.
+    ``viewmat [4,4]`` is world to camera, ``K [3,3]`` in pixels without skew; ``near`` and ``far``
+    are exclusive, in world units; ``eps2d`` is the dilation in the image, pixels squared.
+    ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
+    2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
+    left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
+    Of a ``band`` only these lines of tiles, first and last + 1, are tiled, as a picture of their own.
+    The size of the result goes with what is visible, not with n. Raises ValueError if a size or a
+    number is out of range.
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
@@ -291,7 +292,7 @@ def plan_view(
         order = depth_order(depths.view(np.uint32))
         flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)
     eye, top = camera_centres(local).astype(np.float32), first * projection.TILE
-    return ViewPlan(
+    return TiledView(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
         min(height, last * projection.TILE) - top, top,
     )  # fmt: skip

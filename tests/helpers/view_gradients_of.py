@@ -1,4 +1,4 @@
-"""Plans of the turned camera, and their gradients row by row."""
+"""The view of the turned camera, tiled, and its gradients row by row."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 from slow_renderer import turned_cameras
 
 from gsmerge import Gaussians
-from gsmerge.raster import ViewPlan, plan_view, prepare
+from gsmerge.raster import TiledView, prepare, tile_view
 
 
-def plan_of(gaussians: Gaussians, **options: Any) -> ViewPlan:
+def turned_view(gaussians: Gaussians, **options: Any) -> TiledView:
     cameras = turned_cameras(1).numpy()
-    return plan_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options)
+    return tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options)
 
 
 def normal(*shape: int, seed: int = 0) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 import scenes
 
 from gsmerge.geometry import covariances
-from gsmerge.moments import MAX_OPACITY, Members, pool_members, principal_axes, scene_members, to_gaussians
+from gsmerge.pooling import MAX_OPACITY, Members, pool_members, principal_axes, scene_members, to_gaussians
 from gsmerge.types import Gaussians
 
 

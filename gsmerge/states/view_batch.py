@@ -14,16 +14,16 @@ from gsmerge.fit import FitReport
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.geometry import normalize
 from gsmerge.kernels.matrices import matmul
-from gsmerge.moments import Members, feature_to_gaussians
 from gsmerge.networks.corrector import Corrector
 from gsmerge.plan import Plan
+from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, photo_errors, photos_of
 from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.states.groups import replace_groups, select_groups
-from gsmerge.states.options import ExtendOptions
-from gsmerge.states.state import DividedGroups, GroupSet, Replay, State, StateNetworks
+from gsmerge.states.state import Colors, DividedGroups, GroupSet, Replay, State, StateNetworks
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PicturedScene, Segmentation
 
 REACH = 3.34  # standard deviations to where an opaque Gaussian adds 1/255
@@ -103,7 +103,7 @@ class BatchFeatures:
 
 @dataclass(frozen=True)
 class StateKind:
-    """The functions and constants that differ between states of moments and of latents."""
+    """The functions and constants that differ between states of decoded groups and of latents."""
 
     reach: float  # Standard deviations of a group, to where a view touches it
     encode: Callable[[State | None, Batch, int | None], BatchFeatures]  # Make about so many Gaussians
@@ -154,20 +154,20 @@ def fit_batch_colors(
 ) -> tuple[GroupSet, FitReport]:
     """Fit base colours to new photos; earlier photos enter as a prior.
 
-    The normal equations of earlier photos are stored as their diagonal (``GroupSet.color_precision``) about the colours
-    that solve them. The new photos' equations get ``color_precision |colour - fitted colour|^2`` added, so earlier
+    The normal equations of earlier photos are stored as their diagonal (``Colors.precision``) about the colours
+    that solve them. The new photos' equations get ``precision |colour - fitted colour|^2`` added, so earlier
     photos are not needed again.
     """
     rows = rows_in_view(groups.features, batch_photos.cameras)
     in_view, photos = select_groups(groups, rows), batch_photos.photos(2)
-    before = replace(feature_to_gaussians(in_view.features), sh0=in_view.fitted_sh0)
+    before = replace(feature_to_gaussians(in_view.features), sh0=in_view.colors.sh0)
     drawn = draw(before, photos)
-    after, report = fit_colors(before, drawn, photos, options, seed, in_view.color_precision)
+    after, report = fit_colors(before, drawn, photos, options, seed, in_view.colors.precision)
     all_pixels = np.ones((photos.height, photos.width, 1), np.float32)
-    precision = in_view.color_precision.astype(np.float64)
+    precision = in_view.colors.precision.astype(np.float64)
     for view in drawn.views:
         precision[view.ids] += apply_transposed(replace(view, weights=view.weights**2), all_pixels)[:, 0]
-    refitted = replace(in_view, fitted_sh0=after.sh0, color_precision=precision.astype(np.float32))
+    refitted = replace(in_view, colors=Colors(after.sh0, precision.astype(np.float32)))
     return replace_groups(groups, rows, refitted), report
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gsmerge.batch import BatchOptions, Job
-from gsmerge.batch import schedule as plans
+from gsmerge.batch import BatchOptions, Job, workload
 from gsmerge.batch.jobs import CompactCall
-from gsmerge.batch.schedule import Schedule, estimate_memory, estimate_seconds, make_schedule
+from gsmerge.batch.workload import choose_concurrency
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.exporters import AUTO
 from gsmerge.settings.compact import CompactOptions
@@ -23,8 +21,8 @@ def jobs(*counts: int) -> list[Job]:
 
 
 def machine(monkeypatch: pytest.MonkeyPatch, processors: int, memory: int | None) -> None:
-    monkeypatch.setattr(plans, "available_threads", lambda: processors)
-    monkeypatch.setattr(plans, "free_memory", lambda: memory)
+    monkeypatch.setattr(workload, "available_threads", lambda: processors)
+    monkeypatch.setattr(workload, "free_memory", lambda: memory)
 
 
 def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,8 +30,8 @@ def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) ->
 
     def spread(count: int, **message: Any) -> tuple[int, int]:
         settings = CompactOptions().with_settings({"threads": message.pop("threads", None)})
-        schedule = make_schedule(jobs(*[1000] * count), BatchOptions(settings, **message))
-        return schedule.jobs, schedule.threads
+        concurrency = choose_concurrency(jobs(*[1000] * count), BatchOptions(settings, **message))
+        return concurrency.jobs, concurrency.threads
 
     assert spread(100) == (8, 1)
     assert spread(3) == (3, 2)
@@ -52,16 +50,8 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     scenes, need = jobs(small, large, small, large, small), memory_bytes(large, photos=True)
 
     def count(share: float | None, **message: Any) -> int:
-        machine(monkeypatch, 4, None if share is None else int(share * need / plans.FREE_MEMORY_SHARE) + 1)
-        return make_schedule(scenes, BatchOptions(**message)).jobs
+        machine(monkeypatch, 4, None if share is None else int(share * need / workload.FREE_MEMORY_SHARE) + 1)
+        return choose_concurrency(scenes, BatchOptions(**message)).jobs
 
     assert [count(3), count(2), count(1.9), count(0.5), count(None)] == [4, 2, 1, 1, 4]
     assert count(1, jobs=3) == 3  # who asks for it gets it
-    assert estimate_memory(scenes, Schedule(2, 1)) == 2 * need
-
-
-def test_estimates_grow_with_scenes_and_shrink_with_processors(made_scene: Path) -> None:
-    one = [Job(str(made_scene), ("a.ply",), CALL, 30_000)]
-    seconds = [estimate_seconds(one * count, Schedule(at_once, 1)) for count, at_once in
-               ((0, 1), (1, 1), (8, 1), (8, 4))]  # fmt: skip
-    assert seconds[0] == 0 < seconds[1] < seconds[3] < seconds[2]

@@ -1,0 +1,28 @@
+"""The tables of formats name functions that exist."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+
+from gsmerge.io.cameras import read as camera_reader
+from gsmerge.io.cameras.read import CAMERA_FORMATS
+from gsmerge.io.formats import glb, sog, splat, spz, streamed, usd
+from gsmerge.io.formats.table import FORMATS, LEVELS, output_format
+from gsmerge.runtime.plugins import LazyFunction
+
+ENTRIES = [entry for row in (*FORMATS, *CAMERA_FORMATS) for entry in vars(row).values()]
+FUNCTIONS = [entry.func if isinstance(entry, partial) else entry for entry in (*ENTRIES, *vars(camera_reader).values())]
+
+
+@pytest.mark.parametrize("function", {entry for entry in FUNCTIONS if isinstance(entry, LazyFunction)}, ids=str)
+def test_a_function_that_a_table_names_is_there(function: LazyFunction) -> None:
+    assert callable(function.load())
+
+
+def test_the_table_has_the_degrees_of_the_writers() -> None:
+    degrees = {".sog": sog.MAX_DEGREE, ".splat": splat.MAX_DEGREE, ".glb": glb.MAX_DEGREE, ".usdc": usd.MAX_DEGREE}
+    assert {ending: output_format(f"a{ending}").max_degree for ending in degrees} == degrees
+    assert {version: output_format("a.spz", version).max_degree for version in (3, 4)} == spz.MAX_DEGREES
+    assert LEVELS.max_degree == streamed.MAX_DEGREE
