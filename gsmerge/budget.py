@@ -34,12 +34,12 @@ class FileSize:
 
     @property
     def finest(self) -> int:
-        """Bytes that the finest level may have, about."""
+        """Approximate bytes that are left for the finest level."""
         return int(self.num_bytes / sum(LEVEL_FACTOR**-level for level in range(self.levels)))
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the size that a budget in bytes asks for; None of another budget."""
+    """Return the size that a budget in bytes asks for; None for any other budget."""
     if not options.in_bytes:
         return None
     file = output_format(options.output, options.spz_version, levels=True)
@@ -48,6 +48,6 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """Return the most Gaussians that a budget, a file size or a device allows, at most the input's."""
+    """Return the largest number of Gaussians that budget, file size or device allow, at most that of the input."""
     limit = DEVICES.get(str(options.budget), exact_count(options, num_input, sh_degree))
     return num_input if limit is None else min(limit, num_input)

@@ -63,8 +63,8 @@ class FileCheck:
 def check_content(path: Path) -> FileCheck:
     """Read a file of Gaussians, cameras or networks, a ``.gsm`` or a scene to its end, and check its content.
 
-    The ending says which it is; a folder has a scene, which is read as ``compact`` reads it, or cameras. UsageError if
-    a package is missing.
+    The ending tells the kind of file. A folder has cameras, or a scene, which is read as ``compact`` reads it.
+    UsageError if a package is missing.
     """
     try:
         file_check = _read(path)
@@ -77,7 +77,7 @@ def check_content(path: Path) -> FileCheck:
 
 
 def _problem(error: SceneError, path: Path) -> str:
-    """Describe an error, with its file if that is another than ``path``."""
+    """Describe an error, with the name of its file unless that is ``path``."""
     return str(error).removeprefix(f"{path}: ")
 
 
@@ -127,7 +127,7 @@ def _read_gaussians(path: Path) -> FileCheck:
 
 
 def _read_scene(path: Path) -> FileCheck:
-    """Read the Gaussians of a folder, of all parts if it has several, and its cameras and photos as they fit them."""
+    """Read all Gaussians of a folder, with the cameras and photos that belong to them."""
     files = find_scene_files(path)
     parts = [_read_gaussians(ply) for ply in files.plys]
     starts = [f"{ply.name}: " if files.parts else "" for ply in files.plys]
@@ -167,7 +167,7 @@ def _read_cameras(path: Path) -> FileCheck:
 
 
 def _not_read(names: Sequence[str], remark: str = "") -> list[str]:
-    """Make a note of what was not read; none where that is nothing."""
+    """Make a note of the files that were not read; none if all were."""
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
     return [f"not read{remark}: {', '.join(names[:4])}{more}"] if names else []
 

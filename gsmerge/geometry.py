@@ -43,7 +43,7 @@ def normalize(vectors: np.ndarray) -> np.ndarray:
 
 
 def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
-    """Return unit quaternions ``[n,4]`` wxyz of rotations, the largest component positive (Shepperd 1978)."""
+    """Return unit quaternions ``[n,4]`` wxyz of rotations, with a positive largest component (Shepperd 1978)."""
     a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
     ways = np.stack(
         [
@@ -139,18 +139,18 @@ def motion_vectors(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return viewmats ``end [v,4,4]`` with the common part (mean, median) of all motions since ``start`` taken out."""
+    """Return viewmats ``end [v,4,4]`` without the common part (mean, median) of all motions since ``start``."""
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
 
 
 def camera_centres(viewmats: np.ndarray) -> np.ndarray:
-    """Return the centres ``[...,3]`` of cameras in the world, of rigid viewmats ``[...,4,4]``."""
+    """Return the centres ``[...,3]`` in the world of cameras with rigid viewmats ``[...,4,4]``."""
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
 def middle_depth(means: np.ndarray, camera: Cameras) -> float:
-    """Measure the median depth of the points ``[n,3]`` in one camera's picture; 1 without any."""
+    """Measure the median depth of the points ``[n,3]`` inside one camera's picture; 1 without any."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -182,13 +182,13 @@ def pose_changes(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Return the lengths ``[...,1]`` of vectors ``[...,d]``, by columns: reducing short rows takes thrice as long."""
+    """Return the lengths ``[...,1]`` of vectors ``[...,d]``, column by column, since reducing short rows is slower."""
     columns = np.moveaxis(vectors * vectors, -1, 0)
     return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
 
 
 def median(values: np.ndarray) -> float:
-    """Return the median of ``values [n]``, n >= 1, as ``np.median`` does without its checks; none may be NaN."""
+    """Return the median of ``values [n]``, n >= 1, without the checks of ``np.median``; no value may be NaN."""
     middle = len(values) // 2
     parts = np.partition(values, (middle - 1, middle) if len(values) > 1 else 0)
     return float(parts[middle] if len(values) % 2 else (parts[middle - 1] + parts[middle]) / 2)
@@ -228,7 +228,7 @@ def turn_harmonics(shN: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def harmonics_turn(num: int, rotation: np.ndarray) -> np.ndarray:
-    """Return the matrix ``[num,num]`` that rotates as many harmonics; see :func:`apply_turn`.
+    """Return the matrix ``[num,num]`` that rotates ``num`` harmonics; see :func:`apply_turn`.
 
     Each degree is fitted to the same colours in rotated directions, which is exact.
     """
@@ -264,7 +264,7 @@ def _harmonics_in(directions: np.ndarray, num: int) -> np.ndarray:
 
 
 def sh0_to_rgb(sh0: np.ndarray) -> np.ndarray:
-    """Return the base colours (sRGB, 0 to 1 where they can be shown) of harmonics of degree 0."""
+    """Return the base colours of harmonics of degree 0: sRGB, within 0 to 1 if displayable."""
     return 0.5 + SH_C0 * sh0
 
 
@@ -274,7 +274,7 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 
 
 def robust_weights(errors: np.ndarray, doubt: float, least: float, sizes: np.ndarray | float = 1.0) -> np.ndarray:
-    """Return Cauchy's weights ``[n]`` for reweighted least squares: small where errors exceed their median by far.
+    """Return Cauchy's weights ``[n]`` for reweighted least squares, small for errors far above the median.
 
     The weights are 1 / (sizes^2 (1 + (errors / (doubt * median + least))^2)).
     """

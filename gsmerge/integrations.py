@@ -24,7 +24,7 @@ _BYTES = 255.0  # largest value of an image of bytes
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     """Convert a ``Prediction`` of Depth Anything 3 with ``infer_gs=True``: all Gaussians, one per pixel, and its views.
 
-    Its files lack those at borders and far away. The nested models' poses are brought to the scale of the Gaussians.
+    The files of the model lack Gaussians at borders and far away. Poses of nested models are scaled to the Gaussians.
 
     Args:
         prediction: Has ``gaussians`` (``means``, ``scales``, ``rotations``, ``harmonics``, ``opacities``),
@@ -54,9 +54,9 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
 
 
 def anysplat(gaussians: Any, poses: Mapping[str, Array], images: Array, *, sh_degree: int = 0) -> dict[str, Any]:
-    """Convert what AnySplat's ``model.inference`` returns: Gaussians of voxels, which belong to no pixels, and cameras.
+    """Convert the output of AnySplat's ``model.inference``: Gaussians of voxels, which have no pixels, and cameras.
 
-    Its files have no cameras.
+    The files of the model have no cameras.
 
     Args:
         gaussians: Has ``means``, ``scales``, ``rotations`` xyzw (its files have w first), ``harmonics [1,n,3,k]`` and
@@ -137,7 +137,7 @@ def _gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
 
 
 def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array) -> dict[str, np.ndarray]:
-    """Convert views of the pixelSplat family: camera to world, intrinsics over the image's size, channels first."""
+    """Convert views of the pixelSplat family: camera to world, intrinsics relative to image size, channels first."""
     c2w = as_array(_one(extrinsics, _item("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
     sizes = np.array([photos.shape[2], photos.shape[1], 1.0])
@@ -146,14 +146,15 @@ def _family_views(poses: Mapping[str, Array], extrinsics: str, intrinsics: str, 
 
 
 def _as_floats(photos: np.ndarray) -> np.ndarray:
-    """Bring photos of bytes to [0, 1]; leave others as they are."""
+    """Convert 8-bit photos to [0, 1]; leave float photos unchanged."""
     return photos / np.float32(_BYTES) if photos.dtype == np.uint8 else photos
 
 
 def _in_pixels_of(photos: np.ndarray, Ks: np.ndarray) -> np.ndarray:
-    """Bring intrinsics to the photos' size: writing COLMAP files leaves Depth Anything 3's at the original photos'.
+    """Scale intrinsics to the size of the photos.
 
-    Its principal point is in the middle of whichever size they are of.
+    Depth Anything 3 leaves intrinsics at the original photo size after it has written COLMAP files. The principal point
+    is in the middle at either size.
     """
     factors = np.array([photos.shape[-2], photos.shape[-3]]) / (2 * Ks[:, (0, 1), 2])
     scaled = np.abs(factors - 1).min() > _OTHER_SIZE

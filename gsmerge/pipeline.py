@@ -33,7 +33,7 @@ def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedViews:
-    """Merge the superpixels of all views; compacting, encoding and adding views in batches share this part."""
+    """Merge the superpixels of all views; compacting and adding views to a state share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
     members = assign(scene, segmentation.groups, draws=plan.networks is None)

@@ -91,7 +91,7 @@ class Plan:
 
     @property
     def networks(self) -> NetworkWeights | None:
-        """Networks that correct the stages' results; None: closed formulas alone."""
+        """Networks that correct the results of the stages; None: closed formulas."""
         return None if self.checkpoint is None else self.checkpoint.networks
 
     @property
@@ -119,7 +119,7 @@ class Plan:
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
-    """Decide everything that the options leave open; raise UsageError if scene or checkpoint cannot do it.
+    """Make all decisions that the options leave open; raise UsageError if scene or checkpoint do not allow them.
 
     ``checkpoint``: networks to use instead of those that the options name.
     """
@@ -222,7 +222,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
-    """Note that a cluster brings nothing when the scene is compacted in one piece."""
+    """Note that a cluster has no use for a scene that is compacted in one piece."""
     if blocks == 1 and options.blocks.engine.name != "local":
         problems = blocks_problems(scene, options)
         remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
@@ -235,7 +235,10 @@ def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
-    """Return the number of blocks that the options ask for, at most; 1: one piece. ``num_views``: 0 for few."""
+    """Return the largest number of blocks that the options ask for; 1: one piece.
+
+    ``num_views``: 0 for few.
+    """
     asked = options.blocks.blocks
     if asked == "auto":
         return 1 if _whole_needed(options) else usual_blocks(num_gaussians, num_views)
@@ -243,7 +246,7 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 
 
 def _whole_needed(options: CompactOptions) -> list[str]:
-    """Name the settings in use with which a scene is not cut into blocks."""
+    """Name the settings in use that prevent cutting a scene into blocks."""
     whole = {
         "budget auto": options.budget.auto,
         "poses free": options.prepare.poses == "free",
@@ -253,7 +256,7 @@ def _whole_needed(options: CompactOptions) -> list[str]:
 
 
 def _check_photos(reference: Reference, options: CompactOptions) -> None:
-    """Refuse settings that need photos where there are none."""
+    """Raise UsageError for settings that need photos if there are none."""
     if not reference.score_views and options.budget.quality is not None:
         raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
     if reference.name == RENDERS and "sky" in options.clean.drops:
@@ -261,7 +264,7 @@ def _check_photos(reference: Reference, options: CompactOptions) -> None:
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a scene is merged by positions and colours alone: no view is known, and nothing asks for one."""
+    """Return whether a scene is merged by positions and colours only: it has no views, and no option needs one."""
     return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
 
 
@@ -314,7 +317,7 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
 
 
 def resolve_budget(options: CompactOptions, scene: Scene) -> CompactOptions:
-    """Replace an automatic budget of a fit by the share that the depths of several views bear, and say why."""
+    """Replace an automatic budget of a fit by a share, by how well the depths of several views agree; with a note."""
     fits = options.budget.auto and options.fit.fit != "none"
     share, why = measured_share(scene) if fits else (None, "")
     if share is None:
@@ -325,7 +328,7 @@ def resolve_budget(options: CompactOptions, scene: Scene) -> CompactOptions:
 
 
 def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:
-    """Fill in the options of superpixels that effort and scene decide; a note says why."""
+    """Fill in the options of superpixels that depend on effort and scene; a note gives the reason."""
     if options.superpixels == AUTO_SHARE:
         share, why = measured_share(scene)
         text = SHARE if share is None else f"{100 * share:.2g}%"
@@ -339,7 +342,7 @@ def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) 
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
 ) -> tuple[Gaussians, int | None]:
-    """Merge and clean the unseen Gaussians; return them and the number that shares of a budget refer to, or None."""
+    """Merge and clean the unseen Gaussians; return them, and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
     num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
     if len(unseen) == 0:
@@ -360,10 +363,10 @@ def _merge_unseen(
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Choose K where it is "auto": more where one camera sees the scene and no fit, or a short one, follows.
+    """Choose K if it is "auto": more if a single camera sees the scene and no fit, or only a short one, follows.
 
-    With K = 1, 4.4 % of the pixels of one photo are too few to show it; of more views each has
-    Gaussians of its own.
+    With K = 1, 4.4 % of the pixels of one photo are too few to show it; with more views each view has Gaussians of its
+    own.
     """
     decode, budget, segment = options.decode, options.budget, options.segment
     if decode.k != AUTO:
@@ -376,7 +379,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Choose the number of fit steps by effort, and whether to leave out Gaussians that no photo shows."""
+    """Choose the number of fit steps by effort, and whether to drop Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -398,7 +401,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 
 
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the size of the photos that the fit sees, and whether it moves cameras."""
+    """Fill in the size of the photos for the fit, and whether it moves cameras."""
     scene = prepared.scene
     if not fit.needs_photos:
         return replace(fit, photo_scale=1.0)
@@ -411,7 +414,7 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
 
 
 def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
-    """Choose views, whose photos show the scene, for scoring; more where they decide a quality search."""
+    """Choose views for scoring whose photos show the scene; more if they decide a search for a quality."""
     reference = prepared.reference
     if reference.placed:
         return reference.score_views

@@ -38,7 +38,7 @@ class Members:
     fronts: np.ndarray | None = None
 
     def pixels_of(self, rows: np.ndarray) -> np.ndarray:
-        """Return the pixels of some members, -1 for none."""
+        """Return the pixels of the members ``rows``, -1 for none."""
         return rows if self.pixels is None else self.pixels[rows]
 
 
@@ -66,7 +66,7 @@ def scene_members(scene: Scene) -> Members:
 def unaligned_members(scene: Scene, pixels: np.ndarray, fronts: np.ndarray | None = None) -> Members:
     """Return the Gaussians of an unaligned scene as members, given their pixels ``[n]`` int64 (-1: none).
 
-    ``fronts [v,h,w]`` int32: the Gaussian that each pixel shows (-1: none), which statistics across views read.
+    ``fronts [v,h,w]`` int32: the Gaussian that each pixel shows (-1: none), for statistics across views.
     """
     means, cameras = _array(scene.gaussians.means), scene.cameras
     focals = np.sqrt(np.abs(cameras.Ks[:, 0, 0] * cameras.Ks[:, 1, 1])).astype(np.float64)
@@ -107,10 +107,10 @@ class Moments:
 def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Rule = "depth") -> Moments:
     """Pool every group of members into moments, weighted by opacity.
 
-    ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. ``rule``
-    ``"depth"``: members' own covariances are added to the spread of their means, and their
-    integrated optical depths add. ``"paper"``: the paper's moment matching (eq. teacher_mean,
-    teacher_cov), which states no opacity: the members' mean.
+    ``ids [m]`` int32 are rows of ``members``, ``starts [g+1]`` int64 point into them. With the ``rule`` ``"depth"`` the
+    members' own covariances are added to the spread of their means, and their integrated optical depths are summed.
+    ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov); the paper states no opacity, so the mean
+    of the members is used.
     """
     num_groups = len(starts) - 1
     geometry = np.zeros((num_groups, 13))

@@ -127,14 +127,14 @@ def finite(value: Any) -> Any:
 
 
 def csv_cell(value: Any) -> Any:
-    """Return a value for a CSV table: "" for None; a quote comes before text that a spreadsheet would run."""
+    """Return a value for a CSV table: "" for None; a quote precedes text that a spreadsheet would execute."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r", "\n") else value
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Write rows as comma-separated values under a line of column names; keys that are no columns are ignored."""
+    """Write rows as comma-separated values under a line of column names; keys without a column are ignored."""
     out = io.StringIO()
     writer = csv.DictWriter(out, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -143,13 +143,13 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def text_table(rows: Sequence[Sequence[str]], indent: str = "") -> list[str]:
-    """Write rows as lines for a terminal: the first column to the left, the others to the right."""
+    """Write rows as lines for a terminal, with the first column left-aligned and others right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [indent + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Write rows as a table of HTML for notebooks: the first column to the left, the others to the right."""
+    """Write rows as an HTML table for notebooks, with the first column left-aligned and others right-aligned."""
 
     def cell(text: str, side: str) -> str:
         return f'<td style="text-align:{side}">{html.escape(text)}</td>'
@@ -250,13 +250,13 @@ def summary_line(document: Mapping[str, Any]) -> str:
 
 
 def _against(document: Mapping[str, Any]) -> str:
-    """Say what PSNR is measured against, if not against photos."""
+    """Return what PSNR is measured against, unless that is photos."""
     reference = document.get("psnr_reference")
     return "" if reference in (None, "photos") else f" against {reference}"
 
 
 def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the wall time by stage and in total, in the form that all reports share."""
+    """Return the wall time by stage and in total, in the form of all reports."""
     total = round(sum(seconds.values()), 4)
     return {"seconds": {name: round(value, 4) for name, value in seconds.items()}, "total_seconds": total}
 

@@ -38,7 +38,7 @@ def _expect(name: str, array: Array, shape: tuple[int | str, ...]) -> None:
 
 
 def as_array(values: Array) -> np.ndarray:
-    """Return an array or a tensor of any device as a NumPy array without gradient, copied only if needed."""
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copied only if needed."""
     return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
 
 
@@ -132,7 +132,7 @@ class Gaussians:
 
     @property
     def device(self) -> torch.device | None:
-        """Device of the tensors; None of NumPy arrays."""
+        """Device of the tensors; None for NumPy arrays."""
         return None if isinstance(self.means, np.ndarray) else self.means.device
 
     def to(self, device: torch.device | str) -> Gaussians:
@@ -346,7 +346,7 @@ class Scene:
 
     @property
     def finite_gaussians(self) -> Gaussians:
-        """Gaussians without the rows that stand in for those that are not finite in the file."""
+        """Gaussians of finite rows; rows that replace invalid rows of the file are left out."""
         return self.gaussians if self.pixel_ids is None else self.gaussians[self.pixel_ids >= 0]
 
     @property

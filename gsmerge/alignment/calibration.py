@@ -71,9 +71,9 @@ class _Model:
 
 
 def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
-    """Calibrate the cameras of views of ``width`` x ``height`` pixels; ``pairs`` name their pixels.
+    """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
-    None where the points do not determine cameras, or lie farther from their pixels than the Gaussians of a view may.
+    None where the points do not determine cameras, or where Gaussians lie farther from their pixels than is allowed.
     """
     if not len(pairs.rows):
         return None
@@ -95,7 +95,7 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
 def _choose_model(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float
 ) -> _Model | None:
-    """Choose the simplest intrinsics that explain the pixels; ``bound`` is what projective cameras leave, pixels."""
+    """Choose the simplest intrinsics that explain the pixels; ``bound``: error of projective cameras, pixels."""
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # of a model that the points do not determine; the simple ones come first
         models.extend(_models(points, pixels, size, bound))
@@ -104,7 +104,7 @@ def _choose_model(
 
 
 def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, bound: float) -> Iterator[_Model]:
-    """Yield models with common intrinsics, and with separate ones where those leave something to explain."""
+    """Yield models with common intrinsics, then with separate intrinsics if common ones leave an error to explain."""
     simple = []
     for share in _FOCALS:
         focal = share * max(size)

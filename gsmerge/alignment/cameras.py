@@ -53,13 +53,13 @@ def describe_convention(convention: Convention) -> str:
 
 
 def describe_reading(convention: Convention, usual: Convention) -> str:
-    """Describe in words that poses fit in another convention than the format's ``usual`` one."""
+    """Describe in words that poses fit in a ``convention`` other than ``usual``, that of the format."""
     words = describe_convention(convention)
     return f"the poses fit when read as {words}, where this format has {usual[0]} with {usual[1]} axes"
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Poses]:
-    """List the poses ``viewmats [c,4,4]`` as read in all other conventions, without repetitions."""
+    """List the poses ``viewmats [c,4,4]`` as read in each other convention, without duplicates."""
     stored, readings = from_viewmats(viewmats, convention), [Poses(convention, viewmats)]
     for other in CONVENTIONS:
         read = to_viewmats(stored, other)
@@ -87,16 +87,16 @@ class MovedCameras:
 
 
 def max_pixels(width: int, height: int) -> float:
-    """Return the largest median distance, pixels, that cameras may be moved by; beyond it a scene is refused."""
+    """Return the largest median distance, pixels, by which cameras may be moved; beyond it scenes are refused."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
 def move_cameras(
     pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks"
 ) -> MovedCameras | None:
-    """Move cameras so that sampled Gaussians project into their pixels; None if some cameras are too far off.
+    """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    SceneError, which names ``source``, where the intrinsics are wrong rather than the poses.
+    Raises SceneError, which names ``source``, where the intrinsics rather than the poses are wrong.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
@@ -136,7 +136,7 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
-    """Raise a SceneError where one change of all Ks fits the Gaussians as well as moved poses."""
+    """Raise SceneError if one change of all intrinsics fits the Gaussians as well as moved poses do."""
     if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
         return
     with np.errstate(all="ignore"):

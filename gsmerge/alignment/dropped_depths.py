@@ -20,11 +20,11 @@ _AROUND = 6  # pixels on either side over which colours are compared
 
 
 def fill_from_depths(scene: Scene, depths: np.ndarray, images: np.ndarray) -> Scene:
-    """Add a Gaussian at the depth of ``depths [v,h,w]`` for each pixel that the file has no row for.
+    """Add a Gaussian at the depth of ``depths [v,h,w]`` for each pixel without a row in the file.
 
-    Units, and whether depth is along z or a distance, follow from the other pixels. The colour is that of the photos
-    ``images [v,h,w,3]``; opacity, rotation and size in pixels are copied from the pixel before it in the row. The scene
-    is unchanged if its Gaussians do not lie at the maps' depths.
+    The unit of the depths, and whether they are along z or distances, follow from the other pixels. Colours are those
+    of the photos ``images [v,h,w,3]``. Opacity, rotation and size in pixels are copied from the previous pixel of the
+    line. The scene is returned unchanged if its Gaussians do not lie at the depths of the maps.
     """
     V = scene.cameras.viewmats
     views, height, width = scene.valid.shape
@@ -68,10 +68,11 @@ def fill_from_depths(scene: Scene, depths: np.ndarray, images: np.ndarray) -> Sc
 
 
 def guess_depths(scene: Scene, images: np.ndarray) -> np.ndarray:
-    """Guess depth maps ``[v,h,w]`` along z of a scene whose file lacks borders and other pixels, from its photos.
+    """Guess depth maps ``[v,h,w]`` along z from the photos, for a scene whose file lacks pixels.
 
-    Pixels with rows keep their depths. Others get the depth beside them, or that of the far, at which the nearest other
-    photos have the same colours; border pixels the depth of the pixel beside them.
+    Pixels with rows keep their depths. For an inner pixel without a row, the candidates are the depth of the nearest
+    pixel with a row, and several depths about the farthest one; the candidate with the most similar colours in the
+    nearest other photos is chosen. Border pixels take the depth of the nearest pixel inside the border.
     """
     views, height, width = scene.valid.shape
     y, x = (_without_borders(np.asarray(scene.valid.any((0, 3 - axis)))) for axis in (1, 2))
@@ -94,9 +95,9 @@ def guess_depths(scene: Scene, images: np.ndarray) -> np.ndarray:
 
 
 def _nearest_kept(kept: np.ndarray) -> np.ndarray:
-    """Return for each pixel the index ``y·w + x [h,w]`` of the nearest of ``kept [h,w]`` in its row or column.
+    """Return for each pixel the index ``y·w + x [h,w]`` of the nearest kept pixel in its row or column.
 
-    The first one of all where there is none; at least one pixel must be kept.
+    Where row and column have none, it is the first kept pixel of the picture. At least one pixel must be kept.
     """
     ids = np.arange(kept.size).reshape(kept.shape)
     least, chosen = np.full(kept.shape, kept.size), np.full(kept.shape, int(kept.argmax()))
@@ -111,14 +112,17 @@ def _nearest_kept(kept: np.ndarray) -> np.ndarray:
 
 
 def _without_borders(stored: np.ndarray) -> np.ndarray:
-    """Return for each of some lines ``[l]`` of pixels itself, or for a trimmed border the nearest line inside it."""
+    """Return for each line of pixels its own index ``[l]``, or for a trimmed border that of the nearest inner line."""
     lines, first, last = len(stored), int(stored.argmax()), int(stored[::-1].argmax())
     most = max(TRIMS[0], da3_trim(lines))  # beyond, a line lacks pixels for another reason
     return np.arange(lines).clip(min(first, most), lines - 1 - min(last, most))
 
 
 def _agreeing_depths(scene: Scene, images: np.ndarray, view: int, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Choose of ``depths [d,p]`` those under which photos agree, for some ``pixels [h,w]``; the first in doubt."""
+    """Choose one of ``depths [d,p]`` for each of the ``pixels [h,w]``: that with the best agreement of photos.
+
+    In doubt it is the first depth.
+    """
     cameras = scene.cameras
     if not pixels.any():
         return depths[0]

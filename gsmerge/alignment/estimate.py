@@ -45,10 +45,10 @@ _MIN_STRETCHES, _MIN_AGREEING = 8, 0.5  # of a view that agree, and share of the
 def estimate_cameras(
     path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
 ) -> CameraFile | None:
-    """Estimate cameras so that the rows of a full or trimmed grid project into their own pixels.
+    """Estimate cameras that show each row of a full or trimmed grid in its own pixel.
 
-    ``names`` are those of the views, all ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
-    messages. None if no order of the rows fits at least twice as well as all others.
+    ``names`` are the names of the views, all of ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
+    messages. None if no order of the rows fits at least twice as well as all other orders.
     """
     layouts = exact_layouts(len(gaussians), len(names), width, height)
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
@@ -61,10 +61,9 @@ def estimate_cameras(
 
 
 def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> tuple[CameraFile, np.ndarray] | None:
-    """Estimate the cameras of rows that are a grid, of which nothing else is known; None where they are none.
+    """Estimate the cameras of rows that form a grid of unknown size; None where rows form no grid.
 
-    ``valid [n]`` bool; ``path`` is for messages. Returns the base colours ``[v,h,w,3]`` of the views' pixels as well,
-    0 to 1.
+    ``valid [n]`` bool; ``path`` is for messages. Also returns the base colours ``[v,h,w,3]`` of the pixels, 0 to 1.
     """
     grid = find_grid(gaussians, valid)
     if grid is None:
@@ -99,13 +98,13 @@ class _Grid:
 
     @property
     def bounds(self) -> tuple[int, int]:
-        """Fewest and most rows that a view has, by whether the farthest pixels lie in the box."""
+        """Fewest and most rows of a view, by whether its farthest pixels lie in the box."""
         pixels, box = self.transform.width * self.transform.height, len(self.inside)
         return box - (pixels - int(DEPTH_SHARE * (pixels - 1)) - 1), box
 
 
 def _possible_grids(count: int, views: int, size: Size) -> Iterator[_Grid]:
-    """Yield the grids whose views can have ``count`` rows, for photos of one size."""
+    """Yield the grids in which the views can have ``count`` rows in all, for photos of one size."""
     for transform in (resize_to(size, size), *patch_grids(size)):
         for chosen in every_nth(views):
             grid = _Grid(transform, chosen)
@@ -122,10 +121,10 @@ def estimate_with_photos(
     size: Size,
     read_photos: Callable[[], Photos],
 ) -> CameraFile | None:
-    """Estimate the cameras of a file with unknown missing pixels, from the colours of its photos.
+    """Estimate the cameras of a file that lacks unknown pixels, from the colours of its photos.
 
-    ``names`` are those of the photos, which have one ``size``; ``valid [n]`` bool; ``path`` is for
-    messages. None where colours and rows do not agree.
+    ``names`` are the names of the photos, which all have one ``size``; ``valid [n]`` bool; ``path`` is for messages.
+    None where colours and rows do not agree.
     """
     grids = list(_possible_grids(len(gaussians), len(names), size))
     if not grids:
@@ -143,7 +142,7 @@ def estimate_with_photos(
 
 
 def _match_colors(colors: np.ndarray, grid: _Grid, photos: Photos) -> Layout | None:
-    """Find pixels of some rows of each view by their ``colors [3,n]``, or None if they are too few."""
+    """Find the pixels of a sample of rows in each view by their ``colors [3,n]``; None if too few are found."""
     inside, (fewest, _) = grid.inside, grid.bounds
     dropped = len(inside) - fewest  # pixels of a view, at most
     length = min(_STRETCH, grid.transform.width)

@@ -38,7 +38,7 @@ _ORDERS = {  # in which rows may be instead, by the order of their layout
 
 
 def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile) -> SceneError:
-    """Return the SceneError for rows that are not pixels; raise it at once if the cameras are wrong, not the rows."""
+    """Return the SceneError for rows that are not pixels, or raise it if the cameras rather than the rows are wrong."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
@@ -87,7 +87,7 @@ def _count_remedy(count: int, cameras: Cameras) -> str:
 
 
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
-    """Make the SceneError for rows as many as pixels, that fit no pixels or fit in several ways."""
+    """Make the SceneError for rows as many as pixels, which fit no layout or several."""
     if alignment.ok:
         problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
         return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
@@ -103,7 +103,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 def explain_misalignment(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, convention: Convention
 ) -> str | None:
-    """Name another reading of cameras or row order that fits the scene; None if none does."""
+    """Name another convention of the cameras, or order of the rows, that fits the scene; None if none does."""
     pairs = sample_pixels(gaussians, cameras, valid)
     input_viewmats = cameras.viewmats
     frames = candidate_similarities(pairs, cameras, effort=1)

@@ -51,17 +51,17 @@ class _Pictures:
     ratio: float  # of their side to the photos'
 
     def cameras(self, viewmats: np.ndarray, focal: float) -> Cameras:
-        """Make the views' cameras of all poses ``[c,4,4]`` and a focal length in these pixels."""
+        """Make cameras of poses ``[c,4,4]`` and a focal length in pixels of the small pictures."""
         height, width = self.images.shape[1:3]
         K = make_pinhole(focal, focal, width / 2, height / 2)
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
 def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile | None:
-    """Estimate the intrinsics of cameras that have poses alone; return cameras with a note, or None if that fails.
+    """Estimate the intrinsics of cameras that have only poses; return cameras and a note, or None if that fails.
 
-    ``camera_file`` has poses alone; ``photos`` are its c ``[h,w,3]`` uint8, or none. Where only they show
-    the focal length, pixels are taken to be square, and the principal point to be in the middle.
+    ``camera_file`` has only poses; ``photos`` are c pictures ``[h,w,3]`` uint8, or empty. Where the focal length
+    follows only from the photos, pixels are taken to be square, and the principal point to be in the middle.
     """
     camera_size = int(camera_file.widths[0]), int(camera_file.heights[0])
     size = photo_size(photos) or camera_size
@@ -152,13 +152,13 @@ def _intrinsics_of_colors(
 
 
 def _sample(ply: GaussianFile, count: int) -> Gaussians:
-    """Take about ``count`` finite Gaussians, spread over the file."""
+    """Take about ``count`` finite Gaussians, evenly spread over the file."""
     rows = np.flatnonzero(ply.valid)
     return ply.gaussians[rows[:: max(1, len(rows) // count)]]
 
 
 def _small_pictures(photos: Photos, size: Size) -> _Pictures:
-    """Reduce the photos of some views."""
+    """Reduce the size of a selection of photos."""
     count = len(photos)
     places = np.linspace(0, count - 1, min(count, _MAX_VIEWS))
     views = sorted({round(place) for place in places})
@@ -170,13 +170,13 @@ def _small_pictures(photos: Photos, size: Size) -> _Pictures:
 
 
 def _check(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> CameraCheck:
-    """Measure how well the views see Gaussians under a focal length."""
+    """Measure how well the views show the Gaussians with a focal length."""
     valid = np.ones(len(gaussians), bool)
     return check_cameras(gaussians, valid, pictures.cameras(viewmats, focal), pictures.images)
 
 
 def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> float:
-    """Search ever nearer to a focal length for the one with the smallest distance of colours."""
+    """Search for the focal length with the smallest colour distance in ever smaller steps."""
     points = gaussians.means.astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1)
 

@@ -55,7 +55,7 @@ _BETTER = 2.0  # times nearer to the pixels: another scale, where the same fits 
 
 
 def read_incomplete(inputs: AlignmentInput) -> Iterator[Reading]:
-    """Yield readings with missing pixels, those of the likely order first."""
+    """Yield readings of rows that lack pixels, in order of likelihood."""
     return (reading for reading in _read_orders(inputs) if reading is not None)
 
 
@@ -84,13 +84,13 @@ def _read_orders(inputs: AlignmentInput) -> Iterator[Reading | None]:
 def _read(
     inputs: AlignmentInput, rows: ProjectedRows, search: Callable[[ProjectedRows], Layout | None], frame: Similarity
 ) -> Reading | None:
-    """Score the layout that a search makes of the rows in one frame; None without one."""
+    """Find the pixels of the rows by ``search`` in one frame and score the layout; None if the search finds none."""
     layout = search(rows.with_frame(frame))
     return None if layout is None else score_layout(inputs, layout, frame)
 
 
 def _read_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similarity) -> Reading | None:
-    """Read one view after the other in a frame, and at any other scale where that does not fit well."""
+    """Read the rows view after view in a frame, or at another scale if the frame does not fit well."""
     same = _read(inputs, rows, read_view_major, frame)
     if same is not None and same.worst_px >= _CERTAIN_PX:
         num_pixels = len(same.layout.views) * rows.cameras.width * rows.cameras.height
@@ -105,7 +105,7 @@ def _read_view_major(inputs: AlignmentInput, rows: ProjectedRows, frame: Similar
 
 
 def _read_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
-    """Search for scale and pixels of rows view by view, from the steps between rows."""
+    """Search for the scale and the pixels of rows in view-major order, from the steps between rows."""
     scale = rough_scale(rows)
     best = None if scale is None else _read(inputs, rows, read_view_major, scale_by(scale))
     far = max(FAR_PX, FAR * min(rows.cameras.width, rows.cameras.height))
@@ -116,7 +116,7 @@ def _read_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
 
 
 def _read_view_fastest_scaled(inputs: AlignmentInput, rows: ProjectedRows) -> Reading | None:
-    """Read pixel by pixel at the scale of the cameras' positions at which rows gather at the centres of pixels."""
+    """Read the rows pixel by pixel, at the scale of the cameras at which they gather at pixel centres."""
     scale = concentrated_scale(rows)
     best = None if scale is None else _read(inputs, rows, read_view_fastest, scale_by(scale))
     return None if scale is None or best is None else _solve_scale(inputs, rows, read_view_fastest, best, best.frame)
@@ -141,7 +141,7 @@ def _solve_scale(
 
 
 def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
-    """Return what measures the distances of some rows' base colours from the photos; None without photos."""
+    """Return a function that measures the colour distance of rows from the photos; None without photos."""
     if not len(inputs.images):
         return None
     base = sh0_to_rgb(inputs.gaussians.sh0[ids, 0])
@@ -152,8 +152,9 @@ def _photo_colors(inputs: AlignmentInput, ids: np.ndarray) -> ColorOf | None:
 def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> Layout | None:
     """Find the pixel of every row in a file without an order; None unless nearly all rows lie at pixel centres.
 
-    Each row goes to the view in which it is nearest to a pixel's centre; between several near ones, the colours of
-    the photos count as well. A pixel keeps the row that fits it best, the others go to their second choice.
+    Each row goes to the view in which it is nearest to a pixel centre. If several views are about as near, the colours
+    of the photos count as well. If several rows go to one pixel, the best one keeps it, and the others go to their
+    second choice.
     """
     count, num_views = len(rows), len(rows.cameras)
     num_pixels = rows.cameras.width * rows.cameras.height
@@ -175,9 +176,9 @@ def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> L
 
 
 def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | None:
-    """Measure how near rows are to the centres of pixels, on a sample; None where it may be chance.
+    """Measure how near sampled rows are to pixel centres; None if that may be chance.
 
-    Chance is measured at the corners of pixels, and in the second nearest view, which cameras side by side share.
+    Chance is measured at pixel corners, and in the second nearest view, which cameras side by side have in common.
     """
     if len(rows) < MIN_RUN:
         return None
@@ -209,7 +210,7 @@ def _measure_spread(rows: ProjectedRows, color_of: ColorOf | None) -> Spread | N
 
 
 def _distances(rows: ProjectedRows, row_ids: np.ndarray, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Measure distances ``[r,c]`` from the nearest pixel's centre in each view, inf outside; also return the pixels."""
+    """Measure distances ``[r,c]`` from the nearest pixel centre in each view, inf outside; also return the pixels."""
     distances = np.full((len(row_ids), len(rows.cameras)), np.inf, np.float32)
     pixels = np.zeros((len(row_ids), len(rows.cameras)), np.int32)
     for view in range(len(rows.cameras)):
@@ -223,7 +224,7 @@ def _distances(rows: ProjectedRows, row_ids: np.ndarray, *, shift: float = 0.0) 
 def _choices(
     rows: ProjectedRows, row_ids: np.ndarray, spread: Spread, color_of: ColorOf | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the best and second best slots ``view·H·W + pixel [r,2]`` of some rows, -1: none; and their costs."""
+    """Choose the best and second best slots ``view·H·W + pixel [r,2]`` of the rows, -1 for none; also return costs."""
     distances, pixels = _distances(rows, row_ids)
     tolerance, px, color = spread
     near = distances < tolerance
@@ -246,7 +247,10 @@ def _choices(
 
 
 def _assign(slots: np.ndarray, cost: np.ndarray, size: int) -> np.ndarray:
-    """Choose the row that each slot keeps ``[size]``, -1 for none: the cheapest; second choices take free slots."""
+    """Choose the row ``[size]`` that each slot keeps, -1 for none.
+
+    The cheapest row keeps a slot; rows that lose theirs take a free slot by their second choice.
+    """
     owner = np.full(size, -1, np.int64)
     waiting = np.arange(len(slots))
     for choice in range(2):

@@ -58,9 +58,9 @@ class Recovery:
 
 
 def accept_reading(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recovery | None:
-    """Accept the reading that is nearest to its pixels, by far; None where none is.
+    """Accept the reading that is clearly the nearest to its pixels; None if none stands out.
 
-    Of readings about equally near, the one whose colours the photos have by far is accepted.
+    Among readings about as near, the one with by far the best colours is accepted.
     """
     if not readings:
         return None
@@ -91,7 +91,7 @@ def accept_reading(inputs: AlignmentInput, readings: Sequence[Reading]) -> Recov
 
 @dataclass(frozen=True)
 class Fit:
-    """A grid of which rows are the pixels."""
+    """A grid whose pixels are the rows."""
 
     grid: GridFit
     recovery: Recovery
@@ -103,16 +103,16 @@ class Fit:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a grid of another size may fit as well: borders are cut off, and the scale was solved for."""
+        """Whether a grid of another size may fit as well, since borders are cut off and the scale is solved for."""
         best = self.recovery.best
         return best.layout.kind == "trim" and best.frame.scale != 1 and self.px > _WRONG_SIZE_PX
 
 
 def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -> Fit | None:
-    """Choose the fit that is nearest to its pixels, and of several alike the one whose photos have the colours.
+    """Choose the fit that is nearest to its pixels, or among similar fits the one whose photos have the right colours.
 
-    ``read`` brings the photos to the size of a grid. None where a grid of another size is about as near, SceneError
-    where poses in another convention are.
+    ``read`` resizes the photos to a grid. None where a grid of another size is about as near; SceneError where poses in
+    another convention are.
     """
     best = min(fits, key=lambda fit: fit.px, default=None)
     if best is None:
@@ -136,7 +136,7 @@ def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -
 
 
 def _refine(inputs: AlignmentInput, reading: Reading) -> Reading:
-    """Score a reading again, and solve its frame again, on more Gaussians if they were few."""
+    """Score a reading again, with its frame solved again on more Gaussians if there were few."""
     effort = 2 if reading.frame.kind == "other" else 1
     return best_frame(inputs, reading.layout, SAMPLES, effort) if reading.quick else reading
 

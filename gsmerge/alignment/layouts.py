@@ -79,9 +79,10 @@ class KeptBox:
 
 
 def boxes(width: int, height: int) -> Iterator[KeptBox]:
-    """Yield the boxes that exporters may keep: all, without 8 pixels or 8/256 of each side, without any other border.
+    """Yield the boxes of pixels that exporters may keep, the likely ones first.
 
-    Depth Anything 3 cuts off 8/256. The likely come first.
+    They are the whole picture; without 8 pixels, or 8/256 of the side as Depth Anything 3, at each border; and without
+    any other border.
     """
     yield KeptBox("full", "every pixel", 0, 0)
     usual, side = TRIMS[0], min(width, height)
@@ -146,7 +147,7 @@ def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterato
 
 
 def _row_type(count: int) -> type[np.signedinteger[Any]]:
-    """Return the smallest type that numbers ``count`` rows, of which there may be hundreds of millions."""
+    """Return the smallest integer type for ``count`` rows, since there may be hundreds of millions."""
     return np.int32 if count <= np.iinfo(np.int32).max else np.int64
 
 
@@ -179,10 +180,10 @@ def _orders(
 
 
 def depth_layouts(count: int, depths: np.ndarray) -> list[Layout]:
-    """List the layouts that Depth Anything 3 may have made, by its depth maps: border, nearest 90 %, every n-th view.
+    """List the layouts that Depth Anything 3 may have made by its depth maps: border, nearest 90 %, every n-th view.
 
-    Only the order of ``depths [v,h,w]`` matters, so any scale will do. Empty if no choice of views has ``count``
-    pixels.
+    Only the order of the values of ``depths [v,h,w]`` matters, so their scale does not. Empty if no choice of views has
+    ``count`` pixels.
     """
     views, height, width = depths.shape
     inside = da3_box(width, height).pixels(width, height)
@@ -265,7 +266,7 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
 
 
 def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform: PhotoTransform) -> GridFit:
-    """Return the grid of photos that show it in a known way, at their ``size`` in memory."""
+    """Return the grid of photos that were resized or cropped by a known transform; ``size``: in memory."""
     x, y = (whole / part for whole, part in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
@@ -273,7 +274,7 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
 
 
 def square_grids(grid: GridFit) -> Iterator[GridFit]:
-    """Yield the square that pixelSplat and its relatives crop photos to, unless the grid is no larger."""
+    """Yield the square to which pixelSplat and similar models crop photos, unless the grid is no larger."""
     width, height = grid.size
     if min(width, height) >= SQUARE and (width, height) != (SQUARE, SQUARE):
         transform = resize_and_crop((width, height), (SQUARE, SQUARE))
@@ -282,7 +283,7 @@ def square_grids(grid: GridFit) -> Iterator[GridFit]:
 
 
 def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
-    """Return whether cameras of oblong pixels have square ones at the photos' size, which a model has stretched."""
+    """Return whether oblong pixels become square at the size of the photos, which means that a model stretched them."""
     if camera_file.focal is None:
         return False
     focals = camera_file.Ks[:, (0, 1), (0, 1)]
@@ -292,7 +293,10 @@ def _are_stretched(camera_file: CameraFile, size: Size) -> bool:
 
 
 def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> Iterator[GridFit]:
-    """Yield all other grid sizes that fit files and number of rows, the likely first; ``size``: of the photos."""
+    """Yield all other grid sizes that fit the files and the number of rows, the likely ones first.
+
+    ``size``: size of the photos.
+    """
     sizes = sizes_of(camera_file)
     camera_size = sizes[0] if len(sizes) == 1 else None
     if size is not None and camera_size is not None and camera_size != size:
@@ -314,7 +318,7 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
 
 
 def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator[GridFit]:
-    """Bring photos to the cameras' size, or cameras of uncropped pictures to the photos'."""
+    """Resize photos to the size of the cameras; if cameras are of uncropped pictures, crop the cameras instead."""
     cameras = to_cameras(camera_file, camera_size)
     for transform in (resize_to(size, camera_size), resize_and_crop(size, camera_size)):
         if max(transform.scale_x, transform.scale_y) > _MAX_ENLARGED:
@@ -328,7 +332,7 @@ def _between(camera_file: CameraFile, size: Size, camera_size: Size) -> Iterator
 
 
 def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransform]:
-    """Yield the ways to shrink the photos so that ``views`` of them have ``count`` pixels in all."""
+    """Yield the transforms that shrink photos so that ``views`` of them have ``count`` pixels in all."""
     crops: list[PhotoTransform] = []
     for trim in (0, *TRIMS):
         for per_pixel in PER_PIXEL:
@@ -346,7 +350,7 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
 
 
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
-    """Yield sizes up to ``size`` that have ``pixels`` pixels when ``trim`` is cut off at every border."""
+    """Yield sizes up to ``size`` with ``pixels`` pixels left after ``trim`` pixels are cut off at each border."""
     for width in range(max(1, pixels // size[1]), min(size[0], pixels) + 1):
         height, remainder = divmod(pixels, width)
         to = width + 2 * trim, height + 2 * trim
@@ -355,7 +359,7 @@ def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
 
 
 def patch_grids(size: Size) -> list[PhotoTransform]:
-    """List photo transforms of networks that take multiples of 14: each side rounded, or cropped, to a multiple."""
+    """List the transforms of networks that take multiples of 14: each side rounded, or cropped, to a multiple."""
     transforms = []
     for side in SIDES:
         for scale in (side / max(size), side / min(size)):

@@ -108,7 +108,7 @@ def read_view_major(rows: ProjectedRows) -> Layout | None:
 
 
 def _distance(u: np.ndarray, v: np.ndarray, pixels: np.ndarray, width: int) -> float:
-    """Measure the median distance of projected rows from their pixels, those behind the camera as ``width``."""
+    """Measure the median distance of projected rows from their pixels; behind the camera it is ``width``."""
     y, x = np.divmod(pixels, width)
     away = np.hypot(u - x - 0.5, v - y - 0.5)
     return float(np.median(np.where(np.isfinite(away), away, width)))
@@ -138,7 +138,7 @@ def _find_runs(rows: ProjectedRows) -> list[tuple[int, np.ndarray]] | None:
 
 
 def _increasing(costs: np.ndarray) -> list[int] | None:
-    """Choose increasing columns of ``[b,v]``, one a row, of the smallest sum; None if every choice is infinite."""
+    """Choose a column for each row of ``costs [b,v]``, in rising order, with the smallest sum; None if all are inf."""
     total, came_from = costs[0], []
     for cost in costs[1:]:
         best = np.minimum.accumulate(total)
@@ -154,7 +154,7 @@ def _increasing(costs: np.ndarray) -> list[int] | None:
 
 
 def _unevenness(u: np.ndarray, v: np.ndarray) -> float:
-    """Measure the distance of the typical step from one pixel to the right, pixels."""
+    """Measure how far the typical step between rows is from one pixel to the right, pixels."""
     du, dv = np.diff(u), np.diff(v)
     good = np.isfinite(du) & np.isfinite(dv)
     if good.sum() < max(8, 0.5 * len(du)):
@@ -185,10 +185,10 @@ def _run_end(rows: ProjectedRows, start: int, stop: int, view: int) -> int:
 
 
 def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Assign strictly increasing pixels to the rows of one view, projected to ``u [n]``, ``v [n]``; NaN if unknown.
+    """Assign strictly rising pixels to the rows of one view, projected to ``u [n]``, ``v [n]``; NaN if unknown.
 
-    The rows are cut into scanlines where u falls back; a scanline's row is the median of v, never decreasing. With
-    the row known, ``pixel - rank`` never decreases: isotonic regression finds it, and averages the jitter between
+    Rows are cut into scanlines where u falls back. The picture row of a scanline is the median of v, and never falls.
+    Given that row, ``pixel - rank`` never falls either: isotonic regression finds it, and averages the jitter between
     gaps.
     """
     count, finite = len(u), np.isfinite(u) & np.isfinite(v)
@@ -214,16 +214,16 @@ def assign_pixels(u: np.ndarray, v: np.ndarray, width: int, height: int) -> np.n
 
 
 def _never_falling(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Compute the nearest non-decreasing sequence, by weighted squares."""
+    """Compute the nearest non-decreasing sequence in the sense of weighted least squares."""
     from scipy.optimize import isotonic_regression  # loads slowly, and is seldom needed
 
     return np.asarray(isotonic_regression(values, weights=weights).x)
 
 
 def rough_scale(rows: ProjectedRows) -> float | None:
-    """Find the scale of the camera positions at which rows step by single pixels, without knowing any pixel.
+    """Find the scale of the camera positions at which rows step by single pixels; no pixel need be known.
 
-    None where they do in no view at any scale.
+    None if no scale gives such steps in any view.
     """
     views = len(rows.cameras)
     middles = (np.arange(views) + 0.5) / views * len(rows)
@@ -248,8 +248,8 @@ def rough_scale(rows: ProjectedRows) -> float | None:
 def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
     """Refine the scale, within a quarter of ``rough``, so that rows lie nearest to their assigned pixels.
 
-    The assignment hides small moves: so scales are tried in steps that move most rows by a quarter of a pixel at
-    most.
+    Small moves do not change the assignment, so scales are tried in steps that move most rows by at most a quarter of a
+    pixel.
     """
     chosen = np.unique(np.linspace(0, len(layout.views) - 1, TRIED_RUNS).astype(int))
     starts = [max(0, (len(layout.rows[b]) - STRETCH) // 2) for b in chosen]
@@ -280,9 +280,9 @@ def finer_scale(rows: ProjectedRows, layout: Layout, rough: float) -> float:
 
 
 def concentrated_scale(rows: ProjectedRows) -> float | None:
-    """Find the scale of the camera positions at which projections gather at the centres of pixels, in any order.
+    """Find the scale of the camera positions at which rows, in any order, project to pixel centres.
 
-    None where no scale within a factor of 30 gathers them beyond chance.
+    None if no scale within a factor of 30 concentrates them beyond chance.
     """
     views = len(rows.cameras)
     if not 1 < views <= MAX_SCALED_VIEWS or len(rows) < MIN_RUN * views:
@@ -299,7 +299,7 @@ def concentrated_scale(rows: ProjectedRows) -> float | None:
 
 
 def _gathered(rows: ProjectedRows, scales: np.ndarray, shown: int) -> np.ndarray:
-    """Measure how many more of some projections are near pixels' centres at each scale than by chance, deviations."""
+    """Measure how many more projections than by chance are near pixel centres at each scale, standard deviations."""
     cameras, views = rows.cameras, len(rows.cameras)
     points = rows.points[np.linspace(0, len(rows) - 1, shown // views).astype(np.int64)]
     K, E = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
@@ -325,10 +325,10 @@ def _gathered(rows: ProjectedRows, scales: np.ndarray, shown: int) -> np.ndarray
 
 
 def read_view_fastest(rows: ProjectedRows) -> Layout | None:
-    """Find the pixel of every row in a file that stores all views of a pixel together, if means lie in their pixels.
+    """Find the pixel of every row in a file that stores the views of a pixel together.
 
-    Every row lies in some pixel of every view. In the order of the file the true pixels only go forward, and within
-    a pixel the views do. The path through the views with the smallest steps wins; None if it goes back, or hardly
+    Every row lies in a pixel of every view. In the order of the file the true pixels only go forward, and so do the
+    views within a pixel. The path through the views with the smallest steps is chosen. None if it goes back, or hardly
     changes views.
     """
     count, views = len(rows), len(rows.cameras)
@@ -355,12 +355,12 @@ def read_view_fastest(rows: ProjectedRows) -> Layout | None:
 
 
 def _best_path(pixels: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Choose the view ``[n]`` of every row; also return whether its pixels then only go forward, from view to view."""
+    """Choose the view ``[n]`` of every row; also return whether the pixels then only go forward."""
     chosen = np.empty(len(pixels), np.int64)
     back = cheapest_views(pixels, np.zeros(pixels.shape, np.int8), chosen)
     return chosen, bool(back <= MAX_BACK * len(pixels) and np.mean(chosen[1:] != chosen[:-1]) >= MIN_CHANGES)
 
 
 def _pixels_in_views(rows: ProjectedRows, part: slice) -> np.ndarray:
-    """Find the pixel ``[r,c]`` int32 of some rows in each view; -1 outside."""
+    """Find the pixel ``[r,c]`` int32 of a selection of rows in each view; -1 outside."""
     return np.stack([rows.pixels(part, view)[0] for view in range(len(rows.cameras))], 1)

@@ -37,9 +37,9 @@ _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
 
 
 def read_grid(inputs: AlignmentInput, *, exact_frames: bool = False) -> list[Reading]:
-    """Read the rows as the pixels of a grid, by ever more effort until a reading fits; empty where none does.
+    """Read the rows as the pixels of a grid, with growing effort until a reading fits; empty if none does.
 
-    ``exact_frames``: only try cameras in the frame of their file and files without missing pixels, which is quick.
+    ``exact_frames``: try only cameras in the frame of their file, and files without missing pixels, which is quick.
     """
     readings: list[Reading] = []
     for round_readings in _rounds(inputs, exact_frames=exact_frames):
@@ -66,7 +66,7 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
 
 
 def _read_plain(inputs: AlignmentInput) -> list[Reading]:
-    """Read the rows in order under the stored cameras, as most files need; empty in doubt, for a longer search."""
+    """Read the rows in order with the stored cameras, which fits most files; empty in doubt, for a longer search."""
     cameras, count = inputs.cameras, len(inputs.gaussians)
     expected = len(cameras) * cameras.width * cameras.height
     if inputs.order not in ("auto", "view-major") or inputs.scale is not None or count != expected:
@@ -95,7 +95,7 @@ def _is_seen(inputs: AlignmentInput, layout: Layout) -> bool:
 
 
 def _without_same_labellings(inputs: AlignmentInput) -> AlignmentInput:
-    """Drop orders that only exchange views of one pose with equal photos, or without any: either is right."""
+    """Drop orders that only exchange views with equal poses and photos, since they are all right."""
     cameras, images, (first, *labellings) = inputs.cameras, inputs.images, inputs.labellings
     parts = cameras.viewmats[:, :3], cameras.Ks, images
 
@@ -128,7 +128,7 @@ def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Re
 
 
 def best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int) -> Reading:
-    """Score a layout in the frame of the cameras that fits it best, the simplest of those about as near."""
+    """Score a layout in the camera frame that fits it best; among frames about as good the simplest counts."""
     pairs = inputs.pairs(sample_layout(layout, samples))
     frames = candidate_similarities(pairs, inputs.cameras, scale=inputs.scale, effort=effort)
     readings = [score_layout(inputs, layout, frame, pairs) for frame in frames]

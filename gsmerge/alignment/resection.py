@@ -25,7 +25,8 @@ _SMALLEST_ERROR = 1e-6  # of the pixels' spread
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
     """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None if it fails.
 
-    By SQPnP (Terzakis and Lourakis 2020), near the best; the points must be at least three and lie near zero.
+    Uses SQPnP (Terzakis and Lourakis 2020), which is close to the optimum. Needs at least three points, which should
+    lie near zero.
     """
     try:
         solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
@@ -46,9 +47,9 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    Common intrinsics of the views are solved for as well, as many as ``free`` says: ONE_FOCAL, TWO_FOCALS or
-    ALL_INTRINSICS. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``; numpy.linalg.LinAlgError where the points do
-    not determine them.
+    Also solves for common intrinsics of the views, as many as ``free`` says: ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS.
+    Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine
+    them.
     """
 
     def fit(near_K: np.ndarray, near: np.ndarray) -> _Fit:
@@ -69,7 +70,7 @@ def _linearise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and the error.
 
-    By the turn and the shift of each camera, by the logarithms of focal lengths, and by the principal point.
+    The parameters are rotation and shift of each camera, the logarithms of focal lengths, and the principal point.
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
@@ -99,7 +100,7 @@ def _step(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.
 
 
 def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Apply changes of the logarithms of focal lengths, and of the principal point, as :func:`_linearise` has them."""
+    """Apply changes of the logarithms of focal lengths and of the principal point; see :func:`_linearise`."""
     K = K.copy()
     if len(change):
         K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]
@@ -110,9 +111,9 @@ def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
 def focal_uncertainty(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
 ) -> float:
-    """Estimate the standard error of a focal length, as a share of it, if pixels were off by one; inf for a plane.
+    """Estimate the relative standard error of a focal length for pixel errors of one; inf for points in a plane.
 
-    ``points [n,3]`` and ``pixels [n,2]`` are those of each view; that of the views with one focal length together.
+    ``points [n,3]`` and ``pixels [n,2]`` are given for each view. The error is that of one focal length for all views.
     """
     weight = 0.0
     for p, q, K, pose in zip(points, pixels, Ks, poses, strict=True):
@@ -126,10 +127,10 @@ def focal_uncertainty(
 
 
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
-    """Measure the median distance, pixels, of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera.
+    """Measure the median distance of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera, pixels.
 
-    Any 3 x 4 matrix is such a camera, with any intrinsics, in any frame. It is solved by the direct linear transform
-    with reweighting (Hartley and Zisserman 2004, section 7.1). 0 where there are too few points to decide.
+    A projective camera is any 3 x 4 matrix. It is solved by the direct linear transform with reweighting (Hartley and
+    Zisserman 2004, section 7.1). 0 if there are too few points to decide.
     """
     if len(points) < MIN_POINTS:
         return 0.0

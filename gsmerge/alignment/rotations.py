@@ -33,12 +33,11 @@ _DESCRIPTIONS = {
 
 
 def read_rotations(scene: Scene, quats: QuatChoice, turn: np.ndarray | None = None) -> Scene:
-    """Reinterpret a scene's rotations, read as wxyz so far, in another way; see :class:`ReadHints`.
+    """Reinterpret the rotations of a scene, read as wxyz before, in another way; see :class:`ReadHints`.
 
-    ``turn [3,3]`` is what the exporter turned its world by, rotations included; None: it did not.
-
-    Of the two square roots that "xyzw-root" has, the one whose thinnest axis follows the surface better is taken.
-    Where rows belong to no pixels, only "xyzw" changes anything.
+    ``turn [3,3]`` is the rotation of the world, and of the Gaussians with it, that the exporter applied; None: none.
+    For "xyzw-root", the one of two square roots is taken whose thinnest axis follows the surface better. Where rows
+    belong to no pixels, only "xyzw" has an effect.
     """
     if quats in ("auto", "wxyz") or not (scene.aligned or quats == "xyzw"):
         return scene
@@ -61,7 +60,7 @@ def from_xyzw(quats: np.ndarray) -> np.ndarray:
 
 
 def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute both square roots of rotations ``[n,4]`` wxyz: half the angle, and half a turn more."""
+    """Compute both square roots of rotations ``[n,4]`` wxyz: of half the angle, and that turned by half a turn."""
     unit = normalize(quats)
     unit = np.where(unit[:, :1] < 0, -unit, unit)
     half = normalize(unit + np.array((1, 0, 0, 0), unit.dtype))
@@ -69,9 +68,9 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[QuatChoice, str]:
-    """Choose the reading of rotations whose thinnest axes follow the surface normals, with a note; in doubt "wxyz".
+    """Choose the reading of rotations whose thinnest axes follow the surface normals; in doubt "wxyz".
 
-    ``turn`` as in :func:`read_rotations`.
+    Also returns a note. ``turn`` as in :func:`read_rotations`.
     """
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
@@ -99,7 +98,7 @@ def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[Quat
 
 
 def _camera_quats(scene: Scene, turn: np.ndarray | None) -> np.ndarray:
-    """Compute rotations ``[v,4]`` wxyz from each camera to the world; a turn of the world is undone before."""
+    """Compute rotations ``[v,4]`` wxyz from each camera to the world, with a turn of the world undone first."""
     rotmats = scene.cameras.viewmats[:, :3, :3].swapaxes(1, 2)
     return rotmat_to_quat(rotmats if turn is None else matmul(rotmats, turn.T)).astype(np.float32)
 
@@ -113,10 +112,11 @@ def _cosines(quats: np.ndarray, thinnest: np.ndarray, normals: np.ndarray) -> np
 def _is_root(
     scene: Scene, rows: np.ndarray, single: list[np.ndarray], thinnest: np.ndarray, normals: np.ndarray
 ) -> bool:
-    """Return whether the roots of the rotations as xyzw follow the surface far better than all other readings.
+    """Return whether the square roots of xyzw rotations follow the surface far better than all other readings.
 
-    The better of two is better by chance as well: so every other reading gets a second rotation, half a turn more.
-    ``single`` are readings ``[t,4]``, as stored first, as xyzw next; ``normals`` are rough, for a quick comparison.
+    The better of two rotations is better by chance as well, so every other reading is also given a second rotation,
+    half a turn further. ``single`` are readings ``[t,4]``, first as stored, then as xyzw. ``normals`` are rough, for a
+    quick comparison.
     """
     pairs = [square_roots(single[0]), *((quats, _half_a_turn_more(quats)) for quats in single)]
     roots = square_roots(single[1])
@@ -131,20 +131,20 @@ def _is_root(
 def _better_of(
     pair: tuple[np.ndarray, np.ndarray], thinnest: np.ndarray, normals: np.ndarray, threshold: float
 ) -> float:
-    """Average the cosine of the better of two rotations ``[n,4]``; with a threshold > 0, the share above it."""
+    """Average the cosine of the better one of two rotations ``[n,4]``, or the share above a threshold > 0."""
     better = np.maximum(*(_cosines(quats, thinnest, normals) for quats in pair))
     return float((better > threshold).mean() if threshold else better.mean())
 
 
 def _half_a_turn_more(quats: np.ndarray) -> np.ndarray:
-    """Turn rotations ``[n,4]`` by half a turn more about their own axes, or an arbitrary axis without an angle."""
+    """Turn rotations ``[n,4]`` by another half turn about their own axes; without an angle, about any axis."""
     length = np.linalg.norm(quats[:, 1:], axis=1, keepdims=True)
     axis = np.where(length > 0, normalize(quats[:, 1:]), np.array((0, 0, 1), quats.dtype))
     return np.concatenate([-length, quats[:, :1] * axis], 1)
 
 
 def _smooth_normals(scene: Scene) -> np.ndarray:
-    """Compute normals ``[n,3]`` of the surface at all pixels from means that are averaged around; 0 on overflow."""
+    """Compute surface normals ``[n,3]`` at all pixels from means averaged over neighbours; 0 on overflow."""
     v, h, w = scene.valid.shape
     weights = scene.valid[..., None].astype(np.float32)
     means = scene.gaussians.means.reshape(v, h, w, 3)
@@ -169,7 +169,7 @@ def _average_around(picture: np.ndarray) -> np.ndarray:
 
 
 def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute normals ``[t,3]`` of some pixels' surface; also return their rows and views."""
+    """Compute surface normals ``[t,3]`` at a sample of pixels; also return the rows and views of these."""
     v, h, w = scene.valid.shape
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
     step = spread_step(len(inner) // _SAMPLES, w - 2 * _STEP)

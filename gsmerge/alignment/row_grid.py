@@ -35,9 +35,9 @@ _Size = tuple[int, int, int]  # rows from pixel to pixel, pixels of a line, line
 
 
 def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
-    """Find the grid that all rows are the pixels of, and the cameras of its views; None where there is none.
+    """Find the grid whose pixels are the rows, and the cameras of its views; None if there is no such grid.
 
-    ``valid [n]`` bool. What an exporter trimmed is no part of the grid.
+    ``valid [n]`` bool. Pixels that an exporter trimmed are not part of the grid.
     """
     size = _find_size(gaussians, valid)
     if size is None:
@@ -54,7 +54,7 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
 def _calibrate_layouts(
     means: np.ndarray, valid: np.ndarray, layouts: Iterable[Layout]
 ) -> list[tuple[Layout, Calibration]]:
-    """Calibrate the cameras of layouts; leave out those whose pixels the rows are not."""
+    """Calibrate the cameras of layouts; leave out layouts whose pixels do not match the rows."""
     fits = []
     for layout in layouts:
         count = len(layout.views)
@@ -98,7 +98,7 @@ def _layouts(count: int, width: int, height: int, by_column: bool) -> Iterator[L
 
 
 def _find_size(gaussians: Gaussians, valid: np.ndarray) -> _Size | None:
-    """Find the size of the grid; None where rows have no period, or no camera shows them in their pixels."""
+    """Find the size of the grid; None if the rows have no period, or no camera shows them in their pixels."""
     fastest, periods = _find_periods(gaussians, valid)
     sizes: list[tuple[float, _Size]] = []
     for period in periods:
@@ -112,9 +112,10 @@ def _find_size(gaussians: Gaussians, valid: np.ndarray) -> _Size | None:
 
 
 def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) -> list[tuple[float, _Size]]:
-    """Find the most lines that a projective camera shows in their pixels, in every view.
+    """Find the largest number of lines that a projective camera shows in their pixels, in every view.
 
-    Also returns how far they lie from them: every other pixel of a line would do as well, but not be nearer.
+    Also returns the distance of the rows from their pixels: with every other pixel of a line it would be as small, not
+    smaller.
     """
     lines = len(means) // (step * width)
     for views in _divisors(lines):
@@ -142,7 +143,7 @@ def _divisors(number: int) -> list[int]:
 
 
 def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[int]]:
-    """Find after how many rows the next pixel comes, and the periods of the rows, which divide their number."""
+    """Find the step in rows between neighbouring pixels, and the periods of the rows, which divide their number."""
     means, count = gaussians.means, len(gaussians)
     lags = np.arange(1, min(_MAX_FASTEST, count // _MIN_SIDE**2) + 1)
     if not len(lags):
@@ -168,7 +169,10 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:
-    """Compute the spectrum of steps over ``lag`` rows, as a share of all, of values ``[n]`` that may be no numbers."""
+    """Compute the power spectrum, as shares of its sum, of differences over ``lag`` rows.
+
+    ``values [n]`` may have NaN.
+    """
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)
@@ -180,6 +184,6 @@ def _power(values: np.ndarray, lag: int) -> np.ndarray:
 
 
 def _median(values: np.ndarray) -> float:
-    """Return the median of the numbers among values; 0 where there are none."""
+    """Return the median of the values that are not NaN; 0 without any."""
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else 0.0

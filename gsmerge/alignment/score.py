@@ -82,19 +82,19 @@ def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray
 
 
 def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Apply matrices ``[t,3,3]``, one each, to vectors ``[t,3]``."""
+    """Apply matrices ``[t,3,3]`` to vectors ``[t,3]``, one to one."""
     return matmul(matrices, vectors[:, :, None])[..., 0]
 
 
 def candidate_similarities(
     pairs: Correspondences | None, cameras: Cameras, *, scale: float | None = None, effort: int = 2
 ) -> Iterator[Similarity]:
-    """Yield similarities that may map the cameras' frame to the Gaussians' frame, the most plausible first.
+    """Yield similarities that may map the frame of the cameras to that of the Gaussians, the plausible ones first.
 
     They are: the same frame; a scale; the frame of the first or the middle camera, alone, scaled, or scaled and
-    shifted, as exporters write; any similarity, from poses solved from the pixels. ``scale``: size of the Gaussians'
-    world in units of the cameras', if known. ``effort`` 0 solves for nothing (``pairs`` may be None), 1 for scale and
-    shift, 2 also for the rotation.
+    shifted; any similarity, from poses solved from the pixels. ``scale``: size of the Gaussians' world in units of the
+    cameras', if known. ``effort`` 0 solves for nothing (``pairs`` may be None), 1 for scale and shift, 2 also for the
+    rotation.
     """
     yield IDENTITY if scale is None else scale_by(scale, ", as given")
     rays = None if pairs is None or effort == 0 else ray_directions(pairs, cameras)
@@ -131,7 +131,10 @@ def candidate_similarities(
 def solve_frame(
     points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
 ) -> Similarity | None:
-    """Solve robustly for the scale (None if not positive) and shift that bring rotated points nearest to their rays."""
+    """Solve robustly for scale and shift that bring rotated points nearest to their rays.
+
+    The scale is None if it is not positive.
+    """
     rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [_apply(across, centres)[:, :, None]] + ([across] if shifted else [])
@@ -153,7 +156,7 @@ def solve_frame(
 
 
 def _solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose of each view from its pixels alone."""
+    """Solve for the pose of each view from only its own pixels."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
@@ -170,7 +173,7 @@ def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.nda
 
 
 def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
-    """Return whether one similarity fits about as well as a separate pose per camera; if not, the cameras are wrong."""
+    """Return whether one similarity fits about as well as a separate pose per camera; otherwise cameras are wrong."""
     viewmats = cameras.viewmats.copy()
     for view, pose in _solve_poses(pairs, cameras.Ks).items():
         viewmats[view] = pose
@@ -179,7 +182,7 @@ def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras
 
 
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
-    """Solve for one view's world-to-camera ``[4,4]`` in the Gaussians' frame, from its pixels alone."""
+    """Solve for one view's world-to-camera matrix ``[4,4]`` in the frame of the Gaussians from only its own pixels."""
     rows = np.flatnonzero(pairs.views == view)
     rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     if len(rows) < 6:
@@ -251,7 +254,7 @@ class Reading:
 
 
 def pixel_limit(width: int, height: int) -> float:
-    """Return the largest median distance, pixels, at which Gaussians count as those of their pixels."""
+    """Return the largest median distance, pixels, at which Gaussians still count as belonging to their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
@@ -282,7 +285,7 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
 
 
 def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
-    """Return whether a reading is near enough to be true, and far nearer than shuffled pixels."""
+    """Return whether a reading is near enough to its pixels, and far nearer than to shuffled pixels."""
     return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, SMALLEST_PX)
 
 
@@ -301,7 +304,7 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
 
 
 def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at some pixels; NaN where there are no photos."""
+    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at the given pixels; NaN without photos."""
     return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
@@ -324,10 +327,10 @@ class Alignment:
 
 
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
-    """Measure how far a sample of every view's own Gaussians projects from their pixels.
+    """Measure how far a sample of Gaussians in every view projects from their own pixels.
 
-    ``gaussians`` are V·H·W rows, assumed to be in view-major, row-major order; rows that are False in ``valid
-    [V·H·W]`` (or ``[V,H,W]``) are left out. ValueError for another number of rows.
+    ``gaussians`` are V·H·W rows in view-major, row-major order; rows that are False in ``valid [V·H·W]`` (or
+    ``[V,H,W]``) are left out. ValueError for another number of rows.
     """
     free_pages(vars(gaussians).values())
     return check_pairs(sample_pixels(gaussians, cameras, valid), cameras)

@@ -93,7 +93,7 @@ class _Source:
         return self.seen[grid.size]
 
     def inputs(self, grid: GridFit, *, photos: bool = True) -> AlignmentInput:
-        """Put rows, cameras and photos at the size of a grid together; without photos where only positions matter."""
+        """Bring rows, cameras and photos to the size of a grid; without photos if only positions matter."""
         images = NO_IMAGES
         if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
@@ -109,7 +109,7 @@ class _Source:
         )
 
     def fit(self, grids: Iterable[GridFit], *, photos: bool = True, exact_frames: bool = False) -> list[Fit]:
-        """Read the rows in each of some grids; leave out those whose pixels they are not."""
+        """Read the rows in each of the grids; leave out grids whose pixels do not match the rows."""
         fits = []
         for grid in grids:
             inputs = self.inputs(grid, photos=photos)
@@ -118,7 +118,7 @@ class _Source:
         return fits
 
     def choose(self, rounds: Iterable[Sequence[Fit]]) -> Fit | None:
-        """Choose a fit of the first round that has one, among those that compete in it; None where none has."""
+        """Choose a fit from the first round that has any; None if no round has one."""
         chosen = (choose_fit(fits, self.inputs) for fits in rounds)
         return next((fit for fit in chosen if fit is not None), None)
 
@@ -135,8 +135,7 @@ def align(
 ) -> AlignmentResult:
     """Find the pixel of every row; for rows without pixels, choose the camera poses that see them.
 
-    The size of the grid, the frame and the convention of the poses, and the transform of the photos are searched
-    too.
+    Also searches the size of the grid, the frame and convention of the poses, and the transform of the photos.
 
     Args:
         ply: The file's rows.
@@ -164,7 +163,7 @@ def align(
 
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
-    """Choose cameras that see rows without pixels; SceneError where none do, or the rows should have pixels."""
+    """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
     from gsmerge.alignment.explain import explain_count
     from gsmerge.alignment.unaligned import choose_cameras
     from gsmerge.alignment.upright import upright_rotation
@@ -186,7 +185,7 @@ def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequenc
 
 
 def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> AlignmentResult:
-    """Find pixels or cameras of rows that an exporter has centred, rescaled and turned; SceneError where that fails."""
+    """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
     for candidate in (grid, *square_grids(grid)) if len(source.photos) else ():
@@ -239,7 +238,7 @@ def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
 
 
 def _fit_other_sizes(source: _Source) -> Iterator[list[Fit]]:
-    """Yield fits of other sizes than the photos'; next, those in other conventions of the poses as well."""
+    """Yield fits of grids that differ in size from the photos, then the same in other conventions of the poses."""
     if source.order != "none":
         yield _fit_sizes(source, source.camera_file)
     if source.order not in MAY_BE_UNALIGNED:
@@ -249,7 +248,7 @@ def _fit_other_sizes(source: _Source) -> Iterator[list[Fit]]:
 
 
 def _conventions(camera_file: CameraFile) -> Iterator[CameraFile]:
-    """Yield the cameras with their poses read in each other convention."""
+    """Yield the cameras with poses read in each other convention."""
     for poses in other_conventions(camera_file.viewmats, camera_file.convention):
         yield replace(camera_file, viewmats=poses.viewmats, convention=poses.convention)
 
@@ -260,9 +259,9 @@ def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
 
 
 def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
-    """Fit a grid without missing pixels under slightly moved cameras; nothing where that does not fit.
+    """Fit a grid without missing pixels by slightly moved cameras; nothing if that does not fit.
 
-    Nothing, too, where another convention fits or the photos' colours disagree: views in the wrong order look the
+    Also nothing if another convention fits or the colours of the photos disagree: views in the wrong order look the
     same.
     """
     inputs = source.inputs(grid)
@@ -284,10 +283,10 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
 
 
 def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool = False) -> list[Fit]:
-    """Fit grids of other sizes than the photos', by positions alone: the likeliest of which some fit.
+    """Fit grids that differ in size from the photos, by positions only; return the likeliest group that fits.
 
-    Sizes that only the number of rows suggests are tried in the cameras' own frame first; with ``exact_frames`` all
-    are.
+    Sizes that follow only from the number of rows are tried in the frame of the cameras first; with ``exact_frames``
+    all are.
     """
     guesses: list[GridFit] = []
     candidates = other_grids(source.ply.info, camera_file, photo_size(source.photos))
@@ -303,7 +302,7 @@ def _fit_sizes(source: _Source, camera_file: CameraFile, *, exact_frames: bool =
 
 
 def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
-    """Make the result of rows that are pixels, with the cameras in the frame of the Gaussians."""
+    """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
     inputs, grid, best = source.inputs(fit.grid), fit.grid, fit.recovery.best
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
     frame, layout, count = best.frame, best.layout, len(grid.cameras)

@@ -18,21 +18,21 @@ def byte_colors(gaussians: Gaussians) -> np.ndarray:
 
 
 def base_colors(gaussians: Gaussians) -> np.ndarray:
-    """Return the base colours ``[n,3]`` of Gaussians, 0 to 1; 0 where they are no numbers."""
+    """Return the base colours ``[n,3]`` of Gaussians, 0 to 1; 0 for NaN."""
     with np.errstate(invalid="ignore"):
         return np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
 
 
 def shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:
-    """Return the colours ``[3,p+length]`` int16 of some ``pixels [p]`` of a uint8 ``photo [h,w,3]``, and none after."""
+    """Return the colours ``[3,p+length]`` int16 at ``pixels [p]`` of a uint8 ``photo [h,w,3]``, padded at the end."""
     shown = photo.reshape(-1, 3)[pixels].T.astype(np.int16)
     return np.concatenate([shown, np.full((3, length), OUTSIDE, np.int16)], 1)
 
 
 def place_stretch(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
-    """Find where the colours ``wanted [3,l]`` lie in ``shown [3,m]``, by absolute differences.
+    """Find the place of the colours ``wanted [3,l]`` in ``shown [3,m]`` by the sum of absolute differences.
 
-    Returns the place, from ``low`` on and below ``high``, its sum, and that of the next best place.
+    Returns the best place, from ``low`` on and below ``high``, its sum, and the sum of the next best place.
     """
     sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
     for offset in range(0, wanted.shape[1], _STEP):

@@ -44,7 +44,7 @@ class CameraCheck:
 
     @property
     def score(self) -> float:
-        """Score in [0, 1] to rank cameras by: the share seen, less where colours fit little better than at random."""
+        """Score in [0, 1] to rank cameras: the share seen, reduced where colours fit hardly better than chance."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
@@ -65,9 +65,9 @@ def check_cameras(
     *,
     foremost: bool = False,
 ) -> CameraCheck:
-    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any.
+    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``.
 
-    With ``foremost`` only the colours of those count that no other one hides.
+    Images may be None. With ``foremost`` only Gaussians that no other hides count for the colours.
     """
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
@@ -95,7 +95,7 @@ def check_cameras(
 
 
 def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return which of points ``[n]`` at pixels ``xy [n,2]`` are about as near as the nearest one of their cell."""
+    """Return which points ``[n]`` at pixels ``xy [n,2]`` are about as near as the nearest point of their cell."""
     if not len(xy):
         return np.zeros(0, bool)
     column, row = (xy // max(1, int(np.sqrt(_PER_CELL * area / len(xy))))).astype(np.int64).T
@@ -108,11 +108,11 @@ def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
 def choose_poses(
     gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
 ) -> tuple[Poses | None, CameraCheck, str | None]:
-    """Choose the pose convention under which the cameras see most Gaussians, with colours nearest to the photos.
+    """Choose the pose convention whose cameras see the most Gaussians, with the nearest colours.
 
-    ``cameras`` are in the usual convention; other arguments as for :func:`check_cameras`. Returns the poses, or None if
-    no other convention is clearly better than the usual one; the check of the chosen poses; and a note if others see as
-    much.
+    ``cameras`` are in the usual convention; other arguments are those of :func:`check_cameras`. Returns the poses, or
+    None if no other convention is clearly better than the usual one; the check of the chosen poses; and a note if other
+    conventions see as many.
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -132,7 +132,7 @@ def choose_poses(
 
 
 def find_padding(gaussians: Gaussians) -> np.ndarray:
-    """Return a mask ``[n]`` of equal rows at the origin, with which VolSplat pads its files."""
+    """Return a mask ``[n]`` of the equal rows at the origin with which VolSplat pads its files."""
     padding = np.zeros(len(gaussians), bool)
     rows = np.flatnonzero((gaussians.means == 0).all(1))
     if len(rows) >= _MIN_PADDING:
@@ -147,8 +147,8 @@ def choose_cameras(
 ) -> tuple[Cameras, CameraFile, list[str]]:
     """Choose cameras that see the Gaussians: unchanged, in another frame, or in another convention; with notes.
 
-    ``frames`` are those that a file names; exporters' usual frames are tried next. If none sees the Gaussians, a
-    SceneError gives ``why`` there are no pixels.
+    ``frames`` are the frames that a file names; the usual frames of exporters are tried next. If no camera sees the
+    Gaussians, a SceneError gives ``why`` there are no pixels.
     """
     inputs = replace(inputs, valid=inputs.valid & ~find_padding(inputs.gaussians))
     rows = inputs.gaussians, inputs.valid
@@ -177,7 +177,7 @@ def choose_cameras(
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: SceneError) -> None:
-    """Raise the SceneError ``why`` where photos are far from the colours of the rows that they should show."""
+    """Raise the SceneError ``why`` if the photos differ much from the colours of the rows that they should show."""
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
     if ratio > _MAX_FRONT_RATIO:
         found = (
@@ -188,17 +188,17 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
 
 
 def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
-    """Yield the frames that exporters leave rows in, at the cameras' own scale."""
+    """Yield the frames that exporters use for rows, at the scale of the cameras."""
     yield from list(candidate_similarities(None, inputs.cameras, effort=0))[1:]
     first = inputs.cameras.viewmats[0]
     yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
 
 
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
-    """Choose the frame of an exporter under which the colours fit the photos clearly better, or None.
+    """Choose the exporter's frame in which the colours fit the photos clearly better; None without one.
 
-    The true scale stands out: at any other the colours fit less. It is solved for where no frame stands out
-    at the cameras' own.
+    At any scale but the true one the colours fit less well. The scale is solved for if no frame stands out at the scale
+    of the cameras.
     """
     if not len(inputs.images):
         return None
@@ -226,7 +226,7 @@ def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: i
 
 
 def _stands_out(inputs: AlignmentInput, frame: Similarity) -> bool:
-    """Return whether a frame scores clearly higher than with scales beside its own."""
+    """Return whether a frame scores clearly higher than the same frame at nearby scales."""
     beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / _PEAK, _PEAK))
     return _score_frame(inputs, frame) > _PEAK_GAIN * max(beside)
 
@@ -241,7 +241,7 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
 
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
-    """Find the scale under which the colours are nearest to the photos."""
+    """Find the scale at which the colours are nearest to the photos."""
     best = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_SAMPLES)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))

@@ -58,7 +58,10 @@ class _Try:
 
 
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
-    """Return the rotation of rows that are centred, rescaled and turned upright, from any camera; None for others."""
+    """Return the rotation of rows that are centred, rescaled and turned upright; None for other rows.
+
+    It may be computed from any camera.
+    """
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
     few = means[:: max(1, len(means) // _ROUGH_SAMPLES)]
     if not len(few) or _uneven(few) > _ROUGH:
@@ -72,13 +75,13 @@ def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
 
 
 def _uneven(points: np.ndarray) -> float:
-    """Measure how far points ``[n,3]`` are from a median of 0 and a quantile of 1."""
+    """Measure how far points ``[n,3]`` are from having a median of 0 and a quantile of 1."""
     quantile = float(np.quantile(np.abs(points), _QUANTILE, axis=0).max())
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
 def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | None:
-    """Solve for the frame of upright rows from their colours in the photos; None where too few stretches agree."""
+    """Solve for the frame of upright rows from their colours in the photos; None if too few stretches agree."""
     for pixels, tries in _possible_orders(len(inputs.gaussians), inputs.cameras):
         frame = _agreed_frame(inputs, _match(inputs, tries, pixels), rotation)
         if frame is not None:
@@ -87,7 +90,7 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | 
 
 
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Try]]]:
-    """Yield pixels ``[p]`` of a picture, and places among them to search, for orders that ``count`` rows may have."""
+    """Yield the orders that ``count`` rows may have: pixels ``[p]`` of a picture, and the places to search."""
     views = len(cameras)
     inner, every = (trim_box(trim).pixels(cameras.width, cameras.height).reshape(-1) for trim in (TRIMS[0], 0))
     for per_pixel in _PER_PIXEL:  # row, column, layer, view, with pixels dropped
@@ -130,7 +133,7 @@ def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) ->
 
 
 def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Similarity) -> Similarity | None:
-    """Solve for the scale and shift that most stretches agree on; None where they are few."""
+    """Solve for scale and shift that the most stretches agree on; None if they are few."""
     stretches = np.unique(pairs.parts)
     views = np.array([pairs.views[pairs.parts == stretch][0] for stretch in stretches])
     if len(np.unique(views)) < _MIN_VIEWS:
@@ -165,7 +168,7 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
 
 
 def upright_error(ply: FileInfo, num_photos: int) -> SceneError:
-    """Make the SceneError for upright rows whose place no photo shows."""
+    """Make the SceneError for upright rows that no photo locates."""
     photos = "photos that do not show" if num_photos else "no photos that show"
     return SceneError(
         ply.path,

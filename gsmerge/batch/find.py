@@ -32,7 +32,7 @@ SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
 
 
 def scene_plys(scene: Path) -> list[Path]:
-    """List the files of a scene, which is one of them or their folder; none of a folder that reading it refuses."""
+    """List the files of a scene, given one of them or their folder; empty if the folder cannot be read as a scene."""
     with suppress(SceneError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
@@ -95,7 +95,7 @@ class _Search:
     num_empty: int = 0  # folders since the last scene
 
     def walk(self, folder: Path) -> Iterator[Path]:
-        """Yield the scenes in a folder, which is one itself if it has a file of a usual name."""
+        """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
         for inside, names, folders in self.folders(folder):
             if names is None:
                 scenes = [inside]
@@ -145,7 +145,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _is_scene(folder: Path, names: list[str]) -> bool:
-    """Return whether a folder with these names in it is a scene."""
+    """Return whether a folder that contains these names is a scene."""
     try:
         if SCENE_NAMES.isdisjoint(names) and folder.name != depth_maps.FRAMES:
             return False
@@ -183,7 +183,7 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
 
 
 def _listed(file: Path, search: _Search) -> Iterator[Path]:
-    """Yield the scenes of a list, relative to its folder; a missing one fails when it is read."""
+    """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):
         if "\0" in line:

@@ -42,9 +42,9 @@ class Run:
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
     """Make the results of all jobs in a folder, several at once; yield the record of each as it ends.
 
-    What is done already is yielded as skipped. Several runs may share a folder: what another one works on comes last.
-    Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray is not
-    installed.
+    Jobs that are done already are yielded as skipped. Several runs may share a folder; jobs that another run works on
+    come last. Close the generator to end the processes. SceneError if the folder cannot be written; UsageError if Ray
+    is not installed.
     """
     concurrency = choose_concurrency(jobs, options)
     run = Run(folder, check_folder(folder), concurrency.threads, options.overwrite)
@@ -76,9 +76,10 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
 
 
 def make_result(job: Job, run: Run, wait: bool) -> dict[str, Any] | None:
-    """Make a result, unless it is done, and record how that ended; return the record.
+    """Make a result unless it is done, record the outcome, and return the record.
 
-    ``wait``: for another process that works on it; otherwise None is returned. SceneError if nothing can be recorded.
+    ``wait``: wait for another process that works on the result; otherwise return None. SceneError if nothing can be
+    recorded.
     """
     with lock_result(run.folder, job.output, wait=wait) as begun:
         if begun is None:
@@ -124,12 +125,12 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def read_index(folder: Path, start: int) -> RecordIndex:
-    """Return the index of a folder's records, which a process keeps between the calls of a run."""
+    """Return the index of a folder's records, which each process keeps between the calls of a run."""
     return RecordIndex(folder)
 
 
 def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
-    """Record the failure of a job whose process died; None if another process works on it by now."""
+    """Record the failure of a job whose process died; None if another process works on it now."""
     with lock_result(run.folder, job.output, wait=False) as begun:
         if begun is None:
             return None
@@ -140,7 +141,7 @@ def record_loss(job: Job, run: Run, reason: str) -> dict[str, Any] | None:
 
 
 def remove_unfinished(run: Run, jobs: Iterable[Job]) -> None:
-    """Remove what is left of jobs whose processes were ended on purpose."""
+    """Remove the unfinished files of jobs whose processes were ended on purpose."""
     for job in jobs:
         with suppress(SceneError), lock_result(run.folder, job.output, wait=False) as begun:
             if begun is not None:

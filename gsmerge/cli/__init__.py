@@ -33,7 +33,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Make sure that stdout and stderr exist and take any character, which names of files may have."""
+    """Make sure that stdout and stderr exist and accept any character, since file names may have any."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
@@ -45,7 +45,7 @@ def _open_streams() -> None:
 def program() -> NoReturn:
     """Run :func:`main` as the installed program, and end the process.
 
-    Exit handlers run and output is flushed, but the interpreter is not taken apart, which takes time with gigabytes of
+    Exit handlers run and output is flushed. The interpreter is not shut down, which would take time with gigabytes of
     arrays.
     """
     code = main()

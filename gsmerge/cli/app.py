@@ -76,7 +76,7 @@ class Command(TyperCommand):
     """A command whose usage begins with its arguments, each as its help names it."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """List what the line of usage holds after the command's name."""
+        """List the parts of the usage line after the name of the command."""
         pieces = []
         for param in self.params:
             if param.param_type_name == "argument":
@@ -86,7 +86,7 @@ class Command(TyperCommand):
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with ``only`` one, which imports no other."""
+    """Make the application with all commands, or with ``only`` one, so that the others are not imported."""
     made = typer.Typer(
         name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
     )
@@ -137,7 +137,7 @@ def root(
 
 
 def _usage_message(error: Any) -> str:
-    """Describe wrong usage in one line, with the way to say what was meant."""
+    """Describe wrong usage in one line, with the correct way to write it."""
     place = PROGRAM if error.ctx is None else error.ctx.command_path
     message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
     parameters = [] if error.ctx is None else error.ctx.command.params
@@ -155,7 +155,7 @@ def _usage_message(error: Any) -> str:
 
 
 def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
-    """Write how to give a command a setting or a hint for which it has no option; None where it is neither."""
+    """Suggest ``--set`` or ``--hint`` for a setting that has no option of its own; None for other names."""
     if option == HELP_ALL:
         return f"{HELP_ALL}: expected a command before it, such as {PROGRAM} compact {HELP_ALL}"
     name = option.lstrip("-").replace("-", "_")
@@ -189,7 +189,7 @@ _SOON = 0.02  # seconds after which a signal is raised again that came where it 
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end a block as Ctrl-C does, without unfinished files; list the signals that came.
 
-    Signals that the caller has handled or ignored, as under nohup, stay so.
+    Signals that the caller handles or ignores, as under nohup, are left unchanged.
     """
 
     def again(number: int) -> None:
@@ -225,7 +225,7 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
 
 
 def _check_working_directory() -> None:
-    """Raise SceneError if there is no working directory: libraries fail in ways of their own without it."""
+    """Raise SceneError if the working directory does not exist, since libraries fail unclearly without it."""
     try:
         os.getcwd()
     except OSError as error:

@@ -126,7 +126,7 @@ def run_jobs(
     add: Callable[[dict[str, Any]], None],
     name: str = "scene",
 ) -> None:
-    """Run jobs, show progress, and hand each record to ``add``; ``name``: key of a record that names the job."""
+    """Run jobs, show progress, and pass each record to ``add``; ``name``: key in a record with the name of its job."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED
 

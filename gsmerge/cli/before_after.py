@@ -52,7 +52,7 @@ class BeforeAfter:
 
 
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
-    """Read the scenes of BEFORE (``files``) and AFTER, and the views of ``--targets``; place views where none are."""
+    """Read the scenes BEFORE (``files``) and AFTER, and the views of ``--targets``; place views if there are none."""
     from gsmerge.facts.place_cameras import add_views
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
@@ -75,7 +75,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Read the cameras, moved by the fit, that ``compact`` wrote into results or beside them; with notes."""
+    """Read the cameras that ``compact`` wrote into results or beside them, as the fit moved them; with notes."""
     import numpy as np
 
     from gsmerge.facts.prepare import scene_depth

@@ -160,7 +160,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
 
 
 def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
-    """Return the settings with the engine that was asked for; UsageError where it is not installed."""
+    """Return the settings with the requested engine; UsageError if it is not installed."""
     from gsmerge.settings.stages import Engine
 
     with opt.usage_errors():
@@ -173,7 +173,7 @@ def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
 
 
 def _check_scenes(args: opt.Args) -> None:
-    """Refuse several scenes with cameras for all, one that is missing, or is named twice."""
+    """Raise an error for several scenes with one ``--cameras``, a missing scene, or a scene given twice."""
     if len(args.scenes) == 1:
         return
     if args.cameras is not None:
@@ -188,7 +188,7 @@ def _check_scenes(args: opt.Args) -> None:
 
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
-    """Warn before anything is read if the scene is not likely to fit into memory; in blocks it does."""
+    """Warn before reading if the scene is not likely to fit into memory; not if it is compacted in blocks."""
     from gsmerge.facts.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks

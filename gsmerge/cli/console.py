@@ -29,7 +29,7 @@ def one_line(text: str) -> str:
 
 @contextmanager
 def opening_line(*, quiet: bool) -> Iterator[None]:
-    """Show at once on a terminal, unless ``quiet``, that a command runs: imports alone may take a second."""
+    """Show at once on a terminal, unless ``quiet``, that a command runs, since imports may take a second."""
     with suppress(OSError):
         if not quiet and sys.stderr.isatty():
             _opening.append(f"{OPENING:>16}")
@@ -71,17 +71,17 @@ def say_warning(text: str, *, quiet: bool = False) -> None:
 
 
 def _has_colors(stream: Any) -> bool:
-    """Return whether to use colours: on terminals, or with ``FORCE_COLOR``, unless there is ``NO_COLOR``."""
+    """Return whether to use colours: on terminals, or with ``FORCE_COLOR``, unless ``NO_COLOR`` is set."""
     return not os.environ.get("NO_COLOR") and bool(stream.isatty() or os.environ.get("FORCE_COLOR"))
 
 
 def _columns(stream: Any) -> int | None:
-    """Return the width of a stream's terminal; None where it has none."""
+    """Return the width of a stream's terminal; None if it is no terminal."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
 def wrap_line(line: str, columns: int | None) -> list[str]:
-    """Break a line between words at ``columns`` (None: never), indenting the further lines to the first value."""
+    """Break a line between words at ``columns`` (None: never), with further lines indented to the first value."""
     if columns is None or len(line) <= columns:
         return [line]
     label = re.match(r" *\S+(?: \S+)?  +|note: ", line)
@@ -106,7 +106,7 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print warnings in the block as one line each, without their place in the code."""
+    """Print warnings in the block as one line each, without file and line number."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:
         say(f"gsmerge: warning: {message}")
@@ -181,7 +181,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
 
 @contextmanager
 def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
-    """Keep Ray's messages about lost processes on separate lines of stdout in the block."""
+    """Keep Ray's messages about lost processes on their own lines of stdout in the block."""
     if engine != "ray":
         yield
         return
@@ -193,8 +193,8 @@ def separate_stdout(engine: str, *, quiet: bool) -> Iterator[None]:
 def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, str], None]]:
     """Show one bar for many runs on stderr, with the time left, and the last failure below it.
 
-    Without a terminal, a line for each run. Yields ``(text, done, failure) -> None``; ``failure`` is empty after a run
-    that succeeded.
+    Without a terminal it prints a line for each run. Yields ``(text, done, failure) -> None``; ``failure`` is empty
+    after a run that succeeded.
     """
     console = _terminal(quiet=quiet)
     if console is None:

@@ -16,7 +16,7 @@ from gsmerge.errors import UsageError
                  "world are joined. The last is written, as its name says: one of these, .usdc, .usda, .usdz, or a "
                  "folder named colmap."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
-                "those of a result, inside or beside it."),
+                "the cameras inside a result or beside it."),
     opt.changed("images", help="Photos of the cameras, which --drop sky needs, and whose names a COLMAP model has."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
     opt.changed("set", help="Any other setting of the written file, such as normals=false; may be repeated."),

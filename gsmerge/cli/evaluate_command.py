@@ -107,7 +107,7 @@ def evaluate(args: opt.Args) -> None:
 
 
 def _facts(args: opt.Args, pair: BeforeAfter, seconds: Mapping[str, float]) -> dict[str, dict[str, Any]]:
-    """Collect the facts of each file by name, with the costs of drawing it where they are asked for."""
+    """Collect facts about each file by name, with the cost of drawing if requested."""
     from gsmerge.measure.evaluate import INPUT, near_plane
     from gsmerge.measure.sizes import shrink_cameras
     from gsmerge.measure.speed import measure_costs
@@ -140,7 +140,7 @@ def _seconds_of(text: str) -> float:
 
 
 def _more_views(name: str, ply: GaussianFile, cameras: Cameras) -> str:
-    """Write what is known of a result that is measured as one of some views, but may be made of all."""
+    """Describe a result that is measured as one made from some of the views, but may be made from all."""
     from gsmerge.measure.visibility import share_outside
 
     views, outside = len(cameras), share_outside(ply.gaussians[ply.valid], cameras)

@@ -15,11 +15,11 @@ from gsmerge.errors import UsageError
 
 @opt.command(
     opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
-    opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as of compact."),
+    opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as compact takes it."),
     f"{opt.READING} k max_k superpixels budget effort recipe checkpoint set {opt.RUN}",
 )
 def extend(args: opt.Args) -> None:
-    """Add the views of scenes to a state, of which gsmerge compact makes a result of any size at any time."""
+    """Add the views of scenes to a state; gsmerge compact makes results of any size from it at any time."""
     start = perf_counter()
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):

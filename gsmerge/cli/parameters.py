@@ -60,12 +60,12 @@ class Args(SimpleNamespace):
         return bool(self.quiet or self.json)
 
     def given(self, names: Iterable[str]) -> dict[str, Any]:
-        """Return those of the named options that the user gave."""
+        """Return the subset of the named options that the user gave."""
         values = vars(self)
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
-        """Make settings of the classes ``kinds`` from options, ``--set`` and ``changes``; UsageError for wrong ones."""
+        """Make settings of classes ``kinds`` from options, ``--set`` and ``changes``; UsageError if one is wrong."""
         values = self.values(*kinds, but=changes) | changes
         settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
         with usage_errors():
@@ -75,7 +75,7 @@ class Args(SimpleNamespace):
             ]
 
     def values(self, *kinds: type, but: Collection[str] = ()) -> dict[str, Any]:
-        """Collect the user's settings of the classes ``kinds`` by flat name, leaving out the names in ``but``."""
+        """Collect the user's settings of the classes ``kinds`` by flat name, without the names in ``but``."""
         settings = {name: setting for kind in kinds for name, setting in flat_settings(kind).items() if name not in but}
         options = self.given(settings)
         chosen = parse_pairs("--set", vars(self).get("set") or (), settings)
@@ -114,7 +114,7 @@ class Args(SimpleNamespace):
     def files(self, scene: Path, *more: Path) -> SceneFiles:
         """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
-        Cameras and photos are the named ones, or those beside each.
+        Cameras and photos are those that the user named, or those beside each scene.
         """
         from gsmerge.scene.files import find_scene_files
 
@@ -123,7 +123,7 @@ class Args(SimpleNamespace):
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
-        """Read the scene of ``files``; ``defaults``: hints that the user may override."""
+        """Read the scene of ``files``; ``defaults``: hints to use unless the user gave others."""
         from gsmerge.scene.read import load_files
 
         return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
@@ -173,7 +173,7 @@ def option(
     """Declare an option of a command; ``kind`` bool makes a switch, a tuple lists the possible values.
 
     ``flags``: needed if they cannot be derived from the name. ``wording``: the default in words, if the library decides
-    it; ``more`` goes to Typer.
+    it; ``more`` is passed to Typer.
     """
     flags = flags or (f"--{name.replace('_', '-')}",)
     if more.get("metavar") is None:
@@ -188,7 +188,7 @@ def option(
 
 
 def setting_option(name: str, *flags: str, **more: Any) -> Parameter:
-    """Declare an option for a setting of the library, with its help and values; ``more`` goes to :func:`option`."""
+    """Declare an option for a setting of the library, with its help and values; ``more``: passed to :func:`option`."""
     declared = SETTINGS[name]
     kinds = [kind for kind in declared.kinds if kind is not NoneType]
     kind: Any = str if len(kinds) > 1 or (kinds and declared.words) else kinds[0] if kinds else declared.words
@@ -232,7 +232,7 @@ def _escape(help: str) -> str:
 
 
 def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Decorate a command with its parameters in the order of the help; ``rare`` ones show only in ``--help-all``."""
+    """Decorate a command with its parameters in the order of the help; ``rare`` options show only in ``--help-all``."""
     listed: dict[str, Parameter] = {}
     for parameter in (*parameters, "json quiet", *(["help_all"] if rare else [])):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
@@ -259,7 +259,7 @@ def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[
 
 
 def _show_all(context: typer.Context, value: bool) -> None:
-    """Print help with the options that it leaves out otherwise."""
+    """Print the complete help, including rare options."""
     if value:
         for parameter in context.command.params:
             parameter.hidden = False  # type: ignore[attr-defined]
@@ -296,8 +296,8 @@ _TABLE = (
                "beside the photos, and where these are transparent."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
-        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made of are "
-               "left out."),
+        option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
+               "are left out."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
     ),
     panel(

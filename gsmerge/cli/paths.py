@@ -38,14 +38,14 @@ def default_output(ply: Path) -> Path:
 
 
 def output_file(output: Path) -> Path:
-    """Return the file that an output names: of a folder called ``colmap`` that of a COLMAP model's points."""
+    """Return the file that an output names; for a folder ``colmap``, that is the points of the COLMAP model."""
     from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
 
     return output / PLACE / POINTS if output.name == FOLDER else output
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
-    """List the files that belong to an output if that is a COLMAP model; SceneError if it is another program's."""
+    """List the files of an output that is a COLMAP model; SceneError if another program wrote the model."""
     from gsmerge.io.formats.table import POINTS
 
     if output.name != POINTS:
@@ -56,7 +56,7 @@ def model_files(output: Path) -> tuple[Path, ...]:
 
 
 def is_index(output: Path) -> bool:
-    """Return whether an output is the index of a Streamed SOG, whose folder is made if missing."""
+    """Return whether an output is the index of a Streamed SOG; its folder is made if missing."""
     from gsmerge.io.formats.table import INDEX
 
     return output.name == INDEX
@@ -65,8 +65,8 @@ def is_index(output: Path) -> bool:
 def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
     """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
-    ``levels``: it may be an index of levels; ``cameras``: or a COLMAP model. UsageError for an unknown ending, a
-    missing package, or a version of ``.spz`` for another format.
+    ``levels``: an index of levels is allowed; ``cameras``: a COLMAP model is allowed. UsageError for an unknown ending,
+    a missing package, or a version of ``.spz`` with another format.
     """
     from gsmerge.io import output_format
 
@@ -78,7 +78,7 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
 
 
 def check_embedding(output: Path, budget: BudgetOptions) -> None:
-    """Raise UsageError for embedding cameras in a format without comments, or together with a size in bytes."""
+    """Raise UsageError if cameras cannot be embedded: no comments in the format, or a budget in bytes."""
     if output.suffix.lower() != ".ply":
         raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
     if budget.in_bytes:
@@ -88,11 +88,11 @@ def check_embedding(output: Path, budget: BudgetOptions) -> None:
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
-    """Raise UsageError for an output that is an input, exists without ``overwrite``, or comes twice.
+    """Raise UsageError for an output that is an input, exists without ``overwrite``, or is given twice.
 
-    ``inputs`` are files that are read, and folders of photos and COLMAP models, of which nothing is replaced.
-    SceneError where nothing can be written; missing folders are made with the first file in them, so that a run that
-    fails before leaves none.
+    ``inputs`` are files that are read, and folders of photos and COLMAP models; nothing in these is replaced.
+    SceneError if the output cannot be written. Missing folders are made with the first file in them, so a run that
+    fails before leaves no folders.
     """
     from gsmerge.io.cameras.read import find_cameras
 
@@ -143,7 +143,7 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
 
 
 def is_camera_file(path: Path) -> bool:
-    """Return whether a file holds cameras, such as ``compact`` writes beside a result."""
+    """Return whether a file is one of the camera files that ``compact`` writes beside results."""
     from gsmerge.io.cameras.read import read_cameras
 
     try:
@@ -159,7 +159,7 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
 
 
 def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
-    """Return the file of a checkpoint; empty if ``checkpoint`` is a name from the package."""
+    """Return the file of a checkpoint; empty if ``checkpoint`` names a checkpoint of the package."""
     return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
@@ -173,9 +173,9 @@ def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
-    """Raise UsageError for an output folder that holds files (unless ``overwrite``) or photos, or is not writable.
+    """Raise UsageError for an output folder with files (unless ``overwrite``) or photos, or without write access.
 
-    The folder is made with the first file in it, so that a run that fails before leaves none.
+    The folder is made with the first file in it, so a run that fails before leaves no folder.
     """
     _check_place(folder, folder, "a folder to write pictures to")
     try:

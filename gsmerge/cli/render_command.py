@@ -107,7 +107,7 @@ def _choose_kind(args: opt.Args) -> str:
 
 
 def _check_path(args: opt.Args) -> None:
-    """Refuse an unknown path, and options and outputs that do not go with one."""
+    """Raise UsageError for an unknown path, or for options and outputs that do not fit a path."""
     from gsmerge.measure.camera_path import parse_path
     from gsmerge.measure.preview import is_video
 

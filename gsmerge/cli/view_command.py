@@ -69,7 +69,7 @@ def view(args: opt.Args) -> None:
 
 
 def _open(page: Path) -> bool:
-    """Open a page in the browser; False without a screen, where a text browser would take the terminal."""
+    """Open a page in the browser; False without a screen, where a text browser would occupy the terminal."""
     if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         return False
     import webbrowser

@@ -68,7 +68,7 @@ SURPLUS = 1.03  # times an exact number of Gaussians: the faintest of what is to
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
-    """Cut the views of an aligned scene into ``count`` blocks; fewer, or one, where only many views ask for them."""
+    """Cut the views of an aligned scene into ``count`` blocks, or fewer if only the number of views asks for blocks."""
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
         fewer = options.blocks.blocks == "auto" and scene.num_gaussians <= WHOLE_GAUSSIANS
@@ -129,7 +129,7 @@ def compact_in_blocks(
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
-    """Yield each value with the choices of its record; add the record's seconds and notes to the current record."""
+    """Yield each value with the choices of its record; add the seconds and notes to the current record."""
     for value, record in outcomes:
         add_seconds(record.seconds)
         for text in record.notes:
@@ -177,7 +177,7 @@ def without_gaussians(prepared: Prepared) -> Prepared:
 
 
 def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield arguments for a call with each part: it, ``values`` and its number; then release what it has in files."""
+    """Yield arguments for one call per part: the part and its ``values``; then release its files."""
     for number, part in enumerate(parts):
         yield part, *values, number
         for scene in (part.prepared.scene, part.prepared.input_scene):
@@ -185,10 +185,10 @@ def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
 
 
 def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
-    """Fit all Gaussians that a block's views may see, and return the fitted ones that belong to block ``number``.
+    """Fit all Gaussians that the views of a block may see; return the fitted Gaussians of block ``number``.
 
-    ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians, as
-    a multiple of the number at the start.
+    ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians
+    divided by the number at the start.
     """
     (joined, owners), scene, plan = everything, part.prepared.scene, part.plan
     used = owners == number
@@ -204,17 +204,17 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
 
 
 def score_part(part: Part, gaussians: Gaussians, _: int) -> tuple[float | None, Covered | None]:
-    """Measure the PSNR (dB) of the whole result on a block's scored photos, and where the input covers them."""
+    """Measure the PSNR (dB) of the whole result on a block's scored photos, and on the pixels covered by the input."""
     measured = measure_result(gaussians, part.prepared, part.plan)
     psnr = None if measured is None else measured.psnr
     return psnr, measure_covered(part.before, gaussians, part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
-    """Fit the Gaussians at seams, which views of several blocks show, once more to the photos that show them.
+    """Fit the Gaussians at seams, which views of several blocks show, again to the photos that show them.
 
-    The other Gaussians stay as they are. Before this step a Gaussian was fitted beside its own block's version of the
-    neighbouring Gaussians, not beside the final ones.
+    All other Gaussians stay unchanged. Before this step a Gaussian was fitted beside its own block's version of the
+    neighbouring Gaussians, not beside the final version.
     """
     plan = next((part.plan for part in parts if part.plan.fit.fit != "none"), None)
     if plan is None:
@@ -244,7 +244,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
 
 
 def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views whose photos show many of them."""
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of them."""
     total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), prepare_splats(joined)
     views: list[list[int]] = [[] for _ in parts]
     for number, _, weights in _view_weights(splats, parts):
@@ -259,7 +259,7 @@ def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> 
 
 
 def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedScene:
-    """Join views of several scenes without Gaussians into one scene, whose photos are in a file if they are many."""
+    """Join views of several scenes without Gaussians into one scene; many photos are kept in a file."""
     total, cameras = sum(len(ids) for _, ids in chosen), chosen[0][0].cameras
     images, first = make_array((total, cameras.height, cameras.width, 3), np.float32), 0
     for scene, ids in chosen:
@@ -272,7 +272,7 @@ def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedSce
 
 
 def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yield block, view in it and the blending weights ``[n]`` of all Gaussians there, for each block's own views."""
+    """Yield block, view, and the blending weights ``[n]`` of all Gaussians in it, for each block's own views."""
     for number, part in enumerate(parts):
         own_views, repeated = set(part.block.own), part.prepared.repeated
         places = sorted({repeated[place] for place, view in enumerate(part.block.views) if view in own_views})
@@ -293,7 +293,7 @@ def take_views(scene: Scene, views: Sequence[int]) -> Scene:
 
 
 def free_scene(scene: Scene) -> None:
-    """Release the memory of a scene's arrays that :func:`gsmerge.runtime.memory.make_array` keeps in files."""
+    """Release the memory of those arrays of a scene that :func:`gsmerge.runtime.memory.make_array` put into files."""
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
@@ -310,10 +310,10 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
 def block_options(
     options: CompactOptions, scene: Scene, block: Block, factor: float, most: int | None
 ) -> CompactOptions:
-    """Return the options of one block: the whole scene's, with ``factor`` times the block's share of the Gaussians.
+    """Return the options of a block: those of the scene, with ``factor`` times the block's share of the Gaussians.
 
-    Cameras and exposures stay fixed. The block gets its share of the steps, too, and of those on half-size photos, so
-    that each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
+    Cameras and exposures stay fixed. The block also gets its share of all steps, and of the steps on half-size photos,
+    so each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
     ``superpixels`` and K give.
     """
     settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
@@ -332,9 +332,9 @@ def block_options(
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
-    """Return a mask ``[n]`` of means ``[n,3]`` whose nearest seeing view is one of the block's own views.
+    """Return a mask ``[n]`` of means ``[n,3]`` whose nearest view is one of the block's own views.
 
-    The views considered are those that share surfaces with the block.
+    Only views that see the mean, and share surfaces with the block, are considered.
     """
     sees = covisibility.weights[list(block.own)].sum(0) > 0
     sees[list(block.own)] = True
@@ -349,7 +349,7 @@ def join_reports(
     scores: Sequence[tuple[float | None, Covered | None]],
     options: CompactOptions,
 ) -> CompactReport:
-    """Report the whole scene: PSNR as the mean over blocks weighted by views, sums of seconds, all notes."""
+    """Report the whole scene: mean PSNR of the blocks weighted by views, sums of seconds, all notes."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
 
     def mean(values: Sequence[float | None]) -> float | None:
@@ -375,7 +375,7 @@ def join_reports(
 def _join_covered(
     parts: Sequence[Part], scores: Sequence[tuple[float | None, Covered | None]], sizes: Sequence[int]
 ) -> Covered | None:
-    """Average over blocks what their inputs cover; a block that is covered as a whole counts with all its pixels."""
+    """Average over blocks the scores of covered pixels; a fully covered block counts with all its pixels."""
     if all(covered is None for _, covered in scores):
         return None
     each = [

@@ -93,7 +93,7 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
 
-    More are built than are asked for, and the faintest of what is too many are left out. UsageError if the crop holds
+    More Gaussians are built than requested, and the faintest surplus ones are dropped. UsageError if the crop contains
     none of the scene.
     """
     options = plan.clean

@@ -69,10 +69,10 @@ class ConvertOptions:
 
 
 def convert_files(options: ConvertOptions) -> dict[str, Any]:
-    """Convert files of Gaussians and write the result, and its cameras where they are known: all files, or none.
+    """Convert files of Gaussians and write the result, with cameras if they are known: all files, or none.
 
     Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
-    UsageError for an ending that is not written, or sky without photos.
+    UsageError for an ending that cannot be written, or for dropping the sky without photos.
     """
     ending = output_format(options.output, options.spz_version, levels=True, cameras=True).ending
     with use_threads():
@@ -115,7 +115,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
 
 
 def conversion_line(document: dict[str, Any]) -> str:
-    """Describe a conversion in one line for people."""
+    """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
     kept = "" if after["num_gaussians"] == before else f" of {before:,}"
     beside = document["viewer_cameras"]
@@ -137,7 +137,7 @@ def _read_cameras(options: ConvertOptions) -> CameraFile | None:
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[Gaussians, dict[str, int]]:
-    """Crop the Gaussians and drop what is not wanted; return the rest, and how many were left out for which reason."""
+    """Crop the Gaussians and drop unwanted ones; return the rest, and the number dropped for each reason."""
     if "sky" not in options.clean.drops:
         return clean(gaussians, options.clean, None, lambda g: g)
     if stored is None or options.images is None:

@@ -27,7 +27,7 @@ Rebuild = Callable[[int], Candidate]
 
 
 def measure_bytes(levels: Sequence[Gaussians], file: Format, environment: Gaussians | None = None) -> int:
-    """Count the bytes of a file with some Gaussians, or at most those of all files of an index with several levels."""
+    """Count the bytes of a file with the given Gaussians; for an index with several levels, an upper bound."""
     first = levels[0]
     if file is PLY:
         return file_bytes(len(first), first.sh_degree)
@@ -41,9 +41,9 @@ def measure_bytes(levels: Sequence[Gaussians], file: Format, environment: Gaussi
 
 
 def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
-    """Make a candidate as large as its file may be: build it again until it is near, and leave out its faintest.
+    """Make a candidate as large as its file may be: rebuild it until it is near, then drop its faintest Gaussians.
 
-    Of an index of levels some of its Gaussians stand for coarser ones; see :func:`meet_bytes_of_levels`.
+    For an index of levels, a sample of the Gaussians stands for the coarser levels; see :func:`meet_bytes_of_levels`.
     """
     if plan.size is None or not plan.size.packed:
         return candidate
@@ -62,9 +62,9 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
 def meet_bytes_of_levels(
     candidate: Candidate, coarser: Sequence[Candidate], rebuild: Rebuild, prepared: Prepared, plan: Plan
 ) -> Candidate:
-    """Make the finest level as large as the size of an index leaves it room beside the coarser ones.
+    """Make the finest level as large as the bytes that the coarser levels of an index leave.
 
-    It is built again where these are smaller than those that stood for them, and left without its faintest Gaussians.
+    It is rebuilt if the coarser levels are smaller than expected, and otherwise loses its faintest Gaussians.
     """
     if plan.size is None or plan.size.levels == 1:
         return candidate
@@ -79,12 +79,12 @@ def meet_bytes_of_levels(
 
 
 def _with_coarser(gaussians: Gaussians, size: FileSize) -> list[Gaussians]:
-    """Return Gaussians, and some of them that stand for the coarser levels of the file."""
+    """Return the Gaussians, and samples of them that stand for the coarser levels of the file."""
     return [faintest_dropped(gaussians, len(gaussians) // LEVEL_FACTOR**level) for level in range(size.levels)]
 
 
 def drop_to_bytes(gaussians: Gaussians, coarser: Sequence[Gaussians], most: int, file: Format) -> Gaussians:
-    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; none may fit."""
+    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; this may be none."""
     low, high = 0, len(gaussians)
     kept, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):

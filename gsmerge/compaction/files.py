@@ -167,7 +167,7 @@ def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
 
 
 def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
-    """Move a result, its levels and its cameras into the frame in which they are written, with all their columns."""
+    """Move a result, its levels and its cameras into the output frame, and add columns that are written as zeros."""
     options = outputs.placement
     if not (options.asked or outputs.full_columns):
         return result
@@ -184,14 +184,14 @@ def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
 
 
 def _views_once(scene: Scene) -> list[int]:
-    """Return the views without further layers of a view, which have its name and camera."""
+    """Return the views without further layers, which have the name and camera of an earlier view."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
 
 
 def _other_cameras(path: Path) -> UsageError:
-    """Make the error of a file of cameras for viewers that belongs to another result."""
+    """Make the error for an existing camera file for viewers that belongs to another result."""
     remedy = "pass --overwrite to replace it, or name another with --output"
     return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
@@ -219,7 +219,7 @@ def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:
 
 
 def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
-    """Return a note if the scene is a result of gsmerge, by its header or with far fewer Gaussians than pixels."""
+    """Return a note if the scene is a result of gsmerge, by its header or by its small number of Gaussians."""
     scene, comments = loaded.scene, loaded.info.comments
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     few = is_from_gsmerge(comments) and not scene.aligned and scene.num_gaussians <= pixels / 2

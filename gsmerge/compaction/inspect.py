@@ -113,7 +113,7 @@ def _describe_file(ply: GaussianFile) -> dict[str, Any]:
 
 
 def _photo_notes(scene: Scene) -> list[str]:
-    """Say which photos do not look as their Gaussians, as a run would."""
+    """Describe which photos do not look like their Gaussians, as a run would."""
     with record_part(silent=True) as record:
         if scene.images is not None and len(scene) and len(scene.gaussians):
             compare_photos(PicturedScene.of(canonicalise(scene)[0], scene.images, scene.masks))
@@ -121,7 +121,7 @@ def _photo_notes(scene: Scene) -> list[str]:
 
 
 def _describe_auto(scene: Scene) -> dict[str, Any] | None:
-    """Say how many Gaussians an automatic budget takes where the depths of several views decide it; None elsewhere."""
+    """Describe the number that an automatic budget takes by the depths of several views; None for other scenes."""
     share, why = measured_share(canonicalise(scene)[0]) if scene.aligned else (None, "")
     return None if share is None else {"share": share, "num_gaussians": int(share * scene.num_gaussians), "why": why}
 
@@ -208,7 +208,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _ignored(scene: Mapping[str, Any]) -> list[str]:
-    """List the columns and elements that mean nothing here; those that hold the camera do."""
+    """List the columns and elements that mean nothing to gsmerge; elements with the camera are not among them."""
     used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
     elements = [name for name in scene["extra_elements"] if name not in used]
     return [*scene["extra_columns"], *(f"element {name}" for name in elements)]
@@ -223,7 +223,7 @@ def _describe_cameras(scene: Mapping[str, Any]) -> str:
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Write which row is which pixel, and how far from it; or why that is not known."""
+    """Describe which row is which pixel, and at which distance; or why that is unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return [f"alignment  not measured: {problem}"]
@@ -243,7 +243,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Write the shares that the views show, and the view that shows least."""
+    """Describe the shares that the views show, and the view that shows least."""
     views, seen = scene["coverage"], scene["sight"]
     if not views or seen is None:
         return []

@@ -24,13 +24,13 @@ NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
-    """Add zeros to harmonics that are fewer than ``count`` above degree 0."""
+    """Pad the harmonics above degree 0 with zeros to at least ``count``."""
     missing = max(0, count - gaussians.shN.shape[1])
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
 def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Similarity:
-    """Find the map from the scene's frame into that of its file; the ``cameras`` say where up is."""
+    """Find the map from the frame of the scene to that of its file; the ``cameras`` determine the upward axis."""
     if not options.moves:
         return IDENTITY
     rotation = np.eye(3)
@@ -46,9 +46,9 @@ def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Simila
 
 
 def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x between opposite ones.
+    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x if they are opposite.
 
-    Rodrigues' formula, for an axis and angle that the two vectors give.
+    Computed by Rodrigues' formula.
     """
     cosine = float((start * end).sum())
     if cosine < -1 + 1e-12:
@@ -87,7 +87,7 @@ def add_colmap(
 
 
 def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
-    """Name views by their files in a folder of photos, as COLMAP does; where it has others, by the cameras' file."""
+    """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file."""
     if photos is not None and photos.is_dir():
         with suppress(SceneError):
             return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]

@@ -172,7 +172,7 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
 
 
 def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
-    """Replace a candidate's Gaussians by some of them, and measure it again."""
+    """Replace a candidate's Gaussians by a subset, and measure it again."""
     with record_part() as record:
         psnr = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
@@ -199,7 +199,7 @@ def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
-    """Move the input views to the canonical ``cameras`` of a fit; themselves where it moved none."""
+    """Return the input views with the canonical ``cameras`` of a fit; unchanged if the fit moved none."""
     prepared = prepared.with_cameras(cameras)
     final = prepared.final_cameras()
     if final is prepared.input_scene.cameras:
@@ -208,7 +208,7 @@ def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
 
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
-    """Say how far each camera was moved."""
+    """Add a note on how far each camera was moved."""
     input_scene, cause = prepared.input_scene, "poses are free"
     if plan.settings["poses"] == "auto":
         cause = "the photos of some views agree only under other poses"
@@ -228,7 +228,7 @@ def measure_result(
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
-    """Score the input's own Gaussians; they cover the pixels that have a row where those are known."""
+    """Score the input's own Gaussians, over the pixels that have a row if rows have pixels."""
     if not prepared.reference.of_views:
         return None
     scene = prepared.input_scene
@@ -244,9 +244,9 @@ def _score_photos(
     plan: Plan,
     covered: Sequence[np.ndarray] | None,
 ) -> PhotoScore:
-    """Score Gaussians on the scored photos of ``views``, only a quarter of each unless a quality was asked for.
+    """Score Gaussians on the scored photos of ``views``: a quarter of each, or all if a quality is the target.
 
-    ``name``: of the stage in the record.
+    ``name``: name of the stage in the record.
     """
     with stage(name):
         near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None
@@ -255,7 +255,10 @@ def _score_photos(
 
 
 def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
-    """Score a result where the input, whose score is ``before``, covers the views; None where it covers them all."""
+    """Score a result over the pixels that the input covers; None if it covers all.
+
+    ``before`` is the score of the input.
+    """
     if before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr):
         return None
     after = measure_result(gaussians, prepared, plan, before.covered)
@@ -271,9 +274,9 @@ def make_result(
 ) -> CompactResult:
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
-    ``search`` are the facts of :meth:`gsmerge.compaction.search.CountSearch.facts`. The input is scored last,
-    when the kernels are compiled and memory is free again. The seconds, choices and notes of the
-    current record, which come before those of the candidates, enter the report.
+    ``search`` are the facts of :meth:`gsmerge.compaction.search.CountSearch.facts`. The input is scored last, when
+    memory is free again. The report contains the seconds, choices and notes of the current record, followed by those of
+    the candidates.
     """
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)

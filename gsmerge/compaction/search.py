@@ -121,7 +121,7 @@ def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
 
 
 def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
-    """Choose the number of Gaussians by the budget or the scene's own curve; None: ``superpixels`` and K decide."""
+    """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide."""
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
@@ -135,10 +135,10 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
 
 
 def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
-    """Measure PSNR, SSIM and, where its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
+    """Measure PSNR, SSIM and, if its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
 
-    The fits take ``steps``, whatever the plan says. PSNR and SSIM are those of blocks that the fits leave out, at
-    full size, or of the whole pictures that judge a scene without views; LPIPS needs whole pictures.
+    The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on blocks that the fits
+    leave out; for a scene without views, on the whole pictures that judge it. LPIPS needs whole pictures.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
@@ -173,7 +173,7 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
 
 
 def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:
-    """Return SSIM over the held-out windows inside the picture; of the whole without any, 0 if too small."""
+    """Return SSIM over the windows inside the mask, or over the whole picture without any; 0 if it is too small."""
     if min(mask.shape) < WINDOW:
         return 0.0
     border = WINDOW // 2
@@ -181,21 +181,20 @@ def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float
 
 
 def rungs(shares: Sequence[float], usual: int, least: int, most: int) -> list[int]:
-    """Return rising counts for measuring a curve: ``shares`` of the usual count, clipped to ``least`` and ``most``."""
+    """Return rising counts for measuring a curve: ``shares`` of the usual count, within ``least`` and ``most``."""
     return sorted({min(max(round(usual * share), least), most) for share in shares})
 
 
 def level_counts(finest: int, plan: Plan) -> list[int]:
-    """Return the numbers of Gaussians of the coarser levels of detail; a level has at least the least allowed count."""
+    """Return the numbers of Gaussians of the coarser levels; none is below the least allowed count."""
     counts = [finest // LEVEL_FACTOR**i for i in range(1, plan.levels)]
     return [count for count in counts if count >= plan.limits.min_count]
 
 
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
-    """Return the fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best.
+    """Return the fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best point.
 
-    Between points, which come by rising count, the curve is a straight line over the logarithm of
-    the count.
+    Points come by rising count. Between them the curve is linear in the logarithm of the count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -211,9 +210,8 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
 def curve_knee(points: Sequence[CurvePoint]) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    The quality is PSNR + 40 SSIM, in dB. The knee is the last count up to which it grows by 0.15 dB
-    per doubling, on a straight line between the slopes that lie midway between the points, which
-    come by rising count.
+    The quality is PSNR + 40 SSIM, in dB. The knee is the last count at which the quality grows by 0.15 dB per doubling.
+    Slopes are interpolated linearly between the midpoints of the points, which come by rising count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
@@ -236,8 +234,8 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
 def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
     """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    ``tried`` has the PSNR (dB) of at least one count, taken to rise with the count. A count that
-    was tried already ends the search.
+    ``tried`` has the PSNR (dB) of at least one count, assumed to rise with the count. If the result is in ``tried``,
+    the search ends.
     """
     above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
     below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)

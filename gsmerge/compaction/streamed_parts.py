@@ -31,7 +31,7 @@ class StreamedParts:
     measure: LeafErrors | None  # None: viewers choose by distance or by counts
 
     def noted(self, result: CompactResult) -> CompactResult:
-        """Return the result with what was decided in its report."""
+        """Return the result with the decisions about its parts in the report."""
         count = 0 if self.environment is None else len(self.environment)
         choices = {**result.report.choices, "streamed": {"errors": self.measure is not None, "environment": count}}
         return replace(result, report=replace(result.report, choices=choices))
@@ -73,6 +73,6 @@ def _sky(scene: PicturedScene) -> np.ndarray:
 
 
 def _fits(levels: list[Gaussians], environment: Gaussians, options: CompactOptions) -> bool:
-    """Return whether the files have the bytes that a budget asks for; True without such a budget."""
+    """Return whether the files have the number of bytes that a budget asks for; True without such a budget."""
     size = file_size(options.budget)
     return size is None or NEAR * size.num_bytes <= measure_bytes(levels, size.file, environment) <= size.num_bytes

@@ -146,7 +146,7 @@ def _make_scene(
     names: Sequence[str] | None,
     order: str,
 ) -> tuple[Scene, list[str]]:
-    """Join Gaussians and views to a scene in the given order; return it and notes."""
+    """Combine Gaussians and views into a scene in the given order; return the scene and notes."""
     if names is None or len(cameras) == 0:
         names = [f"view{view}" for view in range(len(cameras))]
     views = tuple(map(str, names))
@@ -175,7 +175,7 @@ def _to_numpy(name: str, values: Any) -> np.ndarray:
 
 
 def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
-    """Copy values ``[...,*tail]`` to ``[n,*tail]`` float32; means may stay float64."""
+    """Copy values ``[...,*tail]`` to ``[n,*tail]`` float32; means may be float64."""
     array = _to_numpy(name, values)
     if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
         expected = ", ".join(map(str, ("n", *tail)))
@@ -185,7 +185,10 @@ def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
 
 
 def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians of columns, transparent in rows that are not finite; return them, the finite rows and notes."""
+    """Make Gaussians from columns; rows that are not finite become transparent.
+
+    Returns the Gaussians, a mask of the finite rows, and notes.
+    """
     n = len(out["means"])
     for name, column in out.items():
         if len(column) != n:
@@ -250,7 +253,7 @@ def _check_values(out: dict[str, np.ndarray], valid: np.ndarray) -> None:
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
-    """Refuse colours far outside [0, 1], and name the range that they seem to have."""
+    """Raise SceneError for colours far outside [0, 1], and name the range that they seem to have."""
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
@@ -330,7 +333,7 @@ def _image_error(photos: np.ndarray, expected: str) -> SceneError:
 def _check_pixels(
     gaussians: Gaussians, cameras: Cameras, valid: np.ndarray, names: tuple[str, ...]
 ) -> tuple[Cameras, list[str]]:
-    """Check that Gaussians project into their own pixels; return cameras, moved a little, and notes."""
+    """Check that Gaussians project into their own pixels; return the cameras, slightly moved if needed, and notes."""
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
     if alignment.ok:
@@ -365,10 +368,10 @@ def _check_rotations(scene: Scene) -> None:
 
 
 def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
-    """Note quaternions whose w may come last: those of matrices usually have no negative w.
+    """Note quaternions whose w may come last, since those from matrices rarely have a negative w.
 
-    Depth Anything 3 writes w first and takes the sign from the last column: where the pixels are known, the surface
-    decides, otherwise the caller.
+    Depth Anything 3 writes w first and takes the sign from the last column. If pixels are known, the surface decides,
+    otherwise the caller.
     """
     first, last = scene.file_gaussians.quats[:, 0], scene.file_gaussians.quats[:, 3]
     if not last.min() >= 0 > first.min():

@@ -85,9 +85,9 @@ class _Pair:
 def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
-    ``views`` are those whose photos show the scene; the others stay. With ``always`` even small
-    errors are corrected. The median motion of the views is taken out. Returns None where no pose is
-    wrong, or the photos cannot tell.
+    ``views`` are the views whose photos show the scene; other views stay. With ``always`` even small errors are
+    corrected. The median motion of the views is subtracted. Returns None if no pose is wrong, or if the photos cannot
+    decide.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -111,8 +111,7 @@ def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = Fa
 def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
     """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
 
-    Higher harmonics are not turned: poses are off by a degree or two, and colours hardly change
-    with that.
+    Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
     """
     g, size = scene.gaussians, scene.pixels_per_view
     motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
@@ -174,9 +173,9 @@ def _level_of(scene: PicturedScene, pairs: list[tuple[int, int]], level: float, 
 
 
 def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, list[_Pair], list[_Pair]]:
-    """Improve poses by Gauss-Newton steps at one size; return them, and the pairs before and after.
+    """Improve poses by Gauss-Newton steps at one size; return the poses, and the pairs before and after.
 
-    With ``check`` there are few steps, and they end after the first one if it moves no view far.
+    With ``check`` there are few steps, and only one if it moves no view far.
     """
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     first: list[_Pair] = []
@@ -202,7 +201,7 @@ def _descend(level: _Level, viewmats: np.ndarray, *, check: bool) -> tuple[np.nd
 
 
 def _compare(level: _Level, viewmats: np.ndarray, pair: tuple[int, int]) -> _Pair:
-    """Compare the pixels of one view with another view's photo, under some poses."""
+    """Compare the pixels of one view with another view's photo, for the given poses."""
     (a, b), (height, width) = pair, level.pictures.shape[1:3]
     x, y, z, u, v, world = _look_up(level, viewmats, a, b)
     inside = (z > NEAR) & (u > BORDER) & (u < width - BORDER) & (v > BORDER) & (v < height - BORDER)
@@ -235,14 +234,14 @@ def _look_up(level: _Level, viewmats: np.ndarray, a: int, b: int) -> tuple[np.nd
 
 
 def _flows(level: _Level, pairs: list[_Pair]) -> np.ndarray:
-    """Return how far the pixels of each view moved, ``[v]`` pixels: the median over its pairs."""
+    """Return the median motion ``[v]`` of the pixels of each view over its pairs, pixels."""
     both = list(zip(level.pairs, pairs, strict=True))
     flows = [[comparison.flow for pair, comparison in both if view in pair] for view in range(len(level.start))]
     return np.array([np.median(view_flows) if view_flows else 0.0 for view_flows in flows])
 
 
 def _any_wrong(level: _Level, before: list[_Pair], last: list[_Pair], *, end: bool) -> bool:
-    """Return whether a view moved far and now disagrees less with the others, at the ``end`` much less."""
+    """Return whether a view moved far and now agrees better with the others, at the ``end`` much better."""
     far = _flows(level, last) > LIMIT_PX
     costs = np.zeros((2, len(far)))  # of each view, before and last
     for i, pairs in enumerate((before, last)):

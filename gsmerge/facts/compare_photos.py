@@ -85,8 +85,8 @@ class Shown:
 def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
     """Mend the photos of a canonical scene, and replace those that do not show it.
 
-    Returns the scene and the views whose photos a fit may use: none where most do not show the scene. The record gets
-    notes and the choices ``photos_changed`` and ``photos_left_out``.
+    Returns the scene and the views whose photos a fit may use; there are none if most photos do not show the scene. The
+    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
     """
     shown = show_photos(scene)
     changes = find_changes(scene, shown)
@@ -133,7 +133,7 @@ def _confirmed(
     change: PhotoChange, cover: np.ndarray | None, before: np.ndarray, after: np.ndarray, picture: np.ndarray,
     drawing: np.ndarray,
 ) -> PhotoChange:  # fmt: skip
-    """Keep of a change what brings the photo nearer to a drawing of the scene as well."""
+    """Return the parts of a change that also bring the photo nearer to a drawing of the scene."""
     outside = np.full(before.shape[:2], True) if cover is None else ~cover
     if change.tones is not None and not _difference(after, drawing, outside) < _difference(before, drawing, outside):
         change = replace(change, tones=None)
@@ -156,7 +156,7 @@ def show_photos(scene: PicturedScene) -> Shown:
 
 
 def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the colours ``[v,h,w,3]`` and opacities ``[v,h,w]`` of the pixels' Gaussians at a small size."""
+    """Return the colours ``[v,h,w,3]`` and opacities ``[v,h,w]`` of the Gaussians of the pixels at a small size."""
     shape = scene.valid.shape
     colors = scene.gaussians.sh0.reshape(*shape, 3)
     opacities = np.where(scene.valid, scene.gaussians.opacities.reshape(shape), 0).astype(np.float32)
@@ -171,7 +171,7 @@ def _shrink_colors(scene: Scene, size: tuple[int, int]) -> tuple[np.ndarray, np.
 
 
 def _draw(scene: Scene, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw some of the Gaussians in every view: pictures ``[v,h,w,3]`` and how opaque they are ``[v,h,w]``."""
+    """Draw a sample of the Gaussians in every view: pictures ``[v,h,w,3]`` and opacities ``[v,h,w]``."""
     level = max(1.0, max(scene.cameras.width, scene.cameras.height) / side)
     few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)
     drawn = photo_errors(few, blank, lambda _, image, left: (image.clip(0, 1), 1 - left))
@@ -180,7 +180,7 @@ def _draw(scene: Scene, side: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _change_small(shown: Shown, changes: Sequence[PhotoChange]) -> Shown:
-    """Mend the small photos; what is covered keeps no weight."""
+    """Mend the small photos; covered pixels get a weight of zero."""
     if not any(map(is_change, changes)):
         return shown
     photos = [change(photo, fill) for change, photo, fill in zip(changes, shown.photos, shown.pictures, strict=True)]
@@ -204,7 +204,7 @@ def _over_channels(combine: np.ufunc, image: np.ndarray) -> np.ndarray:
 
 
 def _find_bars(scene: PicturedScene, shown: Shown) -> tuple[float, float, float, float]:
-    """Find bars around all pictures (shares of the sides) within which they show the scene better; zeros without."""
+    """Find bars (shares of the sides) without which all pictures show the scene better; zeros if there are none."""
     height, width = scene.images.shape[1:3]
     none = (0.0, 0.0, 0.0, 0.0)
     sides = np.median([count_bars(image, BORDER) for image in scene.images], 0).astype(int)
@@ -235,9 +235,9 @@ def _is_reversed(shown: Shown) -> bool:
 
 
 def _is_reversed_alone(shown: Shown, view: int) -> bool:
-    """Return whether one photo is, whose red less blue also falls where that of its Gaussians rises.
+    """Return whether red and blue are exchanged in one photo: red less blue falls where that of its Gaussians rises.
 
-    No tone makes it do so.
+    No change of tone has this effect.
     """
     part = replace(shown, **{name: getattr(shown, name)[[view]] for name in ("photos", "pictures", "weights")})
     if not _is_reversed(part):
@@ -248,10 +248,10 @@ def _is_reversed_alone(shown: Shown, view: int) -> bool:
 
 
 def _find_tones(shown: Shown, flat: Sequence[np.ndarray]) -> list[np.ndarray | None]:
-    """Find the curves ``[3,256]`` that bring each photo to the Gaussians' tone; None where it is theirs.
+    """Find the tone curves ``[3,256]`` from each photo to its Gaussians; None for a photo whose tone is right.
 
-    Drawings have one for all photos. Small changes count only where some photo needs a clear one: models have a tone
-    of their own.
+    Drawn scenes have one curve for all photos. Small changes count only if some photo needs a clear one, since models
+    have a tone of their own.
     """
     views = range(len(shown.photos))
     if shown.drawn:
@@ -262,9 +262,9 @@ def _find_tones(shown: Shown, flat: Sequence[np.ndarray]) -> list[np.ndarray | N
 
 
 def _find_curves(shown: Shown, views: Sequence[int], counts: np.ndarray) -> tuple[np.ndarray | None, float]:
-    """Find the curves of some photos together, and the median change by them; None and 0 where none is needed.
+    """Find common tone curves of a group of photos, and the median change by them; None and 0 if none is needed.
 
-    They join the quantiles of both pictures, which neither wrong depth nor noise moves far.
+    The curves map quantiles of the photos to quantiles of the Gaussians, which wrong depth and noise hardly change.
     """
     if counts.sum() < MIN_PIXELS:
         return None, 0.0
@@ -281,7 +281,7 @@ def _find_curves(shown: Shown, views: Sequence[int], counts: np.ndarray) -> tupl
 
 
 def _curve(levels: np.ndarray, tones: np.ndarray) -> np.ndarray:
-    """Return the curve ``[256]`` float32 that joins the quantiles of two samples, and its ends in proportion."""
+    """Return the curve ``[256]`` float32 that maps the quantiles of one sample to another, proportional at its ends."""
     shares = (np.arange(LEVELS) + 0.5) / LEVELS
     x, y = (np.round(np.quantile(values.astype(np.float64), shares), 6) for values in (levels, tones))
     keep = np.concatenate([[True], np.diff(x) > 1 / 255]) & (x > 0) & (x < 1)
@@ -292,7 +292,7 @@ def _curve(levels: np.ndarray, tones: np.ndarray) -> np.ndarray:
 
 
 def _flat_regions(shown: Shown, view: int) -> np.ndarray:
-    """Return a mask ``[h,w]`` of large regions of one colour in a photo; in drawn scenes, of black ones."""
+    """Return a mask ``[h,w]`` of large regions of one colour in a photo; for drawn scenes, of black regions."""
     photo, kernel = shown.photos[view], np.ones((5, 5))
     spread = _over_channels(np.maximum, cv2.dilate(photo, kernel) - cv2.erode(photo, kernel))
     if shown.drawn:
@@ -302,7 +302,7 @@ def _flat_regions(shown: Shown, view: int) -> np.ndarray:
 
 
 def _large_parts(mask: np.ndarray, share: float, marked: np.ndarray | None = None) -> np.ndarray:
-    """Keep connected parts of at least a share of the picture, half of whose pixels are ``marked``."""
+    """Select connected parts of a mask that cover a share of the picture and have half of their pixels ``marked``."""
     count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     sizes = np.bincount(labels.ravel(), minlength=count)
     keep = sizes >= share * mask.size
@@ -315,7 +315,7 @@ def _large_parts(mask: np.ndarray, share: float, marked: np.ndarray | None = Non
 def _covered(
     picture: np.ndarray, photo: np.ndarray, clear: np.ndarray, flat: np.ndarray, *, drawn: bool
 ) -> np.ndarray | None:
-    """Return a mask ``[h,w]`` of what covers the scene in a photo; None where nothing does."""
+    """Return a mask ``[h,w]`` of pixels of a photo where something covers the scene; None if nothing does."""
     clipped = _over_channels(np.maximum, photo) > CLIPPED
     seen = (clear & (flat | ~clipped)).astype(np.float32)
     share = _box_means(seen[..., None])[..., 0]
@@ -335,7 +335,7 @@ def _covered(
 
 
 def _box_means(image: np.ndarray) -> np.ndarray:
-    """Average a picture ``[h,w,c]`` over squares of ``PATCH`` pixels about each; outside it is 0."""
+    """Average a picture ``[h,w,c]`` over squares of ``PATCH`` pixels around each pixel; 0 beyond the border."""
     half = PATCH // 2
     padded = np.pad(image.astype(np.float64), ((half + 1, half), (half + 1, half), (0, 0)))
     sums = padded.cumsum(0).cumsum(1)
@@ -344,7 +344,7 @@ def _box_means(image: np.ndarray) -> np.ndarray:
 
 
 def _leave_out(scene: PicturedScene, shown: Shown) -> tuple[PicturedScene, tuple[int, ...]]:
-    """Replace photos that do not show the scene by the Gaussians' own colours; return the views of the others."""
+    """Replace photos that do not show the scene by the Gaussians' own colours; return the views of the other photos."""
     views, odd = tuple(range(len(scene))), odd_photos(shown)
     if not odd:
         return scene, views
@@ -362,7 +362,7 @@ def _leave_out(scene: PicturedScene, shown: Shown) -> tuple[PicturedScene, tuple
 
 
 def odd_photos(shown: Shown) -> list[int]:
-    """Return the views whose photos show something else than the Gaussians."""
+    """Return the views whose photos show something other than the Gaussians."""
     height, width = shown.weights.shape[1:]
     least = LEAST_DRAWN if shown.drawn else LEAST
     level = max(1.0, max(width, height) / SIDE)

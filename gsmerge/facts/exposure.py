@@ -64,11 +64,11 @@ class _Pair:
 
 
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
-    """Equalise the exposure: divide each view's photo and its pixels' Gaussians by the view's gain, where needed.
+    """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, where needed.
 
-    ``views`` of the aligned scene are those whose photos show it. Clipped pixels of brighter photos no longer count
-    where another photo shows more. The record gets a note, and the choice ``exposure``: the gain of each view, red,
-    green and blue; where photos differ and stay, a note says why.
+    ``views`` are the views of the aligned scene whose photos show it. Clipped pixels of brighter photos no longer count
+    if another photo shows their surface unclipped. The record gets a note, and the choice ``exposure``: the gain of
+    each view in red, green and blue. If photos differ and are left unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene
@@ -94,7 +94,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], pairs: Sequence[_Pair], gains: np.ndarray) -> str:
-    """Say why photos are better left as they are; an empty text where they are not."""
+    """Return why photos should be left as they are, or an empty text."""
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE, ::COARSE] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if share_left(pairs, gains) > NEARER:
@@ -120,9 +120,9 @@ def share_left(pairs: Sequence[_Pair], gains: np.ndarray) -> float:
 
 
 def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
-    """Return whether the gains come from metering: whether they offset the brightness of what each photo shows.
+    """Return whether the gains come from metering, that is, offset the brightness of what each photo shows.
 
-    With fixed exposure, photos are brighter where gains are larger; metering makes all photos equally bright.
+    With fixed exposure, photos with larger gains are brighter; metering makes all photos equally bright.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
@@ -130,9 +130,9 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
 
 
 def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
-    """Measure how far each view's gains are from the mean of its two nearest views, RMS; 1 for random gains.
+    """Measure the RMS distance of each view's gains from the mean of its two nearest views; 1 for random gains.
 
-    ``gains [v,3]`` are logarithms, ``distances [v,v]`` those of the cameras.
+    ``gains [v,3]`` are logarithms; ``distances [v,v]`` are the distances between cameras.
     """
     nearest = _order_others(distances)[:, :2]
     away = gains - gains[nearest].mean(1)
@@ -141,7 +141,7 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Compute distances ``[v,v]`` between cameras: of the centres, canonical units, plus of the viewing directions."""
+    """Compute distances ``[v,v]`` between cameras: between centres in canonical units, plus between directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     both = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in both]
@@ -149,7 +149,7 @@ def camera_distances(cameras: Cameras) -> np.ndarray:
 
 
 def _order_others(distances: np.ndarray) -> np.ndarray:
-    """Return the other views ``[v,v-1]`` of each one, the nearest first."""
+    """Return for each view the other views ``[v,v-1]``, the nearest first."""
     apart = distances.copy()
     np.fill_diagonal(apart, -1)
     return np.argsort(apart, axis=1, kind="stable")[:, 1:]
@@ -164,7 +164,7 @@ class _Pixels:
     valid: np.ndarray  # [v,h*w]
 
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find pixels ``rows`` of a view in another that has the same surface there: which ones, and its pixels."""
+        """Find which of the pixels ``rows`` of a view have the same surface in another view, and its pixels."""
         width, height = self.cameras.width, self.cameras.height
         (pixels,), (z,) = project(self.means[view, rows], self.cameras[[other]])
         x, y = np.floor(np.nan_to_num(pixels, nan=-1.0).clip(-1, max(width, height))).astype(np.int64).T
@@ -208,9 +208,9 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
 
 
 def choose_partners(distances: np.ndarray) -> np.ndarray:
-    """Choose the views ``[v,p]``, rising, that each of v is compared with: all others, or some of many.
+    """Choose the views ``[v,p]``, rising, that each view is compared with: all others, or a selection of many.
 
-    The nearest share the most surfaces; those at equal steps of rank hold groups of cameras together.
+    The nearest views share the most surfaces; views at equal steps of rank connect groups of cameras.
     """
     order = _order_others(distances)
     if order.shape[1] > NEAREST + FARTHER:
@@ -236,7 +236,7 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray | None:
 def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
-    Without that, what is clipped everywhere (a sky) would be left to no photo.
+    Otherwise a surface that is clipped in all photos, such as a sky, would be masked in all of them.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
@@ -254,7 +254,7 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
 
 
 def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
-    """Divide photos and colours of Gaussians by the gains ``[v,3]``; what is known to be clipped leaves the masks."""
+    """Divide photos and colours of Gaussians by the gains ``[v,3]``; clipped pixels are taken out of the masks."""
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]

@@ -28,7 +28,7 @@ class PhotoChange:
     cover: np.ndarray | None = None  # [h,w] bool at a small size, what is replaced
 
     def __call__(self, photo: np.ndarray, fill: np.ndarray | None) -> np.ndarray:
-        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``fill [h,w,3]`` is what replaces covered pixels."""
+        """Mend a photo ``[h,w,3]`` in [0, 1] of any size; ``fill [h,w,3]`` replaces covered pixels."""
         if any(self.bars):  # as whole numbers, which OpenCV resizes alike on every processor
             levels = np.rint(255 * photo.clip(0, 1)).astype(np.uint8)
             photo = self.without_bars(levels, cv2.INTER_LINEAR) / np.float32(255)
@@ -41,7 +41,7 @@ class PhotoChange:
         return np.ascontiguousarray(photo, np.float32)
 
     def without_bars(self, picture: np.ndarray, interpolation: int) -> np.ndarray:
-        """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` uint8, and enlarge the rest to the size before."""
+        """Cut the bars off a picture ``[h,w]`` or ``[h,w,c]`` uint8, and enlarge the rest to the original size."""
         height, width = picture.shape[:2]
         inner = picture[self.inside(height, width)]
         return np.asarray(cv2.resize(inner, (width, height), interpolation=interpolation))
@@ -70,7 +70,7 @@ def look_up(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def _enlarge(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Resize a mask ``[h,w]`` to a larger picture's first two sides; its borders count to it."""
+    """Resize a mask ``[h,w]`` to a larger picture; pixels that it covers in part belong to it."""
     large = cv2.resize(mask.astype(np.uint8) * 255, shape[1::-1], interpolation=cv2.INTER_LINEAR)
     return np.asarray(large > 0)
 
@@ -100,7 +100,10 @@ def mend_photos(scene: PicturedScene, changes: Sequence[PhotoChange]) -> Picture
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange], fills: dict[int, np.ndarray]) -> LargePhotos:
-    """Return larger photos that are mended at each read; ``fills`` has the colours for covered pixels, by view."""
+    """Return larger photos that are mended whenever they are read.
+
+    ``fills`` has by view the colours of covered pixels.
+    """
 
     def read(view: int) -> np.ndarray:
         photo = large.read(large.ids[view])
@@ -117,7 +120,7 @@ def change_large(large: LargePhotos, changes: Sequence[PhotoChange], fills: dict
 
 
 def _note_changes(changes: Sequence[PhotoChange], names: Sequence[str]) -> None:
-    """Say which photos have another tone, and which are covered in part."""
+    """Note which photos have another tone, and which are covered in part."""
     toned = [view for view, change in enumerate(changes) if change.tones is not None]
     covered = [view for view, change in enumerate(changes) if change.cover is not None]
     choose(photos_changed=[names[view] for view, change in enumerate(changes) if is_change(change)])
@@ -155,7 +158,7 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
 
 
 def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Give pixels ``[h,w]`` that are not known the colour of the nearest one that is."""
+    """Fill unknown pixels ``[h,w]`` with the colour of the nearest known pixel."""
     if valid.all() or not valid.any():
         return picture
     _, labels = cv2.distanceTransformWithLabels(

@@ -32,7 +32,7 @@ MOST_CUT = 1 / 3  # of what views share: where blocks cut more, one piece is bet
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the usual number of blocks for an aligned scene; the most, where views decide it."""
+    """Return the usual number of blocks for an aligned scene, or an upper bound if the number of views decides."""
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
@@ -75,7 +75,7 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure which share of every view of an aligned scene each other view sees, occlusion considered."""
+    """Measure the share of every view of an aligned scene that each other view sees, with occlusion."""
     cameras, step = scene.cameras, max(1, -(-max(scene.cameras.height, scene.cameras.width) // GRID))
     rows, columns = (np.arange(step // 2, side, step) for side in (cameras.height, cameras.width))
     picked = (rows[:, None] * cameras.width + columns).reshape(-1)
@@ -114,7 +114,7 @@ class Frustums:
     farthest: np.ndarray  # [v] largest depth that is seen
 
     def reached_by(self, points: np.ndarray, *, hidden: bool = False) -> np.ndarray:
-        """Return the cameras that may see some of ``points [n,3]``, ascending; with ``hidden`` through surfaces."""
+        """Return the cameras, ascending, that may see any of ``points [n,3]``; with ``hidden`` through surfaces."""
         low, high = points.min(0), points.max(0)
         middle, radius = (low + high) / 2, float(np.sqrt(np.square(high - low).sum())) * 0.500001
         distances = matmul(self.planes[..., :3], middle[:, None])[..., 0] + self.planes[..., 3]
@@ -150,7 +150,7 @@ def split_points(points: np.ndarray, most: int) -> Iterator[np.ndarray]:
 def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return masks ``[c,n]`` of points ``[n,3]``: seen by each camera, and inside each camera's frustum.
 
-    Points behind the surfaces of ``depths [c,h,w]``, a coarse grid, are not seen.
+    Points behind the surfaces of the coarse depth maps ``depths [c,h,w]`` are not seen.
     """
     pixels, z = project(points, cameras)
     inside = (z > 0) & (pixels > 0).all(-1) & (pixels < (cameras.width, cameras.height)).all(-1)
@@ -164,7 +164,7 @@ def see(points: np.ndarray, cameras: Cameras, depths: np.ndarray) -> tuple[np.nd
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
     """Return a factor for each block's number of Gaussians that makes all blocks equally dense.
 
-    Views of other blocks also see what belongs to a block, but their Gaussians there are left out.
+    Views of other blocks also see the surfaces of a block, but their Gaussians there are dropped.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -181,8 +181,8 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> list[Block]:
     """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
-    ``weights [v,v]`` are symmetric, at least 0. Every view belongs to one block. A block also shares views of other
-    blocks, those with the largest weights, up to ``shared`` times the number of its own.
+    ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares the views of
+    other blocks with the largest weights, up to ``shared`` times the number of its own.
     """
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
@@ -195,9 +195,9 @@ def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> 
 
 
 def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
-    """Cut views into at most ``count`` blocks, as :func:`partition_views`, that see little of each other.
+    """Cut views into at most ``count`` blocks that see little of each other, as :func:`partition_views` does.
 
-    The number is halved while they cut more than a third of what the views share, down to one block.
+    The number is halved while more than a third of the shared weights is cut, down to one block.
     """
     while True:
         blocks = partition_views(weights, count)
@@ -208,10 +208,10 @@ def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
 
 
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
-    """Label views ``[v]`` with 0 to ``count - 1``, growing one block after the other from the rim of the views left.
+    """Label views ``[v]`` with 0 to ``count - 1``, growing blocks one by one from the rim of the unlabelled views.
 
-    A block starts with the view that has the weakest edges to the views left, and grows by the view that shares most
-    with the block.
+    A block starts with the view that has the weakest edges to the unlabelled views, and grows by the view that shares
+    most with the block.
     """
     num_views = len(weights)
     labels, left = np.full(num_views, -1), np.ones(num_views, bool)
@@ -232,7 +232,10 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Move views ``[v]`` between blocks while that weakens the edges between blocks, and keep sizes nearly equal."""
+    """Move views between blocks while that weakens the edges between blocks; sizes stay nearly equal.
+
+    ``labels [v]`` are the blocks of the views.
+    """
     labels, count = labels.copy(), int(labels.max()) + 1
     mean = len(labels) / count
     least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))
@@ -251,9 +254,9 @@ def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
-    """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that sees the point.
+    """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that see the point.
 
-    If no view sees the point, the owner is the nearest view with the point in its picture, else the nearest view.
+    If no view sees the point, it is the nearest view with the point inside its picture, or else the nearest view.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres, frustums = camera_centres(cameras.viewmats.astype(np.float64)), make_frustums(cameras, depths)

@@ -36,7 +36,7 @@ NO_VIEWS = (
 
 
 def add_views(scene: Scene) -> Scene:
-    """Keep the finite Gaussians, at least one, and place cameras where there are none; a note says what was done."""
+    """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note."""
     scene = keep_finite(scene)
     if len(scene) == 0:
         scene = _with_cameras(scene, place_cameras(scene.gaussians))
@@ -66,18 +66,18 @@ def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
 
 
 def add_judges(scene: Scene) -> Scene:
-    """Place a few small views by which results of a scene without views are judged."""
+    """Add a few small views on which results of a scene without views are judged."""
     return _with_cameras(scene, place_cameras(scene.gaussians, JUDGES, largest=JUDGE_SIZE, step=FEWER))
 
 
 def blank_pictures(scene: Scene) -> PicturedScene:
-    """Put black pictures that take no memory in the place of photos."""
+    """Replace the photos by black pictures that take no memory."""
     shape = len(scene), scene.cameras.height, scene.cameras.width, 3
     return PicturedScene.of(scene, np.broadcast_to(np.float32(0), shape), None)
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
-    """Render a canonical scene into its views, as its pictures."""
+    """Render a canonical scene into its views and use the renders as its pictures."""
     return PicturedScene.of(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
 
 
@@ -86,11 +86,11 @@ def place_cameras(
 ) -> Cameras:
     """Place cameras that see as much of the scene as possible.
 
-    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it,
-    looking everywhere. They are taken one by one, each time the one that shows most opacity which
-    none has shown so far, in pictures of a sample of the Gaussians. There are at most
-    ``num_views``, of square images that are larger for more Gaussians, at most ``largest`` pixels
-    per side; only every ``step``-th candidate is tried, on a smaller sample. Raises ValueError if there is no Gaussian.
+    Candidates stand on a sphere around the robust extent, looking in, and on a grid inside it, looking in all
+    directions. They are chosen one by one: each time the candidate that shows the most opacity not shown yet, in
+    pictures of a sample of the Gaussians. There are at most ``num_views``, with square images that grow with the number
+    of Gaussians up to ``largest`` pixels per side. Only every ``step``-th candidate is tried, on a smaller sample.
+    Raises ValueError if there is no Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
@@ -115,7 +115,7 @@ def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return middle ``[3]`` and half sides ``[3]`` of the box of most Gaussians."""
+    """Return centre ``[3]`` and half sides ``[3]`` of the box that contains most Gaussians."""
     low, high = np.quantile(means, EXTENT, axis=0)
     half = (high - low) / 2
     widest = float(half.max()) if half.max() > 0 else 1.0
@@ -144,7 +144,7 @@ def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix, OpenCV axes, of an eye and a viewing direction."""
+    """Return the world-to-camera matrix, OpenCV axes, of a camera position and a viewing direction."""
     up = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = np.cross(up, direction)
     x /= np.sqrt((x * x).sum())
@@ -166,7 +166,7 @@ def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.nda
 
 
 def _most_seen(shares: np.ndarray, num_views: int) -> list[int]:
-    """Choose candidates one by one, each adding most to what is seen; at least one."""
+    """Choose candidates one by one, each time the one that adds the most seen opacity; at least one."""
     seen = np.zeros(shares.shape[1], np.float32)
     chosen: list[int] = []
     for _ in range(num_views):

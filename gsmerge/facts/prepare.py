@@ -89,7 +89,7 @@ def scene_frame(scene: Scene) -> Frame:
 
 
 def scene_depth(scene: Scene) -> float:
-    """Measure the median depth of sampled Gaussians, each in its own view or in all that see it; 0 if none is seen."""
+    """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
     rows = _sample_rows(scene)
     means = scene.gaussians.means[rows].astype(np.float64)
     if scene.aligned:
@@ -130,7 +130,7 @@ class Reference:
 
     @property
     def of_views(self) -> bool:
-        """Whether the scene's own views have pictures that results are fitted to and measured on."""
+        """Whether the scene's own views have pictures both for the fit and for the scores."""
         return bool(self.fit_views and self.score_views)
 
 
@@ -162,7 +162,7 @@ class Prepared:
         return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
 
     def result_views(self) -> Scene:
-        """Return the input scene with the photos that a result should match: mended and in one exposure."""
+        """Return the input scene with the photos that a result should match: mended and in a common exposure."""
         return _with_photos(self.input_scene, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
@@ -175,10 +175,10 @@ class Prepared:
 
 @stage("prepare")
 def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
-    """Collect the facts about a scene that the plan needs; notes tell what was missing and replaced.
+    """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite
-    Gaussian, or there are images without cameras.
+    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite Gaussian, or if there are
+    images without cameras.
     """
     options = options or PrepareOptions()
     given, (views, repeated) = scene, distinct_views(scene)
@@ -193,7 +193,7 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
 def _prepare_pixels(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene whose rows belong to pixels: their own colours stand in for photos."""
+    """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
     scene, views = _with_pictures(canonical, add_row_colors)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views) if views else Reference(ROW_COLORS, every, every)
@@ -207,7 +207,7 @@ def _prepare_pixels(
 def _prepare_others(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene whose rows belong to no pixels: drawings of it stand in for photos, and judge nothing."""
+    """Prepare a scene whose rows belong to no pixels: without photos renders of it replace them, for the fit only."""
     scene, views = _with_pictures(canonical, blank_pictures)
     reference = Reference(PHOTOS, views, views)
     if given.images is None:
@@ -224,9 +224,9 @@ def _prepare_others(
 
 
 def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> tuple[PicturedScene, tuple[int, ...]]:
-    """Return a scene with photos that look as its Gaussians, and the views that a fit may use.
+    """Return a scene with a picture of every view, and the views whose photos a fit may use.
 
-    Where no photo shows the scene, it has what stands in for photos, and there are no such views.
+    If no photo shows the scene, its pictures are made by ``stand_in``, and there are no such views.
     """
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks))
@@ -236,7 +236,7 @@ def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> 
 
 
 def missing_notes(scene: Scene) -> list[str]:
-    """Return the note that a run will make on what stands in for views or photos, before it looks at any colour."""
+    """Return the note of a run on the replacement of missing views or photos, without comparing colours."""
     if len(scene) == 0:
         return [NO_VIEWS]
     return [NO_PHOTOS] if _lacks_photos(scene) else []
@@ -248,7 +248,7 @@ def _lacks_photos(scene: Scene) -> bool:
 
 
 def with_row_colors(scene: Scene) -> Scene:
-    """Return a scene with its rows' own colours where it has pixels and no photos, as :func:`prepare` puts them."""
+    """Return a scene with its rows' own colours as photos if it has pixels and no photos, as :func:`prepare` does."""
     if not _lacks_photos(scene):
         return scene
     with record_part(silent=True):
@@ -258,9 +258,9 @@ def with_row_colors(scene: Scene) -> Scene:
 
 @stage("prepare")
 def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
-    """Bring a scene without views into its canonical frame, and add pictures of it by which results are judged.
+    """Bring a scene without views into its canonical frame, and add pictures on which results are judged.
 
-    Nothing is fitted to these pictures: a fit to renders of the input shows other views worse. Raises ValueError if
+    Nothing is fitted to these pictures: a fit to renders of the input makes other views worse. Raises ValueError if
     there is no finite Gaussian.
     """
     finite = keep_finite(scene)
@@ -283,7 +283,7 @@ def photos_count_as_they_are(scene: Scene) -> bool:
 
 
 def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
-    """Return the given scene with the pictures and masks of its distinct views; itself where they are its own."""
+    """Return the given scene with the pictures and masks of its distinct views."""
     if canonical.images is given.images and canonical.masks is given.masks:
         return given
     masks = None if canonical.masks is None else canonical.masks[list(repeated)]
@@ -292,7 +292,7 @@ def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]
 
 
 def _split_unseen(scene: PicturedScene) -> tuple[PicturedScene, Gaussians]:
-    """Split a scene into what some view sees and the Gaussians that none does; none where it is all of them."""
+    """Split a scene into seen Gaussians and those that no view sees; if none is seen, keep all together."""
     seen = seen_weights(scene) > 0
     num_unseen = int((~seen).sum())
     note(f"{num_unseen if num_unseen < len(seen) else 0} Gaussians that no view sees are kept, merged")

@@ -32,7 +32,7 @@ DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, fr
 
 
 def add_row_colors(scene: Scene) -> PicturedScene:
-    """Put the colours of each view's own Gaussians in the place of a canonical scene's photos; a note says so."""
+    """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note."""
     kinds, shape = camera_kinds(scene.cameras), scene.valid.shape
     images, masks, num_drawn = np.zeros((*shape, 3), np.float32), np.full(shape, False), 0
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]  # the layers of a view have one camera
@@ -46,9 +46,9 @@ def add_row_colors(scene: Scene) -> PicturedScene:
 
 
 def _picture(scene: Scene, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make the picture ``[h,w,3]`` of one camera from its Gaussians, those of all of its ``views``.
+    """Make the picture ``[h,w,3]`` of a camera from the Gaussians of all of its ``views``, which are layers.
 
-    Also returns masks ``[h,w]`` of the pixels that are known, and of those that are drawn.
+    Also returns masks ``[h,w]`` of the pixels that are known, and of the pixels that are drawn.
     """
     part = subset(scene, views.tolist())
     tiled = tile_view(prepare(part.gaussians), **blank_photos(part.cameras).camera(0))
@@ -85,6 +85,9 @@ def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blurred_difference(first: np.ndarray, second: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Measure how far two pictures ``[h,w,3]``, blurred with ``weights [h,w]``, differ: ``[h,w]``, mean of channels."""
+    """Blur two pictures ``[h,w,3]`` and return their difference ``[h,w]``, averaged over the channels.
+
+    ``weights [h,w]`` are the weights of the pixels in the blur.
+    """
     apart = np.abs(blur((first - second) * weights[..., None], BLUR))
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))

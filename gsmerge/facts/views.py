@@ -24,15 +24,16 @@ def even_views(num_views: int, count: int) -> list[int]:
 
 
 def scored_views(num_views: int) -> list[int]:
-    """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced.
+    """Return view ids for scoring a whole scene: all, or ``MAX_SCORED_VIEWS`` evenly spaced views.
 
-    Rendering the unmerged input takes time in proportion to views and Gaussians: all views would be most of a run.
+    The time to render the unmerged input is proportional to views and Gaussians; with all views it would be most of a
+    run.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
 def report_views(num_views: int) -> list[int]:
-    """Return view ids for PSNR values that only the report shows."""
+    """Return view ids for PSNR values that are only shown in the report."""
     return pick_views(num_views, REPORT_VIEWS)
 
 
@@ -61,8 +62,7 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     """Return the ids of views that repeat no earlier view and, for every view, its index among these.
 
-    A view repeats another if camera, photo and Gaussians are the same; it then has that view's
-    place.
+    A view repeats another if camera, photo and Gaussians are equal; it then has the index of that view.
     """
     kinds = camera_kinds(scene.cameras)
     kept, places = list[int](), list[int]()

@@ -139,8 +139,8 @@ class ColorSystem:
 def solve_colors(system: ColorSystem, start: np.ndarray, options: FitOptions) -> tuple[np.ndarray, FitReport]:
     """Solve for offsets ``[n,3]`` of the base colours; return ``start`` if the held-out patches get worse.
 
-    A third of the steps with plain weights; then pixels that still fit badly count less, exposure
-    is compensated, and another third follows. The last ones are on all pixels.
+    The first third of the steps uses equal weights. In the second third, badly fitting pixels count less and exposure
+    is compensated. The last third uses all pixels, including the held-out patches.
     """
     steps = options.tuning.iterations
     third = steps // 3

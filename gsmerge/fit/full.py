@@ -30,9 +30,9 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    The result is the fitted Gaussians if they beat the start on held-out patches after the half-size steps, else it
-    is the start. The full-size steps then use every patch. ``survey``: of the Gaussians, if made already; ``fixed``:
-    mask ``[n]`` of Gaussians that stay as they are.
+    The result after the half-size steps is kept if it beats the start on held-out patches; otherwise the start is
+    returned. The full-size steps then use every patch. ``survey``: survey of the Gaussians, if made already; ``fixed``:
+    mask ``[n]`` of Gaussians that stay unchanged.
     """
     job, options, schedule, tail = run.job, run.job.options, Schedule(run), TailMean()
     state, optimiser = start_state(gaussians), make_optimiser(run)
@@ -77,12 +77,11 @@ def fit_full(
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:
-    """Return how much of its box each Gaussian may use, ``[n]`` in [0, 1], and its least log scale ``[n]``.
+    """Return the share ``[n]`` of its box that each Gaussian may use, and its least log scale ``[n]``.
 
-    The share is ``single_view_share`` to 1, by how many photos show the Gaussian: the effective
-    number of them, (sum w)^2 / sum w^2 of its blending weights w in them. The least scale is
-    ``min_scale`` pixels of the largest photo that it is nearest to (the 3D filter of Mip-Splatting);
-    none where no photo shows it.
+    The share lies between ``single_view_share`` and 1, by the effective number of photos that show the Gaussian: (sum
+    w)^2 / sum w^2 of its blending weights w in the photos. The least scale is ``min_scale`` pixels of the largest photo
+    that shows it nearest (the 3D filter of Mip-Splatting); there is none if no photo shows it.
     """
     photos_each = survey.sums**2 / np.maximum(survey.squares, 1e-12)
     box_shares = np.clip(photos_each - 1, rates.single_view_share, 1).astype(np.float32)
@@ -105,7 +104,7 @@ class TailMean:
         self.total += x
 
     def of(self, x: np.ndarray) -> np.ndarray:
-        """Return the mean with normalised quaternions; ``x`` itself if no steps with as many Gaussians were added."""
+        """Return the mean with normalised quaternions; ``x`` itself without steps with this number of Gaussians."""
         if self.total is None or len(self.total) != len(x):
             return x
         mean = self.total / self.count

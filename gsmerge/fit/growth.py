@@ -18,9 +18,9 @@ DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would co
 
 
 def grow_to(state: State, half: Photos, count: int) -> State:
-    """Drop faded Gaussians, then halve others until there are ``count``, or no visible one is left to halve.
+    """Drop faded Gaussians, then split others until there are ``count``, or no visible one is left to split.
 
-    ``half``: the half-size photos, whose errors choose which Gaussians are halved.
+    ``half``: the half-size photos, whose errors decide which Gaussians are split.
     """
     before, opacities = 0, state.splats.opacities
     if len(opacities):
@@ -31,11 +31,11 @@ def grow_to(state: State, half: Photos, count: int) -> State:
 
 
 def grow(state: State, masses: np.ndarray, count: int) -> State:
-    """Halve the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
+    """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
-    Each is halved at most once, so the number at most doubles, and what no photo shows is left
-    alone. The halves start with their parent's momentum, share of the box and least size; the old
-    ones come first and in order, the second halves after them.
+    Each is split at most once, so the number at most doubles. Gaussians that no photo shows are not split. Both halves
+    inherit momentum, share of the box and least size. First halves keep the rows of their parents, second halves are
+    appended.
     """
     num = min(count - len(state.x), int((masses > 0).sum()))
     if num <= 0:

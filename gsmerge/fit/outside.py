@@ -46,8 +46,8 @@ SCORED = 12  # views, at most, that the fog of a result is measured in
 def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
     """Place views outside the capture for a fit; only pixels where the start shows nothing have weights above 0.
 
-    They step back from the cameras of ``photos``, and are black and half as large, at least ``LEAST_WIDTH`` wide. None
-    where the start fills all of them.
+    Cameras step back from those of ``photos``. Pictures are black and half as large, at least ``LEAST_WIDTH`` wide.
+    None if the start fills all of them.
     """
     if len(start) == 0 or len(photos) == 0:
         return None
@@ -67,7 +67,7 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
 
 
 def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
-    """Step back from what the cameras see of means ``[n,3]``, one after the other, and turn about its middle."""
+    """Step back from the points ``[n,3]`` that each camera sees, and turn about their middle."""
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
     for number, view in enumerate(views):
@@ -92,14 +92,14 @@ def _blend_black(
 
 
 def _tiles_of(weights: np.ndarray) -> np.ndarray:
-    """Return a mask ``[lines,columns]`` of the tiles with pixels that count: the others need not be drawn."""
+    """Return a mask ``[lines,columns]`` of the tiles with weighted pixels, since other tiles need not be drawn."""
     height, width = weights.shape
     padded = np.pad(weights > 0, ((0, -height % TILE), (0, -width % TILE)))
     return np.asarray(padded.reshape(-(-height // TILE), TILE, -1, TILE).any((1, 3)))
 
 
 def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
-    """Return the gradients, by Gaussian, of a view's fog: the weighted mean of its opacity."""
+    """Return the gradients of each Gaussian for the fog of a view, which is the weighted mean of its opacity."""
     assert views.weights is not None
     weights = views.weights[view]
     tiled, transmittance = _blend_black(splats, views, view, _tiles_of(weights))

@@ -23,7 +23,7 @@ HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel n
 
 
 def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which is recorded."""
+    """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which goes into the record."""
     views = range(len(scene)) if views is None else views
     photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
@@ -67,8 +67,8 @@ def largest_scale(scene: Scene) -> float:
 def large_photos(scene: Scene, scale: float) -> Photos:
     """Read the photos at ``scale`` times the views' size, at most :func:`largest_scale`, one by one.
 
-    They are uint8, because they may take as much memory as the scene. Their low-pass is that of a viewer of this size.
-    Raises ValueError if the scene has no larger photos.
+    They are uint8, because they may take as much memory as the scene. Their low-pass filter is that of a viewer of this
+    size. Raises ValueError if the scene has no larger photos.
     """
     large, cameras = scene.large_photos, scene.cameras
     if large is None:
@@ -139,7 +139,7 @@ def exposure_gains(
 ) -> np.ndarray:
     """Return factors ``[v,3]`` float32 from renders to the photos' exposure, with geometric mean one.
 
-    Least squares on the weighted pixels, per view and channel; ones where no view differs by
+    They are least squares solutions on the weighted pixels, per view and channel; ones if no view differs by
     ``min_gain``.
     """
 

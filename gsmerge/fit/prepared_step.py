@@ -26,7 +26,7 @@ OF_STEP = {"camera": CAMERA, "background": 3, "loss_weights": 2, "rates": 14, "l
 
 
 def is_prepared(state: State) -> bool:
-    """Return whether the steps of a state can be taken here."""
+    """Return whether prepared steps are possible for a state."""
     return len(state.x) > 0 and state.splats.shN.shape[1] == 0 and not state.fixed.any()
 
 
@@ -60,12 +60,12 @@ class StepTables:
         self._make_room(1)
 
     def _make_room(self, count: int) -> None:
-        """Make buffers for so many intersections; tables with the old ones are dropped."""
+        """Allocate buffers for ``count`` intersections; tables with the old buffers are dropped."""
         self.tables.clear()
         self.room = {"flatten_ids": np.empty(count, np.int32), "slots": np.empty((count, SUMS), np.float32)}
 
     def _table(self, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray) -> FilledTable:
-        """Return the table of a photo's size, with the photo, its weights and the opacities that are drawn."""
+        """Return the table for the size of a photo, filled with the photo, its weights and the drawn opacities."""
         height, width = weight.shape
         if weight.shape not in self.tables:
             columns, lines, line = -(-width // TILE), -(-height // TILE), image_loss.room_of(width)
@@ -92,8 +92,8 @@ class StepTables:
     ) -> float | None:
         """Take step ``number`` on a photo ``[h,w,3]`` with weights ``[h,w]`` and return the sum of squared errors.
 
-        ``drawn [n]`` are the opacities that are drawn; ``numbers``: camera, background, and the constants of loss and
-        optimiser. None, and nothing is changed, where the view has so many intersections that lists must be cut.
+        ``drawn [n]`` are the opacities to draw; ``numbers``: camera, background, and the constants of loss and
+        optimiser. Returns None and changes nothing if the view has so many intersections that lists must be cut.
         """
         for name, values in numbers.items():
             self.gaussians[name][:] = values

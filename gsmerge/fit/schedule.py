@@ -170,7 +170,8 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
 def affordable_steps(seconds: float, run: FitRun) -> int:
     """Return how many steps fit into the time budget, given the ``seconds`` of the first PROBE steps at half size.
 
-    A step at full size costs up to three times as much, one on larger photos more by their pixels.
+    A step at full size costs up to three times as much; a step on larger photos costs more in proportion to their
+    pixels.
     """
     budget, coarse = run.job.options.time_budget, run.half_part
     assert budget is not None

@@ -47,10 +47,11 @@ def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], opti
 
 
 def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
-    """Leave out Gaussians that no photo shows, and fit the rest to the photos; without a fit in a draft, keep all.
+    """Drop Gaussians that no photo shows, and fit the rest to the photos.
 
-    Where the full fit does not make held-out patches of the photos better, the colour fit is tried.
-    Views from outside are added to the job. The report is None if nothing was asked for.
+    If the full fit does not improve held-out patches of the photos, the colour fit is tried. Views from outside are
+    added to the job. If the options need no photos, as in drafts without a fit, all Gaussians are returned and the
+    report is None.
     """
     options = job.options
     if not options.needs_photos:  # it costs as much as all that was done before
@@ -100,10 +101,10 @@ def _fit_colors(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport, close: float) -> FitResult:
-    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos lost.
+    """Return the fitted Gaussians, or their start if held-out patches hardly gained and whole photos got worse.
 
-    Gaussians that were fitted already are where steps of the default size only scatter. After a
-    gain of ``close`` dB or more the photos are not compared.
+    Further steps of the default size only scatter Gaussians that are fitted already. After a gain of ``close`` dB or
+    more the photos are not compared.
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report

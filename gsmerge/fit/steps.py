@@ -108,7 +108,7 @@ class Optimiser:
     def _take_prepared(
         self, state: State, step: Step, weight: np.ndarray, opacities: np.ndarray | None
     ) -> float | None:
-        """Take a step in few calls and return its error; None where it has to be taken by single ones."""
+        """Take a step in few calls and return its error; None if it has to be taken by single calls."""
         if self.poses is not None or not is_prepared(state):
             return None
         with use_threads() as threads:
@@ -140,7 +140,7 @@ class Optimiser:
         }
 
     def clear_fog(self, state: State, step: Step, view: int) -> None:
-        """Take one Adam step against fog: opacity that a view from outside shows where the start was empty."""
+        """Take one Adam step against fog: opacity in a view from outside where the start was empty."""
         assert self.run.job.outside is not None
         self._move(state, fog_gradients(state.splats, self.run.job.outside, view), step)
 

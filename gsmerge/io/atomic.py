@@ -118,7 +118,7 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
 
 
 def _make_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder and those above it, and yield each that was missing."""
+    """Make a folder and its parents, and yield each that was missing."""
     if os.path.lexists(folder):
         return
     yield from _make_folder(folder.parent)
@@ -132,7 +132,7 @@ def _make_folder(folder: Path) -> Iterator[Path]:
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
-    """Give each temporary file its name, folder by folder; an interrupt takes effect after the last."""
+    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last."""
     try:
         for folder, group in groupby(files, lambda file: file[1].parent):
             for temporary, target in group:
@@ -145,7 +145,7 @@ def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Let one process at a time into such a block of a folder, and others wait, where the system can lock folders."""
+    """Let one process at a time into the block for a folder; other processes wait, if the system can lock folders."""
     descriptor = None
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
@@ -186,8 +186,7 @@ def temporary_path(path: Path) -> Path:
 def _place() -> str:
     """Return a hash of the machine and the container, within which process numbers are unique.
 
-    Host names repeat among containers, and so do the numbers of their name spaces: Linux's number of this boot is
-    random.
+    Host names and the numbers of name spaces repeat among containers, so Linux's random boot number is used as well.
     """
     names = f"{socket.gethostname()} {uuid.getnode()}"
     with suppress(OSError):
@@ -196,7 +195,7 @@ def _place() -> str:
 
 
 def remove_stale(folder: Path) -> None:
-    """Remove the temporary files in a folder whose process has ended; of other machines after a week."""
+    """Remove temporary files in a folder whose process has ended; files of other machines after a week."""
     with suppress(OSError), os.scandir(folder) as entries:  # another may be cleaning as well, or may not
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)

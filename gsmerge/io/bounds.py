@@ -52,7 +52,7 @@ class ReadBudget:
         return _FREE_MEMORY + _MEMORY_PER_BYTE * self.file_bytes
 
     def check_memory(self, num_bytes: float, what: str) -> None:
-        """Raise SceneError if ``what``, which takes ``num_bytes`` at once, is more than the file allows."""
+        """Raise SceneError if ``what`` takes ``num_bytes`` at once, and the file allows less."""
         if not num_bytes <= self.memory:
             problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB")
@@ -66,12 +66,12 @@ class ReadBudget:
 
 
 def read_budget(path: Path) -> ReadBudget:
-    """Return the budget of a file; SceneError as of :func:`check_file`."""
+    """Return the budget of a file; SceneError as in :func:`check_file`."""
     return ReadBudget(path, check_file(path))
 
 
 def parse_json(text: str, budget: ReadBudget) -> Any:
-    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError if it is no JSON."""
+    """Parse JSON; SceneError if its objects would take more memory than the budget, ValueError if it is not JSON."""
     objects = sum(size * text.count(character) for character, size in _JSON_BYTES.items())
     budget.check_memory(sys.getsizeof(text) + objects, "JSON")
     try:
@@ -116,13 +116,13 @@ def walk_files(folder: Path) -> list[Path]:
 
 
 def read_text(path: Path, limit: int = MAX_TEXT_BYTES) -> str:
-    """Read a UTF-8 text file; SceneError if it is no text or has more than ``limit`` bytes."""
+    """Read a UTF-8 text file; SceneError if it is not text or has more than ``limit`` bytes."""
     with _text_file(path, limit) as file:
         return file.read()
 
 
 def read_lines(path: Path, limit: int = MAX_TEXT_BYTES) -> Iterator[str]:
-    """Yield the lines of a UTF-8 text file, with their ends, one at a time in memory; SceneError as read_text."""
+    """Yield the lines of a UTF-8 text file with their line ends, one at a time; SceneError as in :func:`read_text`."""
     with _text_file(path, limit) as file:
         yield from file
 
@@ -140,7 +140,7 @@ def _text_file(path: Path, limit: int) -> Iterator[TextIO]:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of at most 32 MiB; SceneError if it cannot be read or is no JSON."""
+    """Read a JSON file of at most 32 MiB; SceneError if it cannot be read or is not JSON."""
     text = read_text(path)
     try:
         return parse_json(text, read_budget(path))
@@ -177,9 +177,9 @@ def check_pixels(path: StrPath, width: int, height: int) -> None:
 
 
 def check_whole(value: Any, name: str, least: int, most: int = 2**53) -> int:
-    """Return a number of a document if it is whole and in its range; ValueError otherwise.
+    """Return a number of a document if it is whole and within its range; ValueError otherwise.
 
-    2^53 is the largest whole number that JSON keeps everywhere.
+    2^53 is the largest whole number that every JSON reader keeps.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, not {value!r:.40}")

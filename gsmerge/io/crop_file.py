@@ -61,7 +61,7 @@ def _list_sphere(table: Mapping[str, Any]) -> list[float]:
 
 
 def _check_keys(table: Mapping[str, Any]) -> set[str]:
-    """Return the keys that say where a shape lies; ValueError if they are not those of one form."""
+    """Return the keys that place a shape; ValueError if they do not belong to one form."""
     keys, forms = table.keys() - {"shape"}, FORMS[table["shape"]]
     turned = {"rotate"} if table["shape"] == "box" and "matrix" not in keys else set[str]()
     if keys - turned not in forms:
@@ -71,7 +71,7 @@ def _check_keys(table: Mapping[str, Any]) -> set[str]:
 
 
 def _parse_matrix(table: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Take a matrix, of the cube from -1 to 1 or the sphere of radius 1, apart: middle, scales ``[3]``, rotation."""
+    """Decompose the matrix of a cube from -1 to 1, or a sphere of radius 1: centre, scales ``[3]``, rotation."""
     matrix = _parse_numbers(table, "matrix", (4, 4))
     axes = matrix[:3, :3]
     scales = np.sqrt(np.square(axes).sum(0))
@@ -86,7 +86,7 @@ def _parse_matrix(table: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _parse_numbers(table: Mapping[str, Any], name: str, shape: tuple[int, ...] = (3,)) -> np.ndarray:
-    """Return an entry as numbers of a shape; ValueError if it is anything else."""
+    """Return an entry as numbers of the given shape; ValueError for any other content."""
     expected = f"{name}: expected {' x '.join(map(str, shape))} number(s) below {MAX_NUMBER:g}"
     try:
         numbers = np.array(table[name])

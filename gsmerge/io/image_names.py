@@ -70,9 +70,9 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str
 
 
 def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
-    """Find the mask of every view by its photo's name, with or without the photo's extension; None for a view without.
+    """Find the mask of every view by the name of its photo, with or without extension; None for a view without.
 
-    SceneError if the folder has no mask of any view, or two of one.
+    SceneError if the folder has no mask of any view, or two of one view.
     """
     by_ending = _by_ending(folder, list_images(folder))
     masks = [_lookup(folder, by_ending, name, "--masks") for name in names]

@@ -63,7 +63,7 @@ class PhotoReader:
         return self.read(photo)
 
     def select(self, ids: Sequence[int]) -> PhotoReader:
-        """Return the reader of some photos, in that order."""
+        """Return the reader of a subset of photos, in the given order."""
         return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
 
 
@@ -74,16 +74,16 @@ NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # photos as floats, where there 
 def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     """Read the image of every view: ``[c,h,w,3]`` float32, sRGB in [0, 1], in the order of ``names``.
 
-    ``source`` is a folder with its sub-folders, or the image files. ``names`` are those of a camera file, with or
+    ``source`` is a folder with its sub-folders, or the image files. ``names`` are the names in a camera file, with or
     without folders and extension. If no name matches but there are as many images as names, the images are taken in
-    order (numbers in their names count as numbers). SceneError if an image is missing or cannot be read, or two
+    order, with numbers in names sorted as numbers. SceneError if an image is missing or cannot be read, or if images
     differ in size.
     """
     return as_floats(decode_images(match_images(source, names)))
 
 
 def decode_images(paths: Sequence[Path]) -> Photos:
-    """Decode image files of one size to ``[h,w,3]`` uint8 each; many large files are decoded at each use."""
+    """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use."""
     sizes = [image_size(path) for path in paths]
     for path, (w, h) in zip(paths, sizes, strict=True):
         if (w, h) != sizes[0]:
@@ -136,12 +136,12 @@ def photo_size(photos: Photos) -> Size | None:
 
 
 def photo_array(images: np.ndarray | None) -> np.ndarray:
-    """Return photos ``[c,h,w,3]`` as they are, and an array of none where there are none."""
+    """Return photos ``[c,h,w,3]`` unchanged, or an empty array if there are none."""
     return NO_IMAGES if images is None else images
 
 
 def select_photos(images: np.ndarray, ids: Sequence[int]) -> np.ndarray:
-    """Select photos ``[c,h,w,3]`` by their numbers; of none there are none."""
+    """Select photos ``[c,h,w,3]`` by their numbers; an empty array stays empty."""
     return images[list(ids)] if len(images) else images
 
 
@@ -153,7 +153,7 @@ def same_shape(size: Size, other: Size) -> bool:
 def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode a mask to ``[h,w]`` bool: True, the photo counts, where it is brighter than half of its maximum.
 
-    What it may take is that of its bytes and of its ``photo``'s: a mask packs to nothing.
+    The memory limit is that of its bytes and of its ``photo`` together, since masks compress to almost nothing.
     """
 
     budget = ReadBudget(path, check_file(path) + (0 if photo is None else check_file(photo)))
@@ -199,7 +199,7 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
-    """Decode what ``choose`` makes of an image; SceneError if it cannot be decoded."""
+    """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
     _stored_size(path)  # refuses what is no image, or too large
     try:
         with warnings.catch_warnings():
@@ -220,8 +220,8 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 def image_size(path: Path) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP, TIFF or PNM file; its orientation is ignored.
 
-    SceneError if it is another file, cannot be read, has a size that no image of Gaussians has, or its pixels take
-    more memory than the file allows.
+    SceneError if it is another file, cannot be read, has an impossible size, or its pixels take more memory than the
+    file allows.
     """
     width, height = _stored_size(path)
     read_budget(path).check_memory(_CHANNELS * width * height, f"{width} x {height} pixels")
@@ -274,7 +274,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def _check_tags(path: Path, file: BinaryIO) -> None:
-    """Raise SceneError if the tags of a TIFF refer to more bytes than the file allows: its decoder copies all."""
+    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them."""
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     start = file.read(16)
@@ -293,8 +293,8 @@ def _check_tags(path: Path, file: BinaryIO) -> None:
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
     """Decode images that a file holds as image files in bytes (``[b]`` uint8) to ``[c,h,w,3]`` uint8.
 
-    Many large ones are decoded at each use. SceneError if one cannot be decoded, two differ in size, or they take more
-    memory or time than the file's budget.
+    If there are many large images, they are decoded at each use. SceneError if an image cannot be decoded, two differ
+    in size, or they take more memory or time than the file's budget.
     """
     path = Path(budget.path)
     sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
@@ -314,7 +314,7 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
 
 
 def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) -> None:
-    """Raise SceneError if JPEG files have more scans, each a walk over all pixels, than there is time for."""
+    """Raise SceneError if JPEG files have more scans, each a pass over all pixels, than the budget has time for."""
     num_scans = sum(data.tobytes().count(_SCAN) for data in files if data[:2].tobytes() == _JPEG)
     budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
 
@@ -336,9 +336,9 @@ def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:
-    """Strip a PNG file ``[b]`` uint8 of all that does not change its pixels; None where it is damaged.
+    """Remove everything from a PNG file ``[b]`` uint8 that does not change its pixels; None if it is damaged.
 
-    The decoder prints lines of its own about damage, in colour profiles and texts as well.
+    Otherwise the decoder prints messages of its own about damaged colour profiles and texts.
     """
     view, start, pixels = np.ascontiguousarray(data).data, len(_PNG), bytearray(_PNG)
     while start + 12 <= len(view):

@@ -37,10 +37,10 @@ def refuse_storage(pid: object) -> object:
 def read_pickle(
     content: bytes, budget: ReadBudget, names: Names, find_storage: Callable[[object], object] = refuse_storage
 ) -> Any:
-    """Read a pickle; ``find_storage`` returns what a persistent id stands for.
+    """Read a pickle; ``find_storage`` returns the object for a persistent id.
 
-    ValueError if it is damaged or holds anything else than plain values and ``names``; SceneError if it takes more
-    than the budget.
+    ValueError if it is damaged or holds anything but plain values and ``names``; SceneError if it takes more than the
+    budget.
     """
     unpickler = _Unpickler(content, budget, names, find_storage)
     try:

@@ -59,14 +59,14 @@ class Platform:
 
     @property
     def triple(self) -> str:
-        """The platform in words of the compiler; a C library is named, none is linked."""
+        """The platform as the compiler names it; a C library is part of the name, but none is linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
         system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """Further options: without a C library nothing can probe the stack."""
+        """Further options: without a C library there is nothing to probe the stack."""
         return ("-mno-stack-arg-probe",) if self.system == "win" else ()
 
     def library_name(self, target: Target) -> str:
@@ -82,12 +82,12 @@ def find_platform(tag: str | None = None) -> Platform:
 
 
 def source_files() -> list[Path]:
-    """Return the sources that are at hand."""
+    """Return the source files that exist."""
     return sorted([*FOLDER.rglob("*.c"), *FOLDER.rglob("*.h")], key=lambda path: path.name)
 
 
 def hash_sources() -> str:
-    """Return a hash of all sources; empty where they are not at hand."""
+    """Return a hash of all sources; empty if there are none."""
     digest = hashlib.sha256()
     for path in source_files():
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
@@ -112,7 +112,7 @@ def compiler() -> list[str]:
 def build_target(
     target: Target, folder: Path, platform: Platform, extra: tuple[str, ...] = (), link: tuple[str, ...] = LINK
 ) -> Path:
-    """Build one target's library into a folder; OSError with the compiler's words if that fails."""
+    """Build one target's library into a folder; OSError with the compiler's message if that fails."""
     command, path = compiler(), folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
     options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.other

@@ -30,9 +30,9 @@ class Binary(Protocol):
 
 
 def _make(name: str, doc: str, arguments: tuple[str, ...] = ("values",), narrow: bool = False) -> Any:
-    """Make a function of arrays from the library's ``name_each``, of flat float64 arrays.
+    """Make a function of arrays from the library's ``name_each``, which takes flat float64 arrays.
 
-    ``narrow``: there is ``name_floats`` besides, for arrays that are all float32.
+    ``narrow``: use ``name_floats`` if all arrays are float32.
     """
     wide_each = declare(f"{name}_each", **{key: f8("n") for key in arguments}, out=f8("n", out=True))
     floats = declare(f"{name}_floats", **{key: f4("n") for key in arguments}, out=f4("n", out=True)) if narrow else None

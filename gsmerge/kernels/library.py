@@ -58,7 +58,7 @@ def _open(target: Target) -> ctypes.CDLL:
 
 
 def _check_end(path: Path) -> None:
-    """Raise OSError for an ELF file that ends before its table of sections, the last part: loading it may kill us."""
+    """Raise OSError if an ELF file ends before its section table, which is last: loading it could crash the process."""
     with path.open("rb") as file:
         head = file.read(64).ljust(64, b"\0")
     table, size, count = struct.unpack_from("<40xQ10xHH", head)

@@ -32,7 +32,7 @@ _diagonalise = declare("diagonalise", a=f8("n", "d", "d", out=True), v=f8("n", "
 
 
 def _wide(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
-    """Return arrays in float64, and the type that a result of them has."""
+    """Return arrays in float64, and the type of the result."""
     own = [np.asarray(one) for one in arrays]
     kind = NARROW if all(one.dtype == NARROW for one in own) else WIDE
     return [one if one.dtype == WIDE else one.astype(WIDE) for one in own], kind
@@ -114,9 +114,9 @@ def determinant(matrices: ArrayLike) -> Array:
 
 
 def closest_rotation(matrix: ArrayLike) -> Array:
-    """Return the rotation R ``[3,3]`` with the largest trace of ``R^T matrix``: the nearest one, by least squares.
+    """Return the rotation R ``[3,3]`` with the largest trace of ``R^T matrix``: the nearest by least squares.
 
-    By the eigenvector of a matrix of quaternions (Horn 1987), so that no reflection comes up.
+    Computed by the eigenvector of a matrix of quaternions (Horn 1987), which never gives a reflection.
     """
     (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64)
     quaternions = np.array(

@@ -30,7 +30,8 @@ _sample_picture = declare(
 def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
     """Convolve a picture ``[h,w]`` or ``[h,w,c]`` with two filters of odd lengths, mirrored at its borders; float32.
 
-    ``across`` goes along the rows and ``down`` along the columns; the borders themselves are not repeated.
+    ``across`` is the filter along the rows and ``down`` that along the columns. Mirroring does not repeat the border
+    pixels.
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
@@ -60,9 +61,9 @@ def sobel(picture: Picture) -> tuple[Picture, Picture]:
 
 
 def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
-    """Look up places of a picture ``[h,w]`` or ``[h,w,c]``, bilinear: float32 of the places' shape ``[...,c]``.
+    """Sample a picture ``[h,w]`` or ``[h,w,c]`` bilinearly: float32 of shape ``[...,c]``.
 
-    ``x`` and ``y`` are in pixels, the top-left pixel's centre at (0, 0); the borders are repeated outside.
+    ``x`` and ``y [...]`` are in pixels, with the top-left pixel's centre at (0, 0). Border pixels are repeated outside.
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
@@ -84,7 +85,7 @@ def enlarge(picture: Picture, width: int, height: int) -> Picture:
 
 
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return which four of ``old`` pixels, and how much of each, make ``new`` ones: ``[4,new]`` ids and weights."""
+    """Return the four of ``old`` pixels, and their weights, that make each new pixel: ids and weights ``[4,new]``."""
     places = (np.arange(new) + 0.5) * (old / new) - 0.5
     first = np.floor(places).astype(np.int64)
     away = np.abs(places - first - np.arange(-1, 3)[:, None])
@@ -98,7 +99,7 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
     """Count the lines of one colour at each border of a picture ``[h,w,c]``: above, below, left, right.
 
-    All values of a bar lie within ``spread``, and it ends before the picture's middle; otherwise it is none.
+    All values of a bar lie within ``spread``. A bar that reaches the middle of the picture counts as none.
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):

@@ -10,7 +10,10 @@ from gsmerge.kernels.signature import STATUS, f8, i8, native
     errors=f8("n", out=True),
 )  # fmt: skip
 def pixel_errors(points, views, viewmats, Ks, pixels, errors):
-    """Write the distances, pixels, of points that are projected into one view each from pixels; inf behind a camera."""
+    """Write the distances, pixels, between pixels and the projections of points into one view each.
+
+    They are inf behind a camera.
+    """
 
 
 @native(
@@ -18,8 +21,9 @@ def pixel_errors(points, views, viewmats, Ks, pixels, errors):
     residuals=f8("rows", out=True),
 )  # fmt: skip
 def linearise(points, pixels, K, pose, jacobian, residuals):
-    """Write how far points of a view are projected from their pixels, and how motions of the camera change that.
+    """Write the projection errors of a view's points, and their derivatives by motions of the camera.
 
-    ``residuals [2n]``: to the right for all points, then down. Columns of ``jacobian [2n,6+f]``: turn and shift of the
-    camera, then of f = 1 the logarithm of the focal length, of 2 of both, of 4 the principal point as well.
+    ``residuals [2n]``: errors to the right for all points, then errors downwards. Columns of ``jacobian [2n,6+f]``:
+    rotation and shift of the camera; with f = 1 the logarithm of the focal length, with f = 2 those of both focal
+    lengths, with f = 4 also the principal point.
     """

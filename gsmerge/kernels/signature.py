@@ -67,7 +67,7 @@ class Argument:
 
     @cached_property
     def span(self) -> tuple[int, int]:
-        """Smallest and largest integer that the type and the rules with numbers admit."""
+        """Smallest and largest integer that the type and the numeric rules allow."""
         limits = np.iinfo(self.dtype)
         most = self.below - 1 if isinstance(self.below, int) else self.most
         return (
@@ -77,7 +77,7 @@ class Argument:
 
     @property
     def has_rules(self) -> bool:
-        """Whether values are checked once all sizes are there: those of arrays, and scalars by rules with names."""
+        """Whether values are checked once all sizes are known: arrays, and scalars with rules that name sizes."""
         rules = [rule for rule in (self.least, self.below, self.most) if rule is not None]
         return self.ascending or any(self.shape or isinstance(rule, str) for rule in rules)
 
@@ -120,7 +120,7 @@ def native(returns: Argument | None = None, /, **arguments: Argument) -> Callabl
 
 
 def declare(name: str, returns: Argument | None = None, /, **arguments: Argument) -> Callable[..., Any]:
-    """Return a function of the native library, as :func:`native` does, for those that need no documentation."""
+    """Return a function of the native library, as :func:`native` does, for functions without documentation."""
     signature = inspect.Signature([inspect.Parameter(key, _POSITIONAL) for key in arguments])
     entries: dict[ctypes.CDLL, Any] = {}  # the function in each library that was loaded: tests load several
     kinds, names = list(arguments.items()), size_names(arguments)
@@ -142,7 +142,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return None if returns is STATUS else result
 
     def prepare(*values: Any) -> Callable[[], None]:
-        """Check arguments once, and return a function that calls with them: what they point to must live as long."""
+        """Check arguments once, and return a call with these arguments, whose memory must stay allocated."""
         sizes: dict[str, int] = {}
         passed = [_pass(name, key, kind, value, sizes) for (key, kind), value in zip(kinds, values, strict=True)]
         passed += [sizes.get(key, 0) for key in names]
@@ -183,7 +183,7 @@ class FilledTable:
             self[key] = size
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
-        """Let an address be that of another array of the same sizes; ValueError if it does not fit."""
+        """Set an address to another array of the same sizes; ValueError if the array does not fit."""
         self[key] = _pass(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 
@@ -195,7 +195,7 @@ class FilledTable:
 
 
 def size_names(arguments: dict[str, Argument]) -> list[str]:
-    """Return the names of sizes that are no arguments, in the order in which they appear."""
+    """Return the names of sizes that are not arguments, in order of appearance."""
     sizes = (size for kind in arguments.values() for size in kind.shape)
     return list(dict.fromkeys(size for size in sizes if isinstance(size, str) and size not in arguments))
 
@@ -216,7 +216,7 @@ def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments:
 
 
 def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]) -> Any:
-    """Check one argument -> what ctypes is given for it; ``sizes`` learns its names."""
+    """Check one argument and return its value for ctypes; ``sizes`` collects the values of named sizes."""
     if not kind.shape:
         if kind.code[0] != "f":
             value = int(value)
@@ -243,7 +243,7 @@ def _pass(name: str, key: str, kind: Argument, value: Any, sizes: dict[str, int]
 
 
 def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return where an array's values lie; through the buffer where that can be, a fifth of the time."""
+    """Return the address of an array's values, through its buffer if possible, which takes a fifth of the time."""
     if writeable and array.size:
         return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return int(array.__array_interface__["data"][0])

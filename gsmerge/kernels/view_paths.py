@@ -17,10 +17,10 @@ _find_path = declare(
 
 
 def cheapest_views(pixels, came_from, views):
-    """Find Viterbi's path through ``pixels [n,v]`` int32, the pixel of each row in each view, -1 outside it.
+    """Find Viterbi's path through ``pixels [n,v]`` int32: the pixel of each row in each view, -1 outside.
 
     Returns how many of its steps go back. Overwritten: ``views [n]`` int64, the view of each row; ``came_from [n,v]``
-    int8, the best view of the row before. There are 1 to 127 views.
+    int8, the best view of the previous row. There are 1 to 127 views.
     """
     back = np.empty(1, np.int64)
     _find_path(pixels, came_from, views, back)

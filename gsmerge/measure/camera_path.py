@@ -98,7 +98,7 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
 
 
 def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
-    """Move cameras backwards by ``back`` times ``depth``, world units."""
+    """Move cameras backwards by ``back`` times ``depth``, which is in world units."""
     if not back:
         return cameras
     return replace(cameras, viewmats=np.stack([step_outside(viewmat, depth, back) for viewmat in cameras.viewmats]))
@@ -200,10 +200,10 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
 
 
 def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as rows ``[c,7]`` whose distances are those of poses, and which differ from the one before.
+    """Return poses as rows ``[c,7]`` whose distances measure differences of poses, without repeated poses.
 
-    A row has the camera's place and its quaternion, near that of the row before, times twice the depth: a small turn
-    changes it by the angle times the depth.
+    A row has the camera's position, and its quaternion times twice the depth. Quaternion signs follow the row before. A
+    small rotation changes the row by the angle times the depth.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
@@ -228,14 +228,14 @@ def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float)
 
 
 def _pieces(knots: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the piece ``[m]`` of a spline that each time lies in, and the share of it that has passed."""
+    """Return the piece ``[m]`` of a spline that contains each time, and the position within the piece, 0 to 1."""
     pieces = np.searchsorted(knots, times, side="right") - 1
     pieces = pieces.clip(0, len(knots) - 2)
     return pieces, (times - knots[pieces]) / np.diff(knots)[pieces]
 
 
 def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the times at which shares of the length of a curve of ``points [m,d]`` have passed."""
+    """Return the times at which the given shares of the length of a curve ``points [m,d]`` are reached."""
     passed = np.concatenate([np.zeros(1), _lengths(np.diff(points, axis=0)).cumsum()])
     return np.interp(shares * passed[-1], passed, times)
 

@@ -73,7 +73,7 @@ class DrawOptions:
     segmentation: SegmentOptions | None = None  # How superpixels are cut
 
     def choose(self, count: int, most: int | None = None) -> list[int]:
-        """Choose ids of ``count`` views, at most the option ``views``, else ``most``; None: all."""
+        """Choose ids of ``count`` views: as many as the option ``views``, or else ``most``; None: all."""
         return pick_views(count, self.views or most or count)
 
 
@@ -179,7 +179,10 @@ def _check_frame(output: Path, width: int, height: int) -> None:
 
 
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Read the scenes and make the cameras of the path; also return its near plane, and the views that it uses."""
+    """Make the cameras of a path, and read the scenes that they are placed in.
+
+    Returns the scenes, the cameras, the near plane, and the views that the path uses.
+    """
     assert options.path is not None
     path = parse_path(options.path)
     file, separate = None if path else Path(options.path), True
@@ -201,7 +204,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path into the frame of a scene, with the size of the scene's where they have none."""
+    """Read the cameras of a path into the frame of a scene; cameras without a size get that of the scene."""
     cameras = load.views.cameras
     stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
@@ -287,7 +290,7 @@ def drawing_document(drawing: Drawing, output: Path, *, dry_run: bool) -> dict[s
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, progress: Progress) -> dict[str, Any]:
-    """Draw the pictures and write them, making folders as needed; return the facts that only drawing tells."""
+    """Draw the pictures and write them, making folders as needed; return facts known only after drawing."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
     def count(pictures: Iterator[Picture]) -> Iterator[Picture]:

@@ -131,7 +131,7 @@ class Evaluation:
         return html_table(self._rows())
 
     def _rows(self) -> list[list[str]]:
-        """List the mean scores over the pixels that the input views have seen, of held-out views where there are."""
+        """List the mean scores over the pixels that the input views have seen, of held-out views if there are any."""
         split = "target" if "target" in self.num_views else "context"
         scores = [(result, vars(result.mean(split)[1])) for result in self.results]
         names = [name for name in vars(Quality()) if any(quality[name] is not None for _, quality in scores)]
@@ -151,11 +151,11 @@ class _Split:
     drawn: Gaussians | None = None  # the input, where its renders stand in
 
     def with_covered(self, masks: NDArray[np.bool_]) -> _Split:
-        """Fill in the pixels ``[v,h,w]`` that the input covers, if they are not known."""
+        """Fill in the mask ``[v,h,w]`` of pixels that the input covers, unless it is known."""
         return self if self.covered is not None else replace(self, covered=masks)
 
     def under(self, cameras: Cameras | None) -> _Split:
-        """Move the views to a result's own cameras; renders of the input are shown from the given cameras."""
+        """Move the views to a result's own cameras; renders of the input stay at the given cameras."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
@@ -168,9 +168,9 @@ class _Renderer:
     options: EvaluateOptions
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Render one view ``[h,w,3]``, by the one call that renders here: equal Gaussians give equal images.
+        """Render one view ``[h,w,3]``; equal Gaussians give equal images, since all renders use this call.
 
-        Also returns a mask ``[h,w]`` of the pixels in which the Gaussians are opaque by half.
+        Also returns a mask ``[h,w]`` of the pixels in which the Gaussians have an opacity of at least a half.
         """
         drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
         return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED)
@@ -247,7 +247,7 @@ def evaluate(
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
-    """Name what results are compared with: photos, and what stands in for those of the input views."""
+    """Name what results are compared with: photos, or what replaces those of the input views."""
     first, *others = dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits)
     return f"{first}, and {others[0]} in its own views" if others else first
 
@@ -258,7 +258,7 @@ def near_plane(scene: Scene) -> float:
 
 
 def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultScores]) -> Iterator[str]:
-    """Name results that are worse than the input where it matters, and say what figures may mislead about."""
+    """Note which results are clearly worse than the input, and which figures may mislead."""
     photos = "context" in splits and splits["context"].reference == PHOTOS
     mended = photos and not photos_count_as_they_are(scene)
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
@@ -278,7 +278,7 @@ def _splits(
 ) -> dict[str, _Split]:
     """Split the views into input and held-out views, with visible pixels.
 
-    Pictures of input views are the scene's, which are what ``reference`` says, or renders of the input.
+    Pictures of input views are those of the scene, named by ``reference``, or renders of the input.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
@@ -345,7 +345,7 @@ def _score_result(
 
 
 def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:
-    """Measure the share of pixels in a mask, and PSNR and SSIM over these; None where they are nearly all."""
+    """Measure the share of pixels in a mask, and PSNR and SSIM over these; None if nearly all pixels are in it."""
     share = float(mask.mean())
     return share, None if share >= WHOLE else _quality(image, photo, mask, ()) if share > 0 else Quality()
 
@@ -360,7 +360,7 @@ def _score_zoom(gaussians: Gaussians, split: _Split, view: int, zoom: float, ren
 
 
 def _both(image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]) -> Pair:
-    """Measure the quality over all pixels, and over those that the input views have seen."""
+    """Measure the quality over all pixels, and over the pixels that the input views have seen."""
     full = _quality(image, photo, None, nets)
     return full, full if seen.all() else _quality(image, photo, seen, nets) if seen.any() else Quality()
 

@@ -73,7 +73,7 @@ def measure_fog(
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe the haze that a result shows from outside; None up to a far fog of 0.05."""
+    """Describe the haze of a result seen from outside; None if far fog is at most 0.05."""
     if fog.fog_far is None or fog.fog_far <= HAZE:
         return None
     return (

@@ -42,7 +42,10 @@ class LevelErrors:
     progress: Progress
 
     def __call__(self, leaves: Sequence[Leaf]) -> np.ndarray:
-        """Return errors ``[leaves, levels]``, no smaller from level to level; 0 where nothing is coarser."""
+        """Return errors ``[leaves, levels]`` that never fall from one level to the next coarser one.
+
+        They are 0 where no level is coarser.
+        """
         num_levels = len(leaves[0].rows)
         starts = np.searchsorted(self.levels, range(num_levels))
         leaf_of = np.zeros(len(self.levels), np.int64)
@@ -68,7 +71,7 @@ class LevelErrors:
         return np.maximum.accumulate(scale * lost / np.maximum(covered, 1e-12)[:, None], axis=1)
 
     def _lost(self, camera: Cameras, leaf_of: np.ndarray, leaves: Sequence[Leaf]) -> tuple[float, np.ndarray]:
-        """Return the energy of a picture, and ``[leaves, levels]`` what it loses, both for each pixel."""
+        """Return the energy per pixel of a picture, and the energy ``[leaves, levels]`` that it loses."""
         present = [[level for level, rows in enumerate(leaf.rows) if len(rows)] for leaf in leaves]
         always = self.levels < 0
         drawn = always | (self.levels == np.array([levels[0] for levels in present])[leaf_of])
@@ -90,7 +93,7 @@ class LevelErrors:
 
     @staticmethod
     def _draw(tiled: TiledView) -> np.ndarray:
-        """Draw colours and opacity ``[h,w,4]``, since nobody knows what a viewer shows behind them."""
+        """Draw colours and opacity ``[h,w,4]``, since the background of a viewer is unknown."""
         image, transmittance = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))
         return np.concatenate([image, 1 - transmittance[..., None]], 2)
 
@@ -124,7 +127,7 @@ def shown_tiles(tiled: TiledView) -> np.ndarray:
 
 
 def coverage(leaves: Sequence[Leaf], camera: Cameras) -> np.ndarray:
-    """Return the coverage ``[leaves]`` of a picture by leaves, at most 1, wherever the camera looks."""
+    """Return the share ``[leaves]`` of a picture that each leaf covers, at most 1, in any viewing direction."""
     bounds = [leaf.node["bound"] for leaf in leaves]
     low, high = (np.array([bound[end] for bound in bounds], np.float64) for end in ("min", "max"))
     centre = camera_centres(camera.viewmats[0].astype(np.float64))

@@ -151,7 +151,7 @@ def read_layers(net: str) -> tuple[Layer, ...]:
 
 
 def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], layers: tuple[Layer, ...]) -> float:
-    """Weight squared differences of unit features, average over pixels, and add up (equation 1 of Zhang et al.)."""
+    """Weight squared differences of unit features, average over pixels, and sum (equation 1 of Zhang et al.)."""
     distance = 0.0
     compared = [layer.weights for layer in layers if layer.weights is not None]
     for weights, unit, other in zip(compared, units, other_units, strict=True):
@@ -162,7 +162,7 @@ def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], la
 
 @lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference
 def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute the features of a reference, float32 values of a ``shape``."""
+    """Compute the features of a reference with the given shape, and cache them."""
     values = np.frombuffer(reference, np.float32).reshape(shape)
     return list(_unit_features(values, _load(path, net)))
 
@@ -187,7 +187,7 @@ def _pool(picture: np.ndarray, size: int) -> np.ndarray:
 
 
 def _convolve(picture: np.ndarray, layer: Layer) -> np.ndarray:
-    """Convolve a picture ``[h,w,in]`` with a layer's kernel, and cut what is below zero."""
+    """Convolve a picture ``[h,w,in]`` with a layer's kernel, and clip negative values to zero."""
     conv, border = layer.conv, (layer.conv.padding, layer.conv.padding)
     padded = np.pad(picture, (border, border, (0, 0)))
     every = sliding_window_view(padded, (conv.size, conv.size), (0, 1))
@@ -214,7 +214,7 @@ def _find_weights(net: str) -> Path | None:
 
 @lru_cache(maxsize=2)
 def _load(path: Path, net: str) -> tuple[Layer, ...]:
-    """Load the layers of ``net`` from its file; a SceneError if that is no pickle of the expected float arrays."""
+    """Load the layers of ``net`` from its file; a SceneError if it is not a pickle of the expected float arrays."""
     try:
         return _layers(read_pickle(path.read_bytes(), read_budget(path), _NAMES), _architecture(net))
     except (LookupError, TypeError, ValueError) as e:  # LookupError, TypeError: other content
@@ -265,7 +265,7 @@ class _StoredDtype(StandIn):
         self.code = code
 
     def set_state(self, state: object) -> None:
-        """Check the type and the order of its bytes."""
+        """Check the number type and the byte order."""
         match self.code, state:
             case "f4", (_, "<", *_):
                 return

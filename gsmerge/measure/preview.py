@@ -56,7 +56,7 @@ def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool =
 
 
 def picture_html(picture: Picture, text: str) -> str:
-    """Write a picture as an element of HTML for notebooks; ``text`` says what it shows."""
+    """Convert a picture to an HTML element for notebooks; ``text`` is its description."""
     data = base64.b64encode(cv2.imencode(".png", picture[..., ::-1])[1].tobytes()).decode("ascii")
     return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
 
@@ -113,7 +113,7 @@ def outside_pictures(
 def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
     """Arrange pictures in a sheet: one labelled row per view.
 
-    Small pictures are enlarged by a whole factor so that a tile has at least ``min_width`` columns.
+    Small pictures are enlarged by a whole factor so that each has at least ``min_width`` columns.
     """
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
@@ -160,7 +160,7 @@ def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def draw_heat(values: np.ndarray) -> Picture:
-    """Draw non-negative values ``[h,w]`` as a heat map, the 99th percentile at the top."""
+    """Draw non-negative values ``[h,w]`` as a heat map whose maximum is the 99th percentile."""
     values = values.astype(np.float64)
     return heat_map((values / (np.quantile(values, 0.99) or 1.0)).clip(0, 1))
 
@@ -211,10 +211,12 @@ def is_video(path: Path) -> bool:
 def write_video(path: StrPath, frames: Iterable[Picture], fps: int, *, overwrite: bool = False) -> str:
     """Write pictures ``[h,w,3]`` of one size as a video, and return the name of its encoding.
 
-    It is H.264 in a ``.mp4`` where :func:`find_ffmpeg` finds a program for it, otherwise the first that OpenCV has.
+    A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise the first encoding that OpenCV has is
+    used.
 
-    One frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since encodings have
-    none. SceneError if OpenCV has no encoder for the name's ending, or the file cannot be written whole.
+    One frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since encodings require
+    even sides. SceneError if OpenCV has no encoder for the ending of the name, or the file cannot be written
+    completely.
     """
     path = Path(path)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -240,7 +242,7 @@ def _to_even(picture: Picture) -> Picture:
 
 
 def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
-    """Open a file with the first encoder that there is; also return the name of its encoding."""
+    """Open a file with the first available encoder; also return the name of its encoding."""
     height, width = first.shape[:2]
     if path.suffix.lower() == ".mp4" and (program := find_ffmpeg()):
         return FfmpegWriter(program, temporary, (width, height), fps), H264
@@ -259,7 +261,7 @@ def _open_writer(path: Path, temporary: Path, first: Picture, fps: int) -> tuple
 
 
 def _check_frames(path: Path, temporary: Path, count: int) -> None:
-    """Raise a SceneError if a video has not all frames, since the encoders do not say when a disk is full."""
+    """Raise a SceneError if frames of a video are missing, since encoders do not report a full disk."""
     with _silent_stderr():
         reader = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
         readable = 0
@@ -274,7 +276,7 @@ def _check_frames(path: Path, temporary: Path, count: int) -> None:
 
 @contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Keep the lines away that OpenCV and FFmpeg print about encoders, at the level of the process."""
+    """Suppress what OpenCV and FFmpeg print about encoders, at the level of the process."""
     try:
         kept = os.dup(2)
     except OSError:  # closed: there is nothing to keep away

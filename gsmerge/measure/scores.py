@@ -34,9 +34,9 @@ def evaluation_document(
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
     ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
-    null of the input, means by split, a score for each view), notes. Means and scores have ``zooms`` where other sizes
-    than the photos' own were asked for; ``photo_side`` is there where it is not 0, ``antialiased`` where it is true.
-    Keys are only ever added within one schema version.
+    null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other sizes
+    than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is true.
+    Within one schema version keys are only added.
     """
     return {
         **document_head(),
@@ -84,7 +84,7 @@ def _mean(result: ResultScores, split: str, evaluation: Evaluation) -> dict[str,
 
 
 def _zooms(scores: Mapping[float, Pair]) -> dict[str, Any]:
-    """Make ``zooms`` where there are any: a list, in the order that was asked for."""
+    """Make the list ``zooms`` in the requested order, if there are any."""
     names = [name + suffix for suffix in ("", MASKED) for name in ZOOMED]
     flat = [(zoom, _flat(pair)) for zoom, pair in scores.items()]
     return {"zooms": [{"zoom": zoom, **{name: score[name] for name in names}} for zoom, score in flat]} if flat else {}
@@ -114,7 +114,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def _more_columns(view: Mapping[str, Any]) -> dict[str, Any]:
-    """Flatten the score of a view: a column for each figure at another size."""
+    """Flatten the score of a view to a column for each figure at another size."""
     row = {key: value for key, value in view.items() if key != "zooms"}
     for score in view.get("zooms", ()):
         row |= {f"{key}_zoom_{score['zoom']:g}": value for key, value in score.items() if key != "zoom"}
@@ -182,7 +182,7 @@ def _speed_row(result: Mapping[str, Any], speed: Mapping[str, Any]) -> Row:
 
 
 def _cells(score: Mapping[str, Any], names: Iterable[str] = METRICS, suffix: str = MASKED) -> Iterator[str]:
-    """Format the figures of the visible pixels, or of others; empty where one was not measured."""
+    """Format the figures of the visible pixels, or those of another ``suffix``; empty for missing figures."""
     for name in names:
         yield _number(score[name + suffix], 2 if name == "psnr" else 3)
 

@@ -50,7 +50,7 @@ def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if all of it lies in the mask."""
+    """Resize a mask ``[h,w]`` to ``[height,width]``; a new pixel is True if it lies completely in the mask."""
     holes = np.pad(np.cumsum(np.cumsum(~mask, 0, dtype=np.int64), 1), ((1, 0), (1, 0)))
     (top, bottom), (left, right) = (
         _covered(old, new) for old, new in zip(mask.shape, (height, width), strict=True)
@@ -60,6 +60,6 @@ def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.
 
 
 def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
-    """Find the first pixel, and the one after the last, of ``old`` in a row that each of ``new`` pixels overlaps."""
+    """Find the first and the (exclusive) last of ``old`` pixels in a row that each of ``new`` pixels overlaps."""
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

@@ -30,11 +30,11 @@ def measure_costs(
 ) -> dict[str, dict[str, Any]]:
     """Measure the costs of drawing each scene.
 
-    The scenes take turns, so that a machine that slows down slows all of them; the others are compared with the first.
-    A few of the ``cameras`` are drawn, at ``zooms`` times their own size. ``near`` is in world units;
-    ``merge_seconds`` is the time that making a scene took, where it is known; ``threads`` None: all. Returned are
-    plain JSON types by name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by zoom: seconds per
-    view, and of all scenes but the first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
+    The scenes are drawn in turns, so that a machine that slows down slows all of them; scenes are compared with the
+    first. A few of the ``cameras`` are drawn, at ``zooms`` times their own size. ``near`` is in world units;
+    ``merge_seconds`` is the time that making a scene took, if known; ``threads`` None: all. Returns plain JSON types by
+    name: ``overdraw``, Gaussians blended into a pixel; ``speeds`` by zoom: seconds per view, and for all scenes but the
+    first ``speedup`` and ``break_even_frames``, next to ``merge_seconds``.
     """
     few = cameras[pick_views(len(cameras), NUM_VIEWS)]
     costs: dict[str, dict[str, Any]] = {
@@ -78,15 +78,15 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
 
 
 def break_even(merge_seconds: float, before: float, after: float) -> float | None:
-    """Compute after how many frames merging has paid for itself in render time (paper, supplement: timing).
+    """Compute the number of frames after which merging has saved its own time (paper, supplement: timing).
 
-    ``before`` and ``after`` are seconds per frame; None where the result does not render faster.
+    ``before`` and ``after`` are seconds per frame; None if the result does not render faster.
     """
     return merge_seconds / (before - after) if after < before else None
 
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
-    """Measure the mean number of Gaussians blended into a pixel, which render time depends on."""
+    """Measure the mean number of Gaussians blended into a pixel, which determines the render time."""
     splats, entries = prepare(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in range(len(cameras)):

@@ -47,8 +47,8 @@ def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Poin
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
     """Return masks ``[c,h,w]`` of pixels on or next to which a point ``[n,3]`` falls, occluded or not.
 
-    Points nearer than ``near``, world units, do not count. Where the views have smaller pixels than those that the
-    points come from (``sources``), a point marks proportionally more of them, as there would be gaps otherwise.
+    Points nearer than ``near``, world units, do not count. If the views have smaller pixels than the views of the
+    points (``sources``), a point marks proportionally more pixels, so that there are no gaps.
     """
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     size = np.array([cameras.width, cameras.height])
@@ -77,7 +77,7 @@ def _side(K: np.ndarray, sources: Cameras | None) -> int:
 
 
 def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
-    """Return for each view the rows whose centres it shows: inside its picture, and not behind a surface."""
+    """Return for each view the rows whose centres it shows: inside its picture, and not hidden by a surface."""
     rows = []
     for view in range(len(cameras)):
         (pixels,), (depths,) = project(gaussians.means, cameras[[view]])
@@ -93,7 +93,7 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
 
 
 def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Measure the share of Gaussians, on a sample, whose centres are outside every view's picture; 0 without any."""
+    """Measure the share of sampled Gaussians whose centres are outside every view's picture; 0 without any."""
     points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
     seen = np.zeros(len(points), bool)
     for inside in inside_views(points, cameras):

@@ -57,7 +57,7 @@ class NetworkContext(Corrector):
 
     @property
     def max_children(self) -> int:
-        """Most Gaussians of a Feature Gaussian that the heads make."""
+        """Largest number of Gaussians that the heads make of a Feature Gaussian."""
         return self.options.max_children
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
@@ -251,8 +251,8 @@ def prepare_children(
 ) -> Gaussians:
     """Prepare the children that heads correct: unchanged, or round Gaussians for heads with absolute outputs.
 
-    A round Gaussian lies at its group's mean, with its base colour and the axes of its frame, from which the head's
-    outputs are offsets (paper section 4.3). It is as large as the group and half transparent. Five or more children of
+    A round Gaussian has the mean of its group, its base colour, and the axes of its frame; the head's outputs are
+    offsets from these (paper section 4.3). It is as large as the group and half transparent. Five or more children of
     one parent stay unchanged: no head corrects them.
     """
     if options.outputs == "residual":
@@ -295,7 +295,10 @@ def run_heads(
 
 
 def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find first, number and parent of the children that a head reads together: many of a parent in two halves."""
+    """Find first row, number and parent of the children that a head reads together.
+
+    Many children of one parent are read in two halves.
+    """
     sizes = np.bincount(parents, minlength=count)
     first = np.cumsum(sizes) - sizes
     large = (sizes > SLOTS[-1]) & halves
@@ -311,7 +314,7 @@ def _run_head(
     group_features: GroupFeatures,
     context: NetworkContext,
 ) -> Array:
-    """Compute outputs ``[r·slots,13]`` of a table of parents' rows, children's rows and mask."""
+    """Compute outputs ``[r·slots,13]`` for a table of parents' rows, children's rows and mask."""
     parents, ids, mask = table
     slots, latents = mask.shape[1], group_features.features.latents
 

@@ -81,7 +81,7 @@ def build_networks(
 ) -> NetworkWeights:
     """Build networks from options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
 
-    A SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
+    Raises SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
     """
     try:
         sizes = NetworkOptions.from_dict(options)
@@ -124,10 +124,10 @@ def _header_error(path: StrPath, error: Exception, remedy: str) -> SceneError:
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:
-    """Load a checkpoint by name, with notes for the user; None for the analytic stages alone.
+    """Load a checkpoint by name, with notes for the user; None for the analytic stages.
 
-    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. A checkpoint that cannot be used is
-    a SceneError where it is ``required``, otherwise a note, and the stages run without it.
+    ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. If a checkpoint cannot be used, a
+    SceneError is raised if it is ``required``; otherwise a note is added, and the stages run without networks.
     """
     if name == "none":
         return None, []

@@ -13,7 +13,7 @@ class Corrector:
 
     @property
     def max_children(self) -> int:
-        """Most Gaussians of a Feature Gaussian."""
+        """Largest number of children of a Feature Gaussian."""
         return MAX_CHILDREN
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
@@ -21,7 +21,7 @@ class Corrector:
         return features
 
     def decode_for_matching(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Replace means and covariances by decoded ones, by which Feature Gaussians are matched."""
+        """Replace means and covariances by decoded ones, for matching Feature Gaussians."""
         return features
 
     def merge(

@@ -28,9 +28,9 @@ def cross_view_stats(
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
     Points ``means [g,3]`` with base colours ``sh0 [g,1,3]`` belong to ``views [g]`` int64, which are left out. The
-    statistics ``[g,7]`` float32 are the logarithm of the number of views that see the point; the shares of these views
-    whose surface is at the point, behind it and in front of it; the mean difference of colours and of relative depths;
-    the logarithm of the number of views.
+    statistics ``[g,7]`` float32 are: the logarithm of the number of views that see the point; the shares of these views
+    with a surface at the point, behind it and in front of it; the mean differences of colours and of relative depths;
+    the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, 6] = math.log(len(cameras)) / 4
@@ -58,9 +58,9 @@ def cross_view_stats(
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """Find the nearest points of other views, ``[g,count]`` int64, nearest first (paper section 4.4).
 
-    -1 where there are fewer, or where ``MOST`` times as many points, at least 1,024, most of them of the own view, are
-    nearer: what lies behind those overlaps nothing. Points are ``means [g,3]`` float64, finite; a view below 0 counts
-    as another.
+    -1 if there are fewer. A point is also not found behind ``MOST`` times as many nearer points, at least 1,024, which
+    are mostly of the own view: points behind those overlap nothing. Points are ``means [g,3]`` float64, finite; a view
+    below 0 counts as another view.
     """
     num = len(means)
     num_nodes = 4 << (num // LEAF).bit_length()

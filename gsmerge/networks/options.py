@@ -74,7 +74,10 @@ class NetworkOptions(Settings):
 
     @property
     def max_children(self) -> int:
-        """Largest number of children that heads correct: five or more in two halves, not with absolute outputs."""
+        """Largest number of children that heads correct.
+
+        Five or more are corrected in two halves, which absolute heads cannot do.
+        """
         return SLOTS[-1] if self.outputs == "absolute" else 2 * SLOTS[-1]
 
     @property
@@ -150,7 +153,7 @@ def _block(name: str, width: int) -> dict[str, tuple[int, ...]]:
 
 
 def _mlp(name: str, *widths: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of linear layers, whose numbers are even: those between are their activations."""
+    """Return the shapes of linear layers; their numbers are even, since activations have the odd ones."""
     layers = (_linear(f"{name}.{2 * i}", *pair) for i, pair in enumerate(pairwise(widths)))
     return {key: shape for layer in layers for key, shape in layer.items()}
 

@@ -62,7 +62,7 @@ def describe_features(
 def make_group_features(
     features: FeatureGaussians, views: np.ndarray, group: np.ndarray, cameras: Cameras
 ) -> GroupFeatures:
-    """Assemble the networks' inputs from ``views [g]`` and numbers ``group [g,GROUP]`` that are known already."""
+    """Assemble the networks' inputs from known ``views [g]`` and numbers ``group [g,GROUP]``."""
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
@@ -84,7 +84,7 @@ def _viewmats(cameras: Cameras) -> np.ndarray:
 
 
 def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras) -> np.ndarray:
-    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, the one with most opacity."""
+    """Choose a view ``[g]`` int64 for each Feature Gaussian: its own or, if merged, the view with the most opacity."""
     views = features.views.copy()
     merged = np.flatnonzero(views < 0)
     if len(merged) == 0:
@@ -101,10 +101,9 @@ def choose_views(features: FeatureGaussians, members: Members, cameras: Cameras)
 def part_tokens(
     parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures, columns: int = PART
 ) -> np.ndarray:
-    """Make tokens that describe the Gaussians ``ids [n]`` relative to the groups ``owners [n]`` they belong to.
+    """Make tokens that describe the Gaussians ``ids [n]`` relative to their groups ``owners [n]``.
 
-    Returns ``[n,columns]``: PART columns for every Gaussian, then MEMBER columns that only members fill; the rest is
-    zero.
+    Returns ``[n,columns]``: PART columns for every Gaussian, then MEMBER columns only for members; the rest is zero.
     """
     g, out = group_features, np.zeros((len(ids), columns), np.float32)
     describe_parts(
@@ -139,9 +138,9 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     """Sample at most ``width`` members of every group, evenly along their ``keys [m]``, independent of order.
 
     Keys come group by group, ``sizes [g]`` of each. A group that is too large is cut along its key into ``width`` runs
-    as equal as possible, and one member of each is taken at random from ``seeds [g]`` uint64: the sample covers the
-    group (paper supplement, encoder compute). Returned are ``[g,width]`` positions into ``keys``, and a mask of the
-    valid ones; the others repeat the group's first.
+    of similar length, and one random member is taken from each by ``seeds [g]`` uint64, so the sample covers the group
+    (paper supplement, encoder compute). Returns positions ``[g,width]`` in ``keys``, and a mask of the valid ones;
+    invalid positions repeat the first of the group.
     """
     first = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))

@@ -34,7 +34,7 @@ class NetworkWeights:
         return sum(array.size for array in self.arrays.values())
 
     def heads_alone(self) -> NetworkWeights:
-        """Return a copy with the decoder heads alone; the other networks take ten times as long."""
+        """Return a copy with only the decoder heads; the other networks take ten times as long."""
         options = replace(self.options, encoder=False, merger=False, refiner=False)
         return NetworkWeights(
             options, {name: array for name, array in self.arrays.items() if name.startswith("heads.")}
@@ -43,8 +43,8 @@ class NetworkWeights:
     def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
-        Inputs are those of the module of the same name. Returned are its outputs side by side, ``[b,columns]``, through
-        tanh, 0 for NaN; those of a head are ``[b,K * 13]``.
+        Inputs are those of the module of the same name. Returns its outputs side by side, ``[b,columns]``, after tanh,
+        with 0 for NaN; outputs of a head are ``[b,K * 13]``.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)
@@ -81,7 +81,7 @@ class NetworkWeights:
         return self._dense(f"{name}.out", x, TANH).reshape(len(children), -1)
 
     def _block(self, name: str, x: np.ndarray, mask: np.ndarray, *, first: bool = False) -> np.ndarray:
-        """Run attention and an MLP; ``first``: for the first token alone."""
+        """Run attention and an MLP; ``first``: only for the first token."""
         context = self._norm(f"{name}.before", x)
         x, query = (x[:, :1], context[:, :1]) if first else (x, context)
         x = self._attention(f"{name}.attention", query, context, mask, x)
@@ -133,7 +133,7 @@ class NetworkWeights:
         return {name: self._layer(name) for name in names}
 
     def _layer(self, name: str) -> Layer:
-        """Pack a linear layer; the heads' values are padded where attention makes them, and where they are read."""
+        """Pack a linear layer; values of attention heads are padded in the layers that write and read them."""
         weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads

@@ -145,7 +145,7 @@ class Rendering:
 def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array, Array]:
     """Return splats relative to the cameras' mean centre, and viewmats and intrinsics in float64.
 
-    The centre is taken off in float64, so that scenes in geographic coordinates keep their detail.
+    The centre is subtracted in float64, so that scenes in geographic coordinates keep their detail.
     """
     cameras = cameras.numpy()
     origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)

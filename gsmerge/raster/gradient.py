@@ -41,7 +41,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not asked for
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Return the gradients of some Gaussians, by mask or by row; that of the view matrix stays."""
+        """Return the gradients of the Gaussians ``rows`` (mask or indices); that of the view matrix stays."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 

@@ -101,9 +101,9 @@ def render_in_turn(
     near: float = 0.01,
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> Iterator[np.ndarray]:
-    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed by ``convert``, pixel by pixel.
+    """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed pixel by pixel by ``convert``.
 
-    At most ``at_once`` are in memory; large ones are drawn, and converted, in bands.
+    At most ``at_once`` images are in memory; large images are drawn and converted in bands.
     """
     under = background_color(background)
     tile_one = _tiler(gaussians, cameras, {"antialiased": antialiased, "near": near})

@@ -141,7 +141,7 @@ def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
-    """Return black photos that take no memory, for uses where only cameras matter; sides divided by ``level``."""
+    """Return black photos that take no memory, if only their cameras matter; sides divided by ``level``."""
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     w, h = cameras.width, cameras.height
     width, height = max(1, round(w / level)), max(1, round(h / level))
@@ -163,11 +163,10 @@ def photo_errors(
 ) -> list[Score]:
     """Render Gaussians into the photos' cameras and score every picture, several views at once.
 
-    ``score`` gets the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance
-    ``[h,w]``. ``views`` of the photos, in the order of the result; None: all. ``near`` is in the
-    Gaussians' unit; ``colors [n,3]`` replace the harmonics. ``keep`` gives a view's mask ``[n]`` of
-    the Gaussians to draw, ``tiles`` its mask ``[tile_height,tile_width]`` of the tiles to complete;
-    None is all.
+    ``score`` is called with the view, its render ``[h,w,3]`` float32 (not clipped) and the transmittance ``[h,w]``.
+    ``views``: views of the photos, in the order of the result; None: all. ``near`` is in the unit of the Gaussians.
+    ``colors [n,3]`` replace the harmonics. ``keep`` returns for a view the mask ``[n]`` of the Gaussians to draw, and
+    ``tiles`` the mask ``[tile_height,tile_width]`` of the tiles to complete; None: all.
     """
     splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
 
@@ -193,7 +192,7 @@ def score_photos(
 ) -> PhotoScore:
     """Score renders against the photos of ``views``, or a ``quarter`` of each; see :func:`photo_errors`.
 
-    ``covered``: a mask ``[h,w]`` for each of the views; None: where the Gaussians are opaque by half.
+    ``covered``: a mask ``[h,w]`` for each of the views; None: the pixels with an opacity of at least a half.
     """
     masks = {} if covered is None else dict(zip(views, covered, strict=True))
 
@@ -231,7 +230,7 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:
-    """Return a mask ``[tile_height,tile_width]`` that selects a quarter of a view's tiles; None for small views."""
+    """Return a mask ``[tile_height,tile_width]`` of a quarter of a view's tiles; None for small views."""
     tile_height, tile_width = -(-height // TILE), -(-width // TILE)
     if min(tile_height, tile_width) <= 3 * BLOCK:
         return None

@@ -69,7 +69,7 @@ def _float32(array: Array) -> Array:
 
 
 def _spread_origin(means: Array) -> Array:
-    """Return zero, or the middle of Gaussians so far from zero that float32 would blur them."""
+    """Return zero, or the centre of Gaussians that are too far from zero for float32."""
     sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
     if len(sample) == 0:
@@ -133,7 +133,7 @@ def camera_numbers(
 
 
 def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
-    """Count the tiles above and left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
+    """Count the marked ``tiles`` above and left of each corner, ``[tile_height+1,tile_width+1]`` int32."""
     if tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
@@ -156,7 +156,7 @@ def _visible(
 
 
 def aligned_rows(count: int, width: int) -> Array:
-    """Return ``[count,width]`` float32 starting at a cache line, so that no short row lies across two."""
+    """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row spans two."""
     line = 16
     buffer = np.empty(count * width + line, np.float32)
     start = -(buffer.ctypes.data // buffer.itemsize) % line
@@ -205,7 +205,7 @@ def _bin(
 def _bin_open(
     order: Array, boxes: Array, conics: Array, tile_height: int, tile_width: int, threads: int
 ) -> tuple[Array, Array]:
-    """Return the lists of :func:`_bin`, each as far as something can be seen of it, so that they stay short."""
+    """Return the lists of :func:`_bin`, each cut off behind the last visible Gaussian, so that they stay short."""
     num = min(tile_height, 4 * threads)
     spans = [(tile_height * i // num, tile_height * (i + 1) // num) for i in range(num)]
 

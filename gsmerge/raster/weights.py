@@ -34,7 +34,7 @@ class ViewWeights:
 
     @property
     def entries(self) -> tuple[Array, Array, Array, Array, Array, int]:
-        """First arguments of the kernels that go over the entries of W."""
+        """First arguments of the kernels that process the entries of W."""
         return self.starts, self.lanes, self.weights, self.flatten_ids, self.isect_offsets, self.tile_width
 
 

@@ -140,7 +140,7 @@ def break_rows(setup: StressScene) -> StressScene:
 
 
 def throw_away(setup: StressScene) -> StressScene:
-    """Move a few Gaussians a thousand times as far from the origin."""
+    """Move a few Gaussians a thousand times as far from the origin as they were."""
     scene = setup.scene
     chosen = _choose(len(scene.gaussians), FAR_SHARE)[:, None]
     means = np.where(chosen, 1000 * scene.gaussians.means, scene.gaussians.means)
@@ -289,7 +289,7 @@ def stress(
 def _check_case(
     case: Case, load: Loaded, setup: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
 ) -> tuple[bool | None, str]:
-    """Check whether the case's property holds, and return that with the figures."""
+    """Check whether the property of a case holds; return the answer with the figures."""
     problem = _inapplicable(case, load)
     if problem is not None:
         return None, problem
@@ -311,7 +311,7 @@ def _check_case(
 
 
 def _inapplicable(case: Case, load: Loaded) -> str | None:
-    """Say why a case does not apply to a scene; None where it does."""
+    """Return why a case does not apply to a scene; None if it does."""
     scene = load.scene
     if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
         return "needs a Gaussian for each pixel"
@@ -371,7 +371,7 @@ def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> 
 
 
 def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
-    """Read the scene from cameras whose poses are in another convention than that of their format."""
+    """Read the scene from cameras with poses in another convention than their format declares."""
     assert load.cameras is not None
     assert case.convention is not None
     stored = from_viewmats(load.cameras.viewmats, case.convention)
@@ -387,7 +387,7 @@ def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool,
 
 
 def _check_cameras(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
-    """Read the scene from cameras that are off, with Gaussians that are not."""
+    """Read the scene with wrong cameras and correct Gaussians."""
     assert load.cameras is not None
     assert case.cameras is not None
     wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
@@ -407,7 +407,7 @@ def _read_again(load: Loaded, cameras: CameraFile, hints: ReadHints) -> Loaded:
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """Say what is wrong with a result for any scene; None where nothing is."""
+    """Return a defect that no result may have; None if there is none."""
     for name in _FIELDS:
         if not np.isfinite(getattr(gaussians, name)).all():
             return f"{name} are not finite"

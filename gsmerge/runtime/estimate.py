@@ -39,10 +39,9 @@ def work_seconds(
 ) -> float:
     """Estimate the processor seconds of compacting a scene, without imports.
 
-    ``pixels`` of all views together, or Gaussians where they are more; ``view_pixels`` of one view;
-    ``options``: all settings by flat name, with the checkpoint that is used; ``photos``: whether
-    there are any to fit to and to score on; ``num_drawn``: Gaussians that lie in a view of the
-    fit, on average, None: the usual number.
+    ``pixels``: pixels of all views together, or the number of Gaussians if that is larger; ``view_pixels``: pixels of
+    one view; ``options``: all settings by flat name, with the checkpoint in use; ``photos``: whether there are photos
+    to fit to and to score on; ``num_drawn``: average number of Gaussians in a view of the fit, None: the usual number.
     """
     method, fits = options["method"], fit_of(options, photos=photos) == "full"
     work = COST_MERGE + COST_SCORE * photos + COST_FIT * fits
@@ -69,15 +68,15 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
 def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere: int = 0) -> int:
     """Estimate the memory of a run in bytes, imports included.
 
-    ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene beyond the ``pixels`` of the
-    block that is worked on.
+    ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene outside the block of ``pixels``
+    in work.
     """
     each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos
     return BYTES_FIXED + round(each * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 
 def memory_problem(needed: int) -> str | None:
-    """Describe why a run of ``needed`` bytes may not fit into this machine; None if it should."""
+    """Return why a run of ``needed`` bytes may not fit into this machine; None if it should."""
     available = machine_memory()
     if available is None or needed <= available:
         return None

@@ -51,8 +51,8 @@ def free_memory() -> int | None:
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    glibc keeps memory that a thread has freed for that thread; across stages that use different threads this adds up to
-    a tenth of the peak. Does nothing on other systems.
+    glibc keeps the memory that a thread has freed for that thread. Over stages that use different threads this adds up
+    to a tenth of the peak. Does nothing on other systems.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -62,10 +62,10 @@ def release_memory() -> None:
 def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: int | None = None) -> np.ndarray:
     """Make an uninitialised array; a large one is mapped from an unnamed temporary file, if there is room.
 
-    ``mapped_bytes``: from how many bytes on it is large, at most ``MAPPED_BYTES``, which is also the default.
+    ``mapped_bytes``: size in bytes from which an array is large, at most ``MAPPED_BYTES``, which is also the default.
 
     A mapped array takes memory only while it is in use, and none after :func:`free_pages`. The file is in the system's
-    temporary folder (``TMPDIR``), and goes with the array.
+    temporary folder (``TMPDIR``), and is removed with the array.
     """
     size = prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
@@ -89,7 +89,7 @@ def free_pages(arrays: Iterable[np.ndarray]) -> None:
 
 
 def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
-    """Copy ``array[ids]``; of a mapped array, memory has only what a part of the ids, best in order, looks up."""
+    """Copy ``array[ids]``; for a mapped array only a part at a time is in memory, the least if ids are sorted."""
     parts = -(-array.nbytes // MAPPED_BYTES)
     if parts <= 1:
         return array[ids]

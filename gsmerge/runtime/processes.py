@@ -1,4 +1,4 @@
-"""A pool of processes on this machine, each of which makes one call after the other."""
+"""A pool of processes on this machine; each process makes one call after the other."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Worker:
         self.count = 0
 
     def read_result(self) -> Any:
-        """Return the result of the current call, or Lost where the process has ended; raise what the call raised."""
+        """Return the result of the current call, or Lost if the process has ended; raise an exception of the call."""
         try:
             is_result, value = self.pipe.recv()
         except (EOFError, OSError):
@@ -71,7 +71,7 @@ class ProcessPool(Pool):
             worker.pipe.send((function, call.arguments))
 
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each that has."""
+        """Wait until a call ends; return key and result of each ended call."""
         busy, ended = [worker for worker in self.workers if worker.key is not None], []
         ready = wait([worker.pipe for worker in busy])
         for worker in [worker for worker in busy if worker.pipe in ready]:
@@ -91,7 +91,7 @@ class ProcessPool(Pool):
 
 
 def _describe_exit(process: BaseProcess) -> str:
-    """Say how a process ended."""
+    """Describe how a process ended."""
     code = process.exitcode
     if code is None or code >= 0:
         return f"its process ended unexpectedly (exit code {code})"
@@ -117,7 +117,7 @@ def _library_threads(count: int) -> Iterator[None]:
 
 
 def run_worker(pipe: Connection) -> None:
-    """Make the calls that come through the pipe until it closes; main function of a worker process."""
+    """Execute calls that come through the pipe until it closes; main function of a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles it, and ends its processes
     os.dup2(2, 1)  # only the run itself prints to stdout
     parent = multiprocessing.parent_process()

@@ -80,7 +80,7 @@ def _write_to(record: Record) -> Iterator[Record]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """Time a block or function as one of ``STAGES``; inside another stage its time counts for that one."""
+    """Time a block or function as one of ``STAGES``; inside another stage its time counts for the outer stage."""
     record = _current.get()
     if record is None or record.running is not None:
         yield

@@ -41,7 +41,7 @@ class _Pool:
             del work  # it would keep what it worked on until the next one comes
 
     def shutdown(self) -> None:
-        """End the threads, once all work that was handed over is done."""
+        """End the threads, once all submitted work is done."""
         for _ in self.threads:
             self.work.put(None)
         for thread in self.threads:
@@ -110,8 +110,8 @@ def _hold_opencv() -> None:
 def hold_torch() -> None:
     """Limit torch to one thread while the calling thread has a pool, if torch is imported.
 
-    :func:`use_threads` and :func:`parallel_map` call it; code that imports torch while a pool is in use calls it before
-    its first computation.
+    :func:`use_threads` and :func:`parallel_map` call it. Code that imports torch while a pool is in use must call it
+    before its first computation.
     """
     torch = sys.modules.get("torch")
     if _local.pool is None or _local.holds_torch or torch is None or not hasattr(torch, "set_num_threads"):
@@ -138,9 +138,9 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call
-    the items are worked off one by one. The calling thread takes its share, so that a short call
-    costs one hand-over, not one for each item.
+    Outside :func:`use_threads` a pool of all processors is made for the call; inside another call the items are
+    computed one by one. The calling thread computes items as well, so that a short call costs one hand-over, not one
+    for each item.
     """
     items = list(items)
     with use_threads() as count:
@@ -152,8 +152,8 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Yield the results of :func:`parallel_map` in order, with only a few in memory at a time.
 
-    This suits results as large as all Gaussians for every view that are only added up: memory does not grow with the
-    views.
+    Use it for results as large as all Gaussians, one per view, that are only added up: memory then does not grow with
+    the number of views.
     """
     items = list(items)
     for first in range(0, len(items), AT_ONCE):
@@ -161,10 +161,10 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 
 
 def _share(pool: _Pool, function: Callable[[T], R], items: list[T], helpers: int) -> list[R]:
-    """Work off the items on this thread and some of the pool's; who is free takes the next.
+    """Compute the items on this thread and some of the pool's; a free thread takes the next item.
 
-    A thread that comes too late for any is not waited for. After an error nothing more is begun; of several errors that
-    of the first item is raised, whichever thread is quicker.
+    A thread that comes too late for any item is not waited for. After an error no further item is begun. If several
+    items fail, the error of the first item is raised, whichever thread is quicker.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     following = itertools.count()  # its next() is atomic

@@ -49,7 +49,7 @@ class Pool(ABC):
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
         """Make calls of a picklable function, each taken when there is room for it.
 
-        Yields the key and the result of each, or :class:`Lost`, as it ends; raises what a call raises.
+        Yields the key and the result of each call, or :class:`Lost`, as it ends; raises exceptions of a call.
         """
         waiting, active = iter(calls), 0
         while True:
@@ -68,11 +68,11 @@ class Pool(ABC):
 
     @abstractmethod
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each that has."""
+        """Wait until a call ends; return key and result of each ended call."""
 
     @abstractmethod
     def close(self) -> None:
-        """End all processes, and the calls that they make."""
+        """End all processes and their calls."""
 
 
 @contextmanager
@@ -99,9 +99,9 @@ class Cluster:
         return int(self.ray.cluster_resources().get("CPU", 1.0))
 
     def needs(self, threads: int, memory: int) -> dict[str, float]:
-        """Return the resources that a task asks for, at most those of the largest node; UsageError without processors.
+        """Return the resources that a task requests, at most those of the largest node.
 
-        Ray would let a task that asks for more wait forever.
+        Ray would let a task that requests more wait forever. UsageError without processors.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -131,7 +131,7 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield (result, record) of each, in order.
 
-        A cluster makes as many at once as it has processors; this process makes one after the other.
+        A cluster makes as many calls at once as it has processors; this process makes one after the other.
         """
         if self.cluster is not None:
             yield from self._run_there(self.cluster, title, function, count, calls)
@@ -181,7 +181,7 @@ class RayPool(Pool):
 
     @property
     def capacity(self) -> int:  # type: ignore[override]
-        """Calls at once; a cluster may grow meanwhile."""
+        """Number of simultaneous calls, which may change as a cluster grows."""
         return self.jobs or max(1, self.cluster.processors // self.threads)
 
     def submit(self, function: Callable[..., Any], call: Call) -> None:
@@ -190,7 +190,7 @@ class RayPool(Pool):
         self.keys[self.function.options(**needs).remote(os.getcwd(), function, *call.arguments)] = call.key
 
     def wait(self) -> list[tuple[Any, Any]]:
-        """Wait until a call ends; return key and result of each that has."""
+        """Wait until a call ends; return key and result of each ended call."""
         ready, pending = self.ray.wait(list(self.keys), num_returns=1, timeout=None)
         if pending:
             ready += self.ray.wait(pending, num_returns=len(pending), timeout=0)[0]
@@ -229,7 +229,7 @@ def require_ray() -> ModuleType:
 
 
 def _join(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
-    """Connect to the cluster, or start one of this machine alone."""
+    """Connect to the cluster, or start one on this machine."""
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of processes that Ray itself ends
     quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}

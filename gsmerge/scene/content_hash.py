@@ -51,7 +51,7 @@ def read_files(files: SceneFiles) -> list[Path]:
 
 
 def photos_of(cameras: Path) -> list[Path]:
-    """List the photos of a camera file: files that it names, otherwise image folders next to it."""
+    """List the photos of a camera file: the files that it names, otherwise image folders next to it."""
     camera_file = cameras_of(cameras)
     root = cameras if cameras.is_dir() else cameras.parent
     names = () if camera_file is None else camera_file.names

@@ -102,7 +102,7 @@ class PhotoMatch:
 
 
 def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | None:
-    """Choose the photos that show the ``pictures [v,h,w,3]`` of a grid's pixels; None where there are none."""
+    """Choose the photos that show the ``pictures [v,h,w,3]`` of a grid; None if there are none."""
     views, height, width = pictures.shape[:3]
     if not views <= len(paths) <= _MAX_PHOTOS:
         return None
@@ -143,7 +143,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
 
 
 def _show(alike: np.ndarray) -> bool:
-    """Return whether photos that correlate so much with the views ``[v]`` show them."""
+    """Return whether photos with these correlations to the views ``[v]`` show them."""
     return bool(alike.mean() >= _MIN_ALIKE and alike.min() >= _MIN_ALIKE_EACH)
 
 

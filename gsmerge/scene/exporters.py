@@ -385,8 +385,8 @@ def choose_exporters(
 ) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    Exporters that leave a mark of their own in the header go before those that leave none. ``layout`` and ``frame``
-    are those of the rows; None where the rows belong to no pixels.
+    Exporters that leave a mark in the header precede exporters that leave none. ``layout`` and ``frame`` belong to the
+    rows; None if the rows belong to no pixels.
     """
     exporter = find_exporter(name)
     if exporter is not None:

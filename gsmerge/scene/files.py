@@ -71,7 +71,7 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path from which names of results are derived: the file, or ``scene.ply`` in the folder of parts or frames."""
+        """Path from which names of results are derived: the file, or ``scene.ply`` in a folder of parts or frames."""
         if is_frame(self.ply):
             return self.ply.parent.with_name("scene.ply")
         return self.ply.with_name("scene.ply") if self.parts else self.ply
@@ -93,14 +93,14 @@ def find_scene_files(
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names are not searched.
 
-    Cameras inside the ``.ply``, or of the depth maps, go before others beside it, those of a result,
-    ``NAME.cameras.json``, before any other.
+    Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
+    result, ``NAME.cameras.json``, over all others.
 
-    The given folder is searched, then the ``.ply``'s own, then the one above it for ``gs_ply/``, ``ply/`` and
-    ``gaussians/``, and two above it for ``point_cloud/iteration_n/``; in each the places of ``PLY_PLACES``,
-    ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` in their order. Without any of these cameras the only file
-    of any name that holds some will do. Images inside the cameras' ``.npz`` or ``.torch`` go before a folder, because
-    they are those that the model saw. A result of gsmerge is taken where a folder has nothing else.
+    The search goes through the given folder, that of the ``.ply``, the folder above it for ``gs_ply/``, ``ply/`` and
+    ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of ``PLY_PLACES``,
+    ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has cameras, the only
+    file of any name that holds cameras is taken. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over
+    a folder, because the model saw those. A result of gsmerge is taken if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
@@ -168,7 +168,7 @@ def _named(path: StrPath | None) -> Path | None:
 
 
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
-    """Find the files of a folder's only scene, as :func:`find_scene_files`; several are its parts, in their order."""
+    """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order."""
     plys = list_plys(folder)
     if len(plys) == 1:
         return plys
@@ -189,8 +189,9 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
 def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
-    That is the one of a usual name, those in the folder, in ``gaussians/`` or further down, depth maps, or only results
-    of gsmerge; at last one of a usual name that holds no Gaussians, so that its reader says what it lacks.
+    They are the file of a usual name; or the files in the folder, in ``gaussians/`` or further down; or depth maps; or
+    only results of gsmerge. At last a file of a usual name without Gaussians is listed, so that its reader reports what
+    it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
@@ -204,7 +205,7 @@ def _plys_in(folder: Path) -> list[Path]:
 
 
 def _scenes_below(folder: Path) -> list[Path]:
-    """List the folders of scenes below one, down to a depth; none where there are too many entries."""
+    """List the folders of scenes below a folder, down to a limited depth; empty if there are too many entries."""
     scenes, places, num_entries = [], [(folder, 0)], 0
     for place, depth in places:  # which grows
         with suppress(OSError), os.scandir(place) as entries:
@@ -221,10 +222,10 @@ def _scenes_below(folder: Path) -> list[Path]:
 
 
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
-    """Return files that have a view or a part of one scene each by their numbers; None where they are several scenes.
+    """Return the files that are views or parts of one scene, ordered by number; None if they are several scenes.
 
-    They are parts if their names say so, or if there are as many as cameras of all. A file with a camera of its own
-    is in a frame of its own.
+    They are parts if their names say so, or if the number of cameras is that of the files. A file with a camera of its
+    own is in a frame of its own.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     names = {match[1].lower() if match else "" for match in matches}
@@ -250,7 +251,7 @@ def _has_own_camera(path: Path) -> bool:
 
 
 def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
-    """Return whether files have as many Gaussians each, and there are as many cameras of all."""
+    """Return whether files have equally many Gaussians, and there is one camera for each file."""
     if cameras is None or len({header_counts(path) for path in plys}) > 1:
         return False
     with suppress(SceneError):
@@ -259,7 +260,7 @@ def _has_camera_each(plys: Sequence[Path], cameras: Path | None) -> bool:
 
 
 def named_ply(folder: Path) -> Path | None:
-    """Find the scene in a folder that has a usual name; of trained ones, that of the most steps. None without one."""
+    """Find the scene in a folder by a usual name; for trained scenes, the one of the most steps. None without one."""
     for place in PLY_PLACES:
         if (folder / place).is_file() and _is_scene(folder / place):
             return folder / place

@@ -37,12 +37,12 @@ class HeldOutViews(Views):
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
-    """Read held-out photos and their cameras, in any of the forms that scenes may have.
+    """Read held-out photos and their cameras, in any format of a scene.
 
-    Views that the scene was made of are left out. If the file has those too, under the same names, their poses tell how
-    its world lies to that of the Gaussians; otherwise it is taken for the world of the scene's own cameras. Poses are
-    read in the convention that the scene's cameras needed. ``images``: folder of the photos; None: where the camera
-    file says. SceneError if a file is missing or damaged, or no view is left.
+    Views that the scene was made from are left out. If the file has those views as well, under the same names, their
+    poses map its world to that of the Gaussians; otherwise its world is assumed to be that of the scene's own cameras.
+    Poses are read in the convention that the scene's cameras needed. ``images``: folder of the photos; None: as the
+    camera file says. SceneError if a file is missing or damaged, or no view is left.
     """
     path = Path(cameras)
     if not path.exists():
@@ -75,7 +75,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 def place_camera_file(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
     """Read a camera file into the frame of a scene's Gaussians; also map its views to those of the scene.
 
-    Which frame they are in, and in which convention, is decided as :func:`read_held_out` says.
+    Frame and convention are chosen as in :func:`read_held_out`.
     """
     stored, cameras = read_cameras(path, scene=load.files.ply.stem), load.cameras
     readings = [stored]
@@ -111,7 +111,7 @@ def _shared_views(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, 
 
 
 def _find_world(camera_file: CameraFile, named: dict[int, int], load: Loaded) -> tuple[Similarity, dict[int, int]]:
-    """Find the similarity from the file's world to that of the Gaussians, and the views that the scene has too."""
+    """Find the similarity from the file's world to that of the Gaussians, and the views that the scene also has."""
     stored = _stored_world(load)
     if not named:
         return stored, {}
@@ -146,7 +146,7 @@ def _stored_world(load: Loaded) -> Similarity:
 def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> Similarity:
     """Fit the similarity that maps cameras ``theirs [c,4,4]`` (world to camera) to ``ours``, by least squares.
 
-    The scale is ``scale`` where all cameras stand in one place and do not determine it.
+    If all cameras stand in one place, they do not determine the scale, and ``scale`` is used.
     """
     rotation = closest_rotation(matmul(ours[:, :3, :3].swapaxes(1, 2), theirs[:, :3, :3]).sum(0))
     a, b = matmul(camera_centres(theirs), rotation.T), camera_centres(ours)
@@ -158,7 +158,7 @@ def fit_similarity(theirs: np.ndarray, ours: np.ndarray, scale: float = 1.0) -> 
 
 
 def _repeated(moved: np.ndarray, scene: Scene) -> dict[int, int]:
-    """Map views to the views of the scene that stand in the same place and look the same way."""
+    """Map views to the views of the scene with the same position and viewing direction."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)

@@ -74,7 +74,7 @@ def no_gaussians(folder: Path) -> SceneError:
 
 
 def find_remedy(folder: Path) -> str:
-    """Return what to do about a folder of folders without a scene; empty where nothing in them is known."""
+    """Return what to do about a folder of folders without a scene; empty if nothing in them is known."""
     with suppress(OSError):
         inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
         for place in (folder, *islice(inside, MAX_FOLDERS)):
@@ -85,7 +85,7 @@ def find_remedy(folder: Path) -> str:
 
 
 def _content(folder: Path) -> tuple[str, str] | None:
-    """Describe what a folder has in the place of a .ply, and what to do about it; None if nothing in it is known."""
+    """Describe the known content of a folder without a .ply, and what to do with it; None if nothing in it is known."""
     files = (
         path
         for path in sorted(folder.glob("[!.]*"))

@@ -156,7 +156,7 @@ def read_scene(
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene as it is, or read it from a path; notes tell what is odd about the file."""
+    """Return a scene unchanged, or read it from a path; notes describe unusual content of the file."""
     if isinstance(scene, Scene):
         return scene
     load = load_scene(scene)
@@ -211,7 +211,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
 
 
 def read_rows(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
-    """Read the Gaussians of a scene's files; the opacity's encoding comes from the option or the exporter."""
+    """Read the Gaussians of a scene's files; the encoding of opacities is given by the option or the exporter."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"  # activated ones show themselves, and some versions write logits in their place
@@ -228,7 +228,7 @@ def align_scene(
 ) -> Loaded:
     """Combine Gaussians, cameras and photos to a scene; find the pixel of every row if there is one.
 
-    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` none
+    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` no photos
     are searched.
     """
     camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
@@ -260,7 +260,7 @@ def align_scene(
 
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views, in which some are placed later; SceneError if there are photos to use."""
+    """Make a scene without views, which are placed later; SceneError if there are photos to use."""
     notes = []
     if files.images is not None:
         if hints.order != "none":
@@ -323,7 +323,7 @@ def _make_load(
 
 
 def _unaligned_note(hints: ReadHints) -> str:
-    """Say that rows have no pixels, and what was not tried."""
+    """Note that rows have no pixels, and which searches were not made."""
     note = "the rows belong to no pixels that could be found: unaligned"
     if hints.exporter == "auto":
         return note
@@ -331,7 +331,10 @@ def _unaligned_note(hints: ReadHints) -> str:
 
 
 def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFiles) -> Gaussians:
-    """Give Gaussians of depth maps without images the photos' colours; others stay. SceneError without photos."""
+    """Give Gaussians of depth maps without images the colours of the photos.
+
+    Other Gaussians stay unchanged. SceneError without photos.
+    """
     if input_format(files.ply) is not DEPTHS or holds_images(files.ply):
         return gaussians
     if images.size != 3 * len(gaussians):
@@ -341,7 +344,7 @@ def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFil
 
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
-    """Put pixels back that the exporter dropped, where their depths are known or can be guessed; with a note."""
+    """Restore pixels that the exporter dropped, if their depths are known or can be guessed; with a note."""
     images = scene.images
     if images is None or scene.missing is None:
         return scene, []
@@ -364,9 +367,9 @@ def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequ
 def _place_rows(
     ply: GaussianFile, result: AlignmentResult
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
-    """Bring rows to the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
+    """Sort rows by the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
 
-    Pixels without a row get a fully transparent Gaussian. Of rows without pixels the finite ones stay, except for
+    Pixels without a row get a fully transparent Gaussian. Rows without pixels are kept if they are finite and not
     padding.
     """
     if result.pixel_ids is None:
@@ -397,7 +400,7 @@ def _place_rows(
 
 
 def _counts_up(ids: np.ndarray) -> bool:
-    """Return whether numbers are those from 0 on; compared in parts, as there may be hundreds of millions."""
+    """Return whether numbers are 0, 1, 2, ...; compared in parts, as there may be hundreds of millions."""
     starts = range(0, len(ids), _PART)
     parts = ((first, ids[first : first + _PART]) for first in starts)
     return all(np.array_equal(part, np.arange(first, first + len(part), dtype=ids.dtype)) for first, part in parts)
@@ -406,7 +409,7 @@ def _counts_up(ids: np.ndarray) -> bool:
 def _with_rotations(
     scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity
 ) -> tuple[Scene, list[str]]:
-    """Read rotations as given, as the given exporter stores them, or as fits the surface; with a note."""
+    """Read rotations by the hint, as the given exporter stores them, or as fits the surface; with a note."""
     turn = frame.rotation if frame.kind in TURNED else None
     if hints.quats != "auto":
         return read_rotations(scene, hints.quats, turn), []
@@ -419,10 +422,10 @@ def _with_rotations(
 
 
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
-    """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; otherwise keep them.
+    """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
 
-    ``photos`` that cannot be read are an error; with False they are left out. SceneError if cameras have no size, or
-    there are photos without any.
+    ``photos`` that cannot be read raise an error; with False photos are left out. SceneError if cameras have no size,
+    or there are photos without cameras.
     """
     camera_file = read_scene_cameras(ply, files)
     if camera_file is None:

@@ -62,7 +62,7 @@ _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its p
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
     """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
 
-    Where a file has poses alone, the focal length is estimated; SceneError if that fails.
+    If a file has only poses, the focal length is estimated; SceneError if that fails.
     """
     stored = None
     if files.cameras is not None:
@@ -82,9 +82,9 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
 
 
 def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
-    """Take the photos that the model saw where those beside them do not show the scene, with a note.
+    """Choose the photos that the model saw if the photos beside them do not show the scene, with a note.
 
-    WorldMirror squeezes what is too tall into ``images``, and cuts it in ``images_resized``.
+    WorldMirror squeezes tall photos into ``images``, and crops them in ``images_resized``.
     """
     usual = files.images
     if usual is None or usual.name == _SEEN_PLACE or not (usual.parent / _SEEN_PLACE).is_dir():
@@ -107,7 +107,7 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
 
 
 def photos_without_cameras(files: SceneFiles) -> SceneError:
-    """Make the error of photos of which no cameras are known."""
+    """Make the error for photos without known cameras."""
     places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
     problem = f"the photos in {files.images} are there, but no cameras that fit them (looked for {places})"
     remedy = "name the cameras with --cameras, or do without cameras and photos by --hint order=none"
@@ -146,7 +146,7 @@ def _photos_inside(files: SceneFiles, camera_file: CameraFile) -> Photos:
 
 
 def _photo_turns(files: SceneFiles, camera_file: CameraFile) -> int:
-    """Return the quarter turns that SHARP, alone among the models, makes by the orientation tag."""
+    """Return the quarter turns by the orientation tag, which only SHARP applies among the models."""
     paths = _photo_paths(files, camera_file) if camera_file.source == SHARP else []
     turns = quarter_turns(paths[0]) if paths else 0
     if turns % 2 == 0 or not paths:
@@ -219,7 +219,7 @@ def find_larger_and_masks(
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
     def cut(view: int, picture: np.ndarray) -> np.ndarray:
-        """Undistort and turn a picture as it is in a photo's file, and cut out what the view shows."""
+        """Undistort and turn a picture given as in the photo's file, and crop it to the view."""
         if Ks is not None:
             picture = undistort_photos([picture], Ks[view : view + 1], lenses[view : view + 1])[0]
         return np.ascontiguousarray(np.rot90(picture, turns)[window.rows, window.columns])
@@ -236,7 +236,7 @@ def find_larger_and_masks(
     alphas: Sequence[Path | None] = paths or [None] * len(names)
 
     def read_parts(view: int) -> list[np.ndarray]:
-        """Read what a mask, upright, and the photo's transparency, as it is stored, say."""
+        """Read the mask, which is upright, and the photo's transparency, which is as stored."""
         mask, photo = named[view], alphas[view]
         parts = [None if photo is None else decode_alpha(photo)]
         parts += [None if mask is None else np.rot90(decode_mask(mask, photo), -turns)]
@@ -246,7 +246,7 @@ def find_larger_and_masks(
 
 
 def _match_masks(folder: Path | None, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
-    """Find the masks of photos; of a folder that was not named, only where their names tell, with a note."""
+    """Find the masks of photos, with a note; in a folder that the user did not name, only by matching names."""
     if folder is None:
         return [None] * len(names), []
     try:
@@ -264,7 +264,7 @@ def _read_masks(
     cameras: Cameras,
     cut: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray | None:
-    """Read where photos, of ``size`` in their files, count; ``cut`` brings their pictures to the views' part."""
+    """Read the masks of photos with the given file ``size``; ``cut`` crops a mask to the view."""
     shape = cameras.height, cameras.width
 
     def read(view: int) -> np.ndarray | None:
@@ -306,7 +306,7 @@ class _Window:
 
 
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part of files of the size ``stored`` that the grid shows; see :func:`find_larger_and_masks`."""
+    """Find the part of files with the size ``stored`` that the grid shows; see :func:`find_larger_and_masks`."""
     fitted = transform or resize_to(size, size)
     scale = np.array([fitted.scale_x, fitted.scale_y]) * size / np.array(stored)
     cut, grid = np.array([fitted.left, fitted.top]), np.array([fitted.width, fitted.height])
@@ -344,7 +344,8 @@ def cut_bars(photos: Photos, camera_file: CameraFile) -> tuple[Photos, list[str]
 def limit_photo_size(photos: Photos, rows: int, max_side: int, *, unaligned: bool) -> tuple[Photos, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
 
-    Photos whose pixels may be the file's ``rows`` Gaussians keep their size, unless they are known to be ``unaligned``.
+    Photos whose pixels may be the ``rows`` Gaussians of the file keep their size, unless they are known to be
+    ``unaligned``.
     """
     size = photo_size(photos)
     if size is None:
@@ -367,7 +368,7 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
 
 
 def _limit(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
-    """Make the transform that brings pictures to ``max_side``, and a note; None where nothing has to be done."""
+    """Make the transform that resizes pictures to ``max_side``, and a note; None if they are small enough."""
     if max(size) <= max_side:
         return None, []
     scale = max_side / max(size)

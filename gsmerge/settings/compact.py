@@ -66,10 +66,10 @@ class CompactOptions(Settings):
     effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
-        "none, or auto: the shipped ones where they improve the result.",
-        "`shipped`: those that come with the package; `paper`: those with absolute outputs; `none`: the analytic "
-        "stages alone. `auto`: the shipped ones where no fit follows, of which a draft or a fast run takes the decoder "
-        "heads alone.", metavar="FILE|NAME")  # fmt: skip
+        "none, or auto: the shipped networks where they improve the result.",
+        "`shipped`: networks that come with the package; `paper`: networks with absolute outputs; `none`: only the "
+        "analytic stages. `auto`: the shipped networks if no fit follows; a draft or a fast run uses only their "
+        "decoder heads.", metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
@@ -101,7 +101,7 @@ class CompactOptions(Settings):
 
     @property
     def whole_only(self) -> list[str]:
-        """Names of the settings in use that need the scene in one piece."""
+        """Names of the settings in use that require the scene in one piece."""
         budget = self.budget
         asked = {f"method {self.method}": self.method != OURS, "levels": budget.levels > 1}
         asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}

@@ -115,10 +115,10 @@ class FitOptions(Settings):
 
     @property
     def needs_photos(self) -> bool:
-        """Whether the photos are needed: to fit, or to leave out what none of them shows."""
+        """Whether photos are needed: to fit, or to drop Gaussians that none of them shows."""
         return self.fit != "none" or self.min_contribution > 0
 
     @property
     def grows(self) -> bool:
-        """Whether the fit starts with fewer Gaussians than are asked for, and adds the rest on the way."""
+        """Whether the fit starts with fewer Gaussians than requested, and adds the rest during its steps."""
         return self.fit == "full" and self.steps >= GROW_STEPS

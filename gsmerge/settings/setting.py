@@ -150,7 +150,7 @@ class Settings:
     """Base class of frozen dataclasses whose fields are settings; values that are not allowed raise ValueError."""
 
     def __init_subclass__(cls) -> None:
-        """Write what is declared of the fields into the docstring."""
+        """Write the declarations of the fields into the docstring."""
         declared = [(name, f) for name, f in vars(cls).items() if isinstance(f, Field) and "setting" in f.metadata]
         lines = [f"    {name}: {f.metadata['setting'].text}" for name, f in declared]
         cls.__doc__ = "\n".join([cleandoc(cls.__doc__ or ""), "", "Args:", *lines])
@@ -173,7 +173,7 @@ def settings_of(options: type) -> dict[str, Setting]:
 
 
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return all settings by flat name; a stage's settings stand in the place of the stage."""
+    """Return all settings by flat name; the settings of a stage replace the stage."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
@@ -188,7 +188,7 @@ def join_words(words: Iterable[str]) -> str:
 
 
 def _parts(kind: Any) -> list[Any]:
-    """List the types of which a value, or an element of a list, may be one."""
+    """List the possible types of a value, or of the elements of a list."""
     if get_origin(kind) in (Union, UnionType):
         return [part for member in get_args(kind) for part in _parts(member)]
     return _parts(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]

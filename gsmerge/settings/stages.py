@@ -78,7 +78,7 @@ class SegmentOptions(Settings):
 
     @property
     def per_view(self) -> int | None:
-        """Number of superpixels of each view; None where a share of its pixels is asked for."""
+        """Number of superpixels of each view; None if the option is a share of its pixels."""
         text = str(self.superpixels)
         return int(text) if text.removeprefix("-").isdecimal() else None
 
@@ -183,7 +183,7 @@ class CleanOptions(Settings):
 
     @property
     def drops(self) -> tuple[str, ...]:
-        """Names of what is left out."""
+        """Names of the kinds of Gaussians to drop."""
         return () if self.drop is None else tuple(name.strip() for name in self.drop.split(","))
 
     @property

@@ -34,8 +34,9 @@ MIN_COVERED = 0.96
 def assign(scene: Scene, groups: Groups, *, draws: bool = True) -> Members:
     """Return all Gaussians of a canonical scene as members with a pixel each; UsageError if no view sees any.
 
-    ``draws``: draw every view to assign Gaussians without pixels; otherwise their centres are projected, which takes
-    less time, suits networks better, and says what each pixel shows. Centres too far apart to cover the views do not.
+    ``draws``: draw every view to assign Gaussians without pixels. Otherwise their centres are projected, which is
+    faster, suits networks better, and shows which Gaussian each pixel sees; it fails to cover the views if centres are
+    far apart.
     """
     if scene.aligned:
         return scene_members(scene)
@@ -53,9 +54,9 @@ def assign(scene: Scene, groups: Groups, *, draws: bool = True) -> Members:
 def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Find the pixel of each Gaussian, ``[n]`` int64 over all views, and the front of each pixel, ``[v,h,w]`` int32.
 
-    A Gaussian's pixel is where its opacity x transmittance x area, pixels, is largest, -1 if no view sees it; the first
-    view wins ties. A pixel's front is the Gaussian with the largest opacity x transmittance of those whose centres it
-    sees, -1 without any.
+    A Gaussian's pixel is the one with the largest opacity x transmittance x area, pixels, or -1 if no view sees it; in
+    ties the first view counts. The front of a pixel is the Gaussian with the largest opacity x transmittance among
+    those with their centre in it, or -1 without any.
     """
     from gsmerge.kernels.gaussians.fronts import weigh_centres  # with networks alone
 
@@ -95,7 +96,7 @@ class Owners:
 
 
 def find_owners(scene: Scene, groups: Groups) -> Owners:
-    """Find the superpixel to which each Gaussian contributes most, over all views; the first view wins ties."""
+    """Find the superpixel to which each Gaussian contributes most, over all views; in ties the first view counts."""
     count, lock = len(scene.gaussians), Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 

@@ -41,7 +41,10 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:
-    """Return a mask ``[n]`` of centres ``[n,3]`` outside ten times the box of 1 % to 99 % of them or of ``samples``."""
+    """Return a mask ``[n]`` of centres ``[n,3]`` outside ten times the box of the scene.
+
+    The box contains 1 % to 99 % of the ``samples``, or of the centres themselves, along each axis.
+    """
     low, high = np.percentile(means if samples is None else samples, BOX_QUANTILES, axis=0)
     half = np.maximum((high - low) / 2, 1e-3 * max(float(np.sqrt(((high - low) ** 2).sum())), 1e-30))
     return np.asarray((np.abs(means - (low + high) / 2) > OUTLIER_BOX * half).any(1))
@@ -50,9 +53,9 @@ def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.nda
 def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray:
     """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
-    Isolated: none of the eight nearest is within three times the largest scales of both, and the
-    nearest is more than three times as far as the median Gaussian's. Far beyond:
-    :func:`beyond_scene`. Across: :func:`curtains`. ``rows [m]``: only these.
+    A Gaussian is isolated if none of its eight nearest neighbours is within three times the largest scales of both, and
+    the nearest is more than three times as far away as for the median Gaussian. For the others see :func:`beyond_scene`
+    and :func:`curtains`. ``rows [m]``: test only these.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
@@ -71,7 +74,7 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
 
 
 def spread_rows(points: np.ndarray, most: int) -> np.ndarray:
-    """Return the rising rows of points ``[n,3]``, of equal points only the first ``most``."""
+    """Return the rising rows of points ``[n,3]``; of equal points only the first ``most`` are included."""
     rows = np.arange(len(points))
     keys = np.sort(points[:, 0] + 2**0.5 * points[:, 1] + 3**0.5 * points[:, 2])  # equal for equal points
     if not (keys[most:] == keys[:-most]).any():
@@ -83,7 +86,7 @@ def spread_rows(points: np.ndarray, most: int) -> np.ndarray:
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: huge and unlike others."""
+    """Return a mask ``[m]`` of the Gaussians ``rows [m]`` that hang across the scene: huge, unlike their neighbours."""
     low, high = np.percentile(gaussians.means.astype(np.float64), BOX_QUANTILES, axis=0)
     radius = np.sqrt(((high - low) ** 2).sum()) / 2
     scales = np.sort(gaussians.scales, axis=1)[:, 1:]
@@ -100,10 +103,10 @@ def floater_share(gaussians: Gaussians) -> float:
 def clean(
     gaussians: Gaussians, options: CleanOptions, scene: PicturedScene | None, to_world: ToWorld
 ) -> tuple[Gaussians, Counts]:
-    """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and those of ``drop``.
+    """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and one for each of ``drop``.
 
-    Gaussians and scene are canonical; ``to_world`` leads to the frame of the crop. The sky is found
-    in the scene's photos; nothing else needs the scene.
+    Gaussians and scene are canonical; ``to_world`` maps to the frame of the crop. The sky is found in the scene's
+    photos; nothing else needs the scene.
     """
     counts = {}
     if options.crop is not None:

@@ -29,12 +29,11 @@ def decode(
     counts: np.ndarray | None = None,
     networks: Corrector = ANALYTIC,
 ) -> Gaussians:
-    """Decode each Feature Gaussian into K Gaussians, fewer where its members are alike.
+    """Decode each Feature Gaussian into K Gaussians, fewer if its members are alike.
 
-    Children are found by halving the members again and again across their widest direction in
-    colour and position, so that those of K = 2 are unions of those of K = 4. ``counts [g]``, from 1
-    on, sets K for each group and is needed where K is mixed. Gaussians of one group are next to
-    each other.
+    Children are found by halving the members repeatedly across their widest direction in colour and position, so the
+    children of K = 2 are unions of those of K = 4. ``counts [g]``, from 1 on, sets K for each group and is required for
+    mixed K. Gaussians of one group are adjacent.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -54,7 +53,7 @@ def keep_all(scene: Scene, count: int | None) -> Decoded | None:
 
 @stage("decode")
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
-    """Decode merged views into the exact count, unless the fit ``grows`` to it, or into K per group."""
+    """Decode merged views into the exact count, unless the fit ``grows`` to it, or into K Gaussians per group."""
     asked = merged.segmentation
     if asked.exact and not grows:
         gaussians = _decode_exactly(merged, asked.count, options)
@@ -66,7 +65,7 @@ def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOpti
 
 
 def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, options: DecodeOptions) -> Gaussians:
-    """Decode ``count`` Gaussians where they lower distortion most; None: K of each Feature Gaussian."""
+    """Decode ``count`` Gaussians where they lower distortion most; None: K per Feature Gaussian."""
     features, members, networks = merged.features, merged.members, merged.networks
     children = None
     if count is not None:
@@ -92,11 +91,11 @@ def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> 
 def deal_visible(
     order: np.ndarray, num_groups: int, total: int, min_opacity: float, make: Callable[[np.ndarray], Gaussians]
 ) -> Gaussians:
-    """Make ``total`` visible Gaussians: those fainter than ``min_opacity`` are replaced by further children elsewhere.
+    """Make ``total`` visible Gaussians; those fainter than ``min_opacity`` are replaced by children of other groups.
 
-    ``order [d]`` are the groups of further Gaussians, see :func:`deal_order`; each group gets at
-    least one. ``make`` makes Gaussians from the number of each group ``[g]``, however faint. There
-    are fewer than ``total`` where the groups do not divide into as many.
+    ``order [d]`` are the groups of further Gaussians, see :func:`deal_order`; each group gets at least one. ``make``
+    makes Gaussians, faint ones included, from the number for each group ``[g]``. There are fewer than ``total`` if the
+    groups cannot be divided into as many.
     """
     extra = max(0, total - num_groups)
     for _ in range(REFILLS + 1):
@@ -129,9 +128,9 @@ def mixed_counts(
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    The result is a number if an exact count is asked for and no fit grows to it, and for unaligned scenes. There, what
-    a near and a far view both show belongs to the near one, so many superpixels of the far one stay empty, and their
-    Gaussians go to other groups.
+    It is a number if an exact count is requested and no fit grows to it, and for unaligned scenes. In unaligned scenes
+    a surface in both a near and a far view belongs to the near view, so many superpixels of the far view are empty, and
+    their Gaussians go to other groups.
     """
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
@@ -147,7 +146,7 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return the children that :func:`decode` makes without networks, however faint, and the group ``[n]`` of each."""
+    """Return the children that :func:`decode` makes without networks, faint ones too, and the group ``[n]`` of each."""
     divided = counts > 1
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
@@ -197,9 +196,9 @@ def pool_children(
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
     """Give ``extra`` Gaussians to the groups where they lower distortion most; return the children ``[g]`` per group.
 
-    A step that only pays together with the next one is judged by the two together (the convex hull
-    of the group's distortion), so a larger ``extra`` never takes a child away. The sum is ``g +
-    extra``, or the most that the members give.
+    A step that only pays together with the next step is judged by the two together (the convex hull of the group's
+    distortion), so a larger ``extra`` never removes a child. The sum is ``g + extra``, or the largest number that the
+    members give.
     """
     if extra < 0:
         raise ValueError(f"extra: expected at least 0, got {extra}")
@@ -211,7 +210,7 @@ def split_counts(features: FeatureGaussians, members: Members, extra: int, max_c
 
 
 def deal_order(features: FeatureGaussians, members: Members, max_children: int = 8) -> np.ndarray:
-    """Return the order in which groups get further Gaussians: the group ``[d]`` of each, largest gain first."""
+    """Return the order in which groups get further Gaussians: the group ``[d]`` of each, the largest gain first."""
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
     gains = hull_gains(_child_errors(features, members, max_children))

@@ -59,8 +59,8 @@ def correct(
 ) -> FeatureGaussians:
     """Correct pooled Feature Gaussians with the encoder network, if any, which also adds latents.
 
-    ``weaken``: lower the optical depth of groups that other views see through. A long fit closes the holes that this
-    leaves.
+    ``weaken``: lower the optical depth of groups that other views see through. This leaves holes, which a long fit
+    closes.
     """
     return networks.encode(weaken_contradicted(features, members, cameras) if weaken else features)
 
@@ -81,7 +81,10 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
 
 
 def _rows_by_view(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray]:
-    """Sort the pixels of each view by superpixel on its own, which needs memory for one view at a time."""
+    """Sort the pixels of each view by superpixel.
+
+    One view is sorted at a time, to save memory.
+    """
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
         labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
@@ -109,7 +112,7 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 
 def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose Gaussians per pixel by how well the depths of the views agree (None: unknown); also say why."""
+    """Choose Gaussians per pixel by how well the depths of the views agree (None: unknown); also return the reason."""
     if not scene.aligned or len(scene) < 2:
         return None, "depths of several views cannot be compared"
     wrong = contradicted_share(scene, scene_members(scene))
@@ -119,7 +122,7 @@ def measured_share(scene: Scene) -> tuple[float | None, str]:
 
 
 def contradicted_share(scene: Scene, members: Members) -> float:
-    """Return the share of sampled pixels whose Gaussian more views see through than confirm."""
+    """Return the share of sampled pixels whose Gaussian is seen through by more views than confirm it."""
     rows = np.flatnonzero(scene.valid)
     rows = rows[:: max(1, len(rows) // SAMPLES)]
     views = rows // scene.pixels_per_view
@@ -136,9 +139,10 @@ def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: C
 def agreement_factors(
     means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
 ) -> np.ndarray:
-    """Return factors ``[g]`` float32, at most 1, on the optical depth of points: lower where other views see through.
+    """Return factors ``[g]`` float32, at most 1, on the optical depth of points.
 
-    Arguments are those of :func:`gsmerge.networks.cross_view_stats.cross_view_stats`.
+    They are lower where other views see through. Arguments are those of
+    :func:`gsmerge.networks.cross_view_stats.cross_view_stats`.
     """
     _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
     disputed = np.where(same > 0, DISPUTED, ALONE)

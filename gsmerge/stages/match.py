@@ -17,8 +17,8 @@ from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 def match(features: FeatureGaussians, options: MatchOptions, networks: Corrector = ANALYTIC) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
-    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight,
-    ties by position. Fully transparent Feature Gaussians stay alone.
+    The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, in ties by position.
+    Fully transparent Feature Gaussians form clusters of one.
     """
     if options.geometry == "decoded" and options.match != "none":
         features = networks.decode_for_matching(features)

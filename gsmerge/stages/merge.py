@@ -25,12 +25,11 @@ class MergedViews:
 
 @stage("match")
 def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = ANALYTIC) -> FeatureGaussians:
-    """Pool each cluster into one Feature Gaussian; members that are alone in their cluster come first, unchanged.
+    """Pool each cluster into one Feature Gaussian; clusters of one come first, unchanged.
 
-    Members are weighted with their opacities times what the photos say of them (gains); masses and
-    integrated optical depths add, so equal ones stacked on each other become 1 - prod(1 - alpha).
-    Sums run in float64 about the cluster's own mean: the result does not depend on the order of the
-    members beyond rounding.
+    Members are weighted by their opacities times the gains from the photos. Masses and integrated optical depths are
+    summed, so equal Gaussians on top of each other become 1 - prod(1 - alpha). Sums run in float64 about the cluster's
+    own mean: the result does not depend on the order of the members beyond rounding.
     """
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
@@ -45,7 +44,7 @@ def refine(features: FeatureGaussians, networks: Corrector) -> FeatureGaussians:
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split rows by cluster: those alone in theirs, the others sorted by cluster, and where each cluster starts."""
+    """Split rows by cluster: rows that are alone, the other rows sorted by cluster, and the start of each cluster."""
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1
     order = np.flatnonzero(~alone)
@@ -109,7 +108,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
 
 def _pool_latents(latents: Array, share: np.ndarray, run: np.ndarray, count: int) -> Array:
-    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; gradients pass, where they are tensors."""
+    """Return weighted sums ``[count,d]`` of latents ``[m,d]`` over runs; differentiable for tensors."""
     if isinstance(latents, np.ndarray):
         sums = np.zeros((count, latents.shape[1]), np.float32)
         np.add.at(sums, run, latents * share[:, None])

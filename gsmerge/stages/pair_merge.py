@@ -1,4 +1,4 @@
-"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes of which no view is known.
+"""Gaussians -> fewer Gaussians by their positions and colours alone: for scenes without known views.
 
 Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
 add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was.
@@ -49,7 +49,10 @@ class _Cloud:
 
 @stage("reduce")
 def merge_neighbors(gaussians: Gaussians, count: int) -> Gaussians:
-    """Merge finite Gaussians of any frame into ``count``, at least one; none is dropped. All if there are no more."""
+    """Merge finite Gaussians in any frame into ``count``, at least one; none is dropped.
+
+    Returns all if there are no more than ``count``.
+    """
     count = max(1, count)
     if len(gaussians) <= count:
         return gaussians
@@ -69,7 +72,7 @@ def _cloud_of(g: Gaussians) -> _Cloud:
 
 
 def _merge_round(cloud: _Cloud, count: int) -> _Cloud:
-    """Merge the cheapest pairs of all cells until ``count`` Gaussians are left, or as few as the cells give."""
+    """Merge the cheapest pairs of all cells until ``count`` Gaussians are left, or until no pairs are left."""
     order, starts = _divide(cloud.means)
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
@@ -104,7 +107,7 @@ def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
-    """Return the rising places of the ``count`` lowest finite costs ``[n]``; of equals the first."""
+    """Return the rising indices of the ``count`` lowest finite costs ``[n]``; among equal costs the first."""
     finite = np.isfinite(costs)
     count = min(count, int(finite.sum()))
     if count == 0:
@@ -115,7 +118,7 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _gaussians_of(cloud: _Cloud, source: Gaussians) -> Gaussians:
-    """Convert moments to Gaussians; what was merged with nothing stays as it was."""
+    """Convert moments to Gaussians; Gaussians that were not merged stay unchanged."""
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     opacities = np.minimum(cloud.masses / (scales[:, 1] * scales[:, 2]), MAX_OPACITY)
     scales *= 1 + WIDER * log(cloud.sizes.astype(np.float64))[:, None] / float(log(2.0))

@@ -58,11 +58,11 @@ class SuperpixelChoices:
 
 @stage("segment")
 def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
-    """Cut every view into superpixels: as the options say, or as many as become exactly ``count`` Gaussians.
+    """Cut every view into superpixels, by the options or so that they give exactly ``count`` Gaussians.
 
-    An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many; a finer tree
-    is built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
-    budget, the largest allowed count is cut instead.
+    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many; a finer tree is
+    built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
+    budget, the tree is cut at the largest allowed count instead.
     """
     limits, options, views = choices.limits, choices.options, len(scene)
     if count is None:
@@ -111,7 +111,7 @@ class CountLimits:
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians that a budget, a size or a device sets; None where ``superpixels`` and K decide."""
+        """Number of Gaussians set by a budget, a size or a device; None if ``superpixels`` and K decide."""
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
@@ -133,10 +133,9 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits on the number of Gaussians.
 
-    ``num_input``: Gaussians that shares of a budget refer to; None: the scene's. ``num_reserved``:
-    Gaussians of the result that are settled already, such as those that no view sees. Raises
-    UsageError if more superpixels are asked for than there are pixels, or fewer Gaussians than
-    views.
+    ``num_input``: number that shares of a budget refer to; None: that of the scene. ``num_reserved``: Gaussians of the
+    result that are fixed already, such as those that no view sees. Raises UsageError if more superpixels are requested
+    than there are pixels, or fewer Gaussians than views.
     """
     count, views = scene.num_gaussians, scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
@@ -156,7 +155,10 @@ def count_limits(
 
 
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
-    """Return the superpixels per view; a share refers to the Gaussians where they are fewer than the pixels."""
+    """Return the superpixels per view.
+
+    A share refers to the Gaussians if there are fewer Gaussians than pixels.
+    """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
@@ -174,7 +176,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def largest_count(limits: CountLimits, segment: SegmentOptions) -> int:
-    """Return the most Gaussians that a run can give; adaptive superpixels may become more than asked for."""
+    """Return the largest number of Gaussians that a run can give; adaptive superpixels may exceed the request."""
     if limits.count is not None:
         return limits.count
     return min(MAX_FACTOR * limits.default, limits.max_count) if segment.adapts else limits.default
@@ -217,10 +219,9 @@ def pixel_depths(scene: Scene) -> np.ndarray:
 def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> RegionTree:
     """Merge neighbouring superpixels in order of added distortion, until each view is a single region.
 
-    ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, of which those of at most 0 count as
-    very near; ``groups`` are 4-connected, none empty; pixels outside of ``valid [v,h,w]`` do not
-    count, and superpixels without a valid pixel merge first. Raises ValueError if these do not fit
-    together.
+    ``images [v,h,w,3]`` sRGB in [0, 1]; ``depths [v,h,w]``, where values of at most 0 count as very near; ``groups``
+    are 4-connected, none empty. Pixels outside ``valid [v,h,w]`` do not count, and superpixels without a valid pixel
+    merge first. Raises ValueError if the arguments do not fit together.
     """
     _check_pictures(images, depths, groups, valid)
     extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
@@ -286,7 +287,7 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 
 
 def auto_count(tree: RegionTree) -> int:
-    """Find the :func:`knee` of a scene, among the counts that need no region larger than ``MAX_EXTENT``."""
+    """Find the :func:`knee` of a scene among the counts that need no region larger than ``MAX_EXTENT``."""
     usable = tree.counts >= tree.min_regions
     return knee(tree.counts[usable], tree.distortions[usable])
 

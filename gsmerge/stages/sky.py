@@ -48,7 +48,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
 
 
 def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict[int, np.ndarray]:
-    """Return a mask ``[h,w]`` of the sky for each view that shows any, by view; empty if too few do."""
+    """Return a mask ``[h,w]`` of the sky for each view that shows sky, by view; empty if too few views do."""
     regions = {view: region for view, photo in enumerate(photos) if (region := sky_region(photo)).any()}
     shown = {
         view: region
@@ -59,7 +59,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
 
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return a mask ``[n]`` of Gaussians with most of their blending weights inside regions of some views."""
+    """Return a mask ``[n]`` of Gaussians that have most of their blending weights inside the views' regions."""
     splats = prepare(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():

@@ -60,7 +60,7 @@ def count_children(
 
 
 def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int:
-    """Return the number of Gaussians that a budget leaves for the groups."""
+    """Return the part of a budget that remains for the groups."""
     try:
         count = exact_count(BudgetOptions(budget), state.settings.num_input, state.sh_degree)
     except ValueError as error:
@@ -111,7 +111,7 @@ class DecodeResult:
 
 
 def check_fit(state: State, options: FitOptions) -> None:
-    """Raise UsageError if a fit is asked for and no photos are stored."""
+    """Raise UsageError if a fit is requested and no photos are stored."""
     if options.fit != "none" and not len(state.replay):
         raise UsageError(f"fit {options.fit}: expected a state with photos, found none; extend one with photos")
 

@@ -31,7 +31,7 @@ class Division:
 
     @property
     def by_heads(self) -> bool:
-        """Whether decoder heads make the children alone, without stored ones."""
+        """Whether decoder heads make all children, so that none are stored."""
         return len(self.slots) < self.num_splits
 
     @property
@@ -81,7 +81,7 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
 def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: int) -> Division:
     """Divide every group into up to ``max_k`` children, at most one per member, for heads with absolute outputs.
 
-    Further children go where a child stands for most pixels, weighted by the opacity of the group's members.
+    Further children are added where a child represents the most pixels, weighted by the opacity of the group's members.
     """
     splits = np.minimum(num_members, max_k) - 1
     steps = np.arange(1, max_k)

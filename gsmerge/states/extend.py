@@ -68,10 +68,10 @@ def extend(
 ) -> tuple[State, BatchReport]:
     """Add a batch of views to a state (paper section 4.5, "Online reconstruction").
 
-    ``state``: what earlier batches left, which is not changed; None: this is the first batch. ``scene``: the new views,
-    in the same world as the earlier ones; tensors become arrays. ``extend_options``: which part of the batch enters the
-    state, and how. Raises ValueError if a setting is out of range or not possible for a state, or the SH degree differs
-    from the state's.
+    ``state``: state after the earlier batches, which is not changed; None: this is the first batch. ``scene``: the new
+    views, in the same world as the earlier ones; tensors become arrays. ``extend_options``: which part of the batch
+    enters the state, and how. Raises ValueError if a setting is out of range or impossible for a state, or if the SH
+    degree differs from that of the state.
     """
     options = options or CompactOptions().with_settings({"fit": "none"})
     extend_options = extend_options or ExtendOptions()
@@ -117,7 +117,7 @@ def extend(
 
 
 def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
-    """Make a state of a first batch, whose groups divide as its own Gaussians say."""
+    """Make a state from a first batch, whose groups are divided by their own members."""
     prepared, plan, cameras = batch.prepared, batch.plan, batch.photos.cameras
     max_k = _most_children(new, batch)
     groups = kind.divide(new, batch, max_k)
@@ -146,7 +146,7 @@ def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
 
 
 def _most_children(new: BatchFeatures, batch: Batch) -> int:
-    """Return the largest number of children of a group that is stored."""
+    """Return the largest number of children per group that is stored."""
     most, decode = batch.extend_options.max_k, batch.plan.decode
     if most is None:
         asks_for_number = new.segmentation.exact or new.members.pixels is not None
@@ -155,7 +155,7 @@ def _most_children(new: BatchFeatures, batch: Batch) -> int:
 
 
 def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tuple[State, dict[str, int]]:
-    """Add a further batch to a state; return it, and numbers of the batch's groups by key of the report."""
+    """Add a further batch to a state; return the state, and numbers of the batch's groups by key of the report."""
     state, counts, cameras = share(state), dict[str, int](), batch.photos.cameras
     groups, settings = state.groups, state.settings
     assert isinstance(groups, GroupSet)
@@ -184,7 +184,7 @@ def _join(state: State, new: BatchFeatures, batch: Batch, kind: StateKind) -> tu
 
 
 def _with_photos(state: State, batch: Batch) -> State:
-    """Fit colours to a batch's photos, but those of heads, and keep some of the photos."""
+    """Fit colours to a batch's photos, except colours from decoder heads, and store some of the photos."""
     groups = state.groups
     if batch.extend_options.fit_colors and not state.keeps_latents:
         with stage("fit"):
@@ -197,7 +197,7 @@ def _with_photos(state: State, batch: Batch) -> State:
 
 
 def _check(state: State | None, scene: Scene, options: CompactOptions, max_k: int | None) -> None:
-    """Refuse settings that no state can have, and harmonics of another degree."""
+    """Raise UsageError for settings that are impossible for a state, and for harmonics of another degree."""
     for name in options.compact_only:
         raise UsageError(f"{name}: goes with a whole scene, not with views that come one after the other; use compact")
     if options.fit.fit == "full":

@@ -57,7 +57,7 @@ def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]
 def _join(
     groups: GroupSet, rows: np.ndarray, new: BatchFeatures, batch: Batch, max_k: int
 ) -> tuple[GroupSet, dict[str, int]]:
-    """Merge a batch into the state's ``rows`` in view, and add the rest where a view shows it."""
+    """Merge a batch into the state's ``rows`` in view, and add groups that the state does not show yet."""
     with stage("decode"):
         fresh = bake(new.features, new.members, new.context, max_k)
     with stage("join"):
@@ -82,8 +82,8 @@ DECODED = StateKind(REACH, _encode, _decode, _divide, _join)
 def find_partners(features: FeatureGaussians, new: FeatureGaussians, options: MatchOptions) -> np.ndarray:
     """Return, for each of n new groups, the state's group with the same surface, ``[n]`` int64; -1 for none.
 
-    Matching is that across the views of one batch, with the state as one view and the batch as another. A group gets
-    one partner at most: the first of several in a cluster.
+    Groups are matched as across the views of one batch, with the state as one view and the batch as another. A group
+    gets at most one partner: the first in its cluster.
     """
     both = FeatureGaussians.concat([features, new])
     sides = (np.arange(len(both)) >= len(features)).astype(np.int64)

@@ -78,14 +78,14 @@ class StateContext(NetworkContext):
 
 
 def keeps_latents(plan: Plan) -> bool:
-    """Return whether the state keeps latents, which later batches need: where an encoder makes them."""
+    """Return whether an encoder makes latents, which the state then keeps for later batches."""
     return plan.networks is not None and plan.networks.options.encoder
 
 
 def own_checkpoint(state: State, options: CompactOptions) -> Checkpoint | None:
     """Return the networks of a state as a checkpoint; None for a state without networks.
 
-    Raises UsageError if the options name others, SceneError if they name a file that cannot be read.
+    Raises UsageError if the options name other networks, SceneError if they name a file that cannot be read.
     """
     if state.networks is None:
         return None
@@ -116,7 +116,7 @@ def _same(networks: NetworkWeights, other: NetworkWeights) -> bool:
 
 
 def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> ViewSamples:
-    """Sample the Gaussians that the pixels at the centres of a grid of ``shape`` show."""
+    """Sample the Gaussians shown at the centres of the cells of a grid of ``shape``."""
     (height, width), num_views = shape, len(cameras)
     rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
     columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
@@ -135,7 +135,7 @@ def sample_views(members: Members, cameras: Cameras, shape: tuple[int, int]) -> 
 
 
 def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatures:
-    """Encode a batch's superpixels, which stay of one view each."""
+    """Encode a batch's superpixels; each group stays in one view."""
     plan, cameras = batch.plan, batch.scene.cameras
     weights = plan.networks
     assert weights is not None
@@ -183,7 +183,7 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
 
 
 def _children(features: FeatureGaussians, context: NetworkContext, max_k: int) -> tuple[Gaussians, np.ndarray]:
-    """Return the analytic children of every group, and the rising group of each; none where heads need none."""
+    """Return the analytic children of every group, and the rising group of each; empty if heads need none."""
     if context.options.outputs == "absolute":
         return feature_to_gaussians(features)[:0], np.zeros(0, np.int64)
     return divide(features, context.members, np.full(len(features), max_k))
@@ -205,7 +205,7 @@ def _join(
 ) -> tuple[GroupSet, dict[str, int]]:
     """Match, merge and refine a batch with the state's ``rows`` in reach; the other groups come first.
 
-    The state's groups come before the batch's, so that the merger's cluster begins with one of them.
+    The state's groups precede the batch's, so that the cluster of the merger begins with a group of the state.
     """
     far, near = (select_groups(groups, r) for r in (np.setdiff1d(np.arange(len(groups)), rows), rows))
     assert isinstance(new.context, StateContext)
@@ -240,9 +240,10 @@ def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch, ma
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, context: StateContext) -> Matches:
-    """Match groups of a batch with each other, as of a scene, and with the state's; clusters are the union of both.
+    """Match groups of a batch with each other, as in a scene, and with groups of the state.
 
-    The state counts as one view and the batch as another, so that each group is compared with its nearest there.
+    Clusters are the union of both matchings. For the second the state counts as one view and the batch as another, so
+    that each group is compared with its nearest groups there.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options, context).clusters
@@ -254,9 +255,9 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, c
 
 
 def _refine_near(merged: FeatureGaussians, before: FeatureGaussians, context: StateContext) -> FeatureGaussians:
-    """Refine what is new or changed, and what has such a neighbour; the others stay as ``before``, by their part.
+    """Refine new and changed groups, and groups with such a neighbour; the others stay as in ``before``.
 
-    Each is refined from what the merger left, never twice.
+    Each group is refined from the output of the merger, so never twice.
     """
     if not context.options.refiner or len(merged) == 0:
         return merged

@@ -52,12 +52,11 @@ def extend_file(
 ) -> dict[str, Any]:
     """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
 
-    The file is replaced when all is done, and not at all if anything goes wrong or another process
-    has changed it; of processes that end together, the second waits for the first and then sees its
-    change. ``settings``: see :class:`gsmerge.Compactor`; by default the state's own.
-    ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a file
-    cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of
-    range, or needs what the state or the scene does not have.
+    The file is replaced at the end, and not if anything fails or another process has changed it. If two processes end
+    together, the second waits for the first and then sees its change. ``settings``: see :class:`gsmerge.Compactor`; by
+    default the state's own. ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a
+    file cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of range, or
+    requires what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)
@@ -94,14 +93,14 @@ def extend_file(
 
 
 def _source(files: SceneFiles, load: Loaded) -> dict[str, Any]:
-    """Return facts about the file of a scene as plain JSON types, without the folder that it is in."""
+    """Return facts about the file of a scene as plain JSON types, without its folder."""
     num_bytes = sum(path.stat().st_size for path in files.plys)
     texts = {"comments": list(load.comments), "notes": list(load.notes)}
     return {"name": files.ply.name, "sha256": file_sha256(*files.plys), "bytes": num_bytes, **texts}
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:
-    """Return numbers that differ between one file of this name and the next; None without a file."""
+    """Return numbers that change when a file of this name is replaced; None without a file."""
     try:
         status = os.stat(path)
     except OSError:  # other problems show when it is written
@@ -189,7 +188,7 @@ def compact_file(
 
 
 def _file_size(budget: int | str | None, out: Path, spz_version: int) -> FileSize | None:
-    """Return the size in bytes that a budget asks for; None of another one."""
+    """Return the size in bytes that a budget asks for; None for any other budget."""
     try:
         return None if budget is None else file_size(BudgetOptions(budget, output=out.name, spz_version=spz_version))
     except ValueError as error:
@@ -197,7 +196,7 @@ def _file_size(budget: int | str | None, out: Path, spz_version: int) -> FileSiz
 
 
 def _comments(state: State) -> list[str]:
-    """Return the lines of the header: that of a result, and those of the first batch's file, as of a scene."""
+    """Return the comments of the header: those of a result, and those copied from the first batch's file."""
     texts = state.about.get("source", {}).get("comments")
     return [RESULT_COMMENT, *copied_comments(texts if isinstance(texts, list) else ())]
 

@@ -176,9 +176,9 @@ def share(state: State) -> State:
 
 
 def divide_groups(state: State, *, fitted_colors: bool = True) -> DividedGroups:
-    """Return groups with children for every K: those of one batch as they came, others by dividing their children.
+    """Return groups with children for every K: groups of one batch unchanged, others with their children divided.
 
-    ``fitted_colors``: in the colours fitted to the photos instead of those of the input files. With networks, decoder
+    ``fitted_colors``: use the colours fitted to the photos instead of those of the input files. With networks, decoder
     heads set the colours.
     """
     groups, max_k, networks = state.groups, state.settings.max_k, state.networks

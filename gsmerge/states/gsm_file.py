@@ -117,7 +117,7 @@ class GsmFile:
         return SceneError(self.path, problem, REMEDY)
 
     def has(self, *prefixes: str) -> bool:
-        """Return whether some array's name begins with one of the prefixes."""
+        """Return whether the name of any array begins with one of the prefixes."""
         return any(name.startswith(prefixes) for name in self.arrays)
 
     def array(self, key: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
@@ -162,7 +162,7 @@ class GsmFile:
         return Gaussians(*(self.array(f"{prefix}.{name}", np.float32, n, *shape) for name, shape in shapes.items()))
 
     def common(self, num_higher: int) -> dict[str, Any]:
-        """Return the fields of every state that are no groups: kept, frame, cameras."""
+        """Return the fields of every state that are not groups: kept, frame, cameras."""
         kept = self.gaussians("kept", None, num_higher)
         unit, width, height = (self.header[name] for name in ("unit", "width", "height"))
         origin = self.array("frame.origin", np.float64, 3)
@@ -176,7 +176,7 @@ class GsmFile:
         return {"kept": kept, "frame": Frame(origin, unit), "cameras": cameras}
 
     def _cameras(self, viewmats: np.ndarray, Ks: np.ndarray, width: int, height: int) -> Cameras:
-        """Return the cameras, if they are plausible and of a size for which the file has the bytes."""
+        """Return the cameras, if they are plausible and the file has enough bytes for their size."""
         check_pixels(self.path, width, height)
         most = SMALL_VIEW + PIXELS_PER_BYTE * sum(
             a.nbytes for key, a in self.arrays.items() if not key.startswith("networks.")

@@ -100,7 +100,7 @@ class Learned:
     num_members: np.ndarray  # [g] int64, Gaussians that became the group
 
     def __getitem__(self, rows: np.ndarray) -> Learned:
-        """Return that of some groups."""
+        """Return the learned data of the groups ``rows``."""
         return Learned(take(self.refined, rows), self.views[rows], self.num_members[rows])
 
     @staticmethod

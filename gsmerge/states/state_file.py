@@ -118,7 +118,7 @@ def load_state(path: str | PathLike[str]) -> State:
 
 
 def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) -> Mapping[str, Any]:
-    """Return options, batches and source, the former of this version."""
+    """Return options, batches and source; options are converted to those of this version."""
     about = dict(file.header["about"])
     if file.is_encoded:  # an encoded scene is a batch
         options = {name: value for name, value in about.get("options", {}).items() if name not in OF_ANOTHER_RUN}
@@ -136,7 +136,7 @@ def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) 
 
 
 def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
-    """Return the children for every K, with every index within its range."""
+    """Read the children for every K, and check that every index is in range."""
     g = len(features)
     splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
     uniform = file.array("division.uniform", np.int32, None)
@@ -172,7 +172,7 @@ def _read_views(file: GsmFile, num_groups: int, num_views: int) -> np.ndarray:
 
 
 def _read_groups(file: GsmFile, features: FeatureGaussians, max_k: int, weights: NetworkWeights | None) -> GroupSet:
-    """Return groups of several batches, each with 1 to ``max_k`` children, or without any where heads make them."""
+    """Return groups of several batches, each with 1 to ``max_k`` children, or with none if heads make them."""
     g, num_latents = len(features), features.latents.shape[1]
     if weights is None and num_latents:
         raise file.error(f"features.latents: expected 0 numbers in a state without networks, found {num_latents}")
@@ -191,7 +191,7 @@ def _read_colors(file: GsmFile, num_groups: int) -> Colors:
 
 
 def _read_learned(file: GsmFile, features: FeatureGaussians, weights: NetworkWeights, num_views: int) -> Learned:
-    """Return what a state that keeps latents has more of its groups, with every view and number in its range."""
+    """Return the additional data of groups in a state that keeps latents, with views and numbers checked for range."""
     g = len(features)
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,), "covars": (3, 3), "sh0": (1, 3), "latents": (weights.options.latent,),
@@ -204,7 +204,7 @@ def _read_learned(file: GsmFile, features: FeatureGaussians, weights: NetworkWei
 
 
 def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
-    """Return the Gaussians of some pixels of every view, which are as many of each."""
+    """Return the sampled Gaussians of every view, equally many per view."""
     opacities = file.array("samples.opacities", np.float32, num_views, None, None)
     shape = *opacities.shape, 3
     if 0 in shape[1:]:
@@ -214,7 +214,7 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 
 
 def _read_replay(file: GsmFile, cameras: Cameras) -> Replay:
-    """Return the stored photos, if their views are there."""
+    """Return the stored photos, if their views exist."""
     views = file.array("replay.views", np.int32, None).astype(np.int64)
     images = file.array("replay.images", np.uint8, len(views), cameras.height, cameras.width, 3)
     if len(views) and not (views[0] >= 0 and views[-1] < len(cameras) and (np.diff(views) > 0).all()):

@@ -72,17 +72,17 @@ class Batch:
 
     @property
     def num_new(self) -> int:
-        """Number of input Gaussians for the share of views that are new: a state counts the input of a view once."""
+        """Number of input Gaussians in new views, since a state counts the input of a view once."""
         return round(self.prepared.input_scene.num_gaussians * float(self.is_new.mean()))
 
     @property
     def min_contribution(self) -> float:
-        """Least blending weight of a group: as asked for, in drafts, too."""
+        """Least blending weight of a group, as the options ask, also in drafts."""
         return float(self.plan.settings["min_contribution"])
 
 
 def make_batch(state: State | None, prepared: Prepared, plan: Plan, extend_options: ExtendOptions) -> Batch:
-    """Make a batch: resize its photos to those of the state, and find out which views are new."""
+    """Make a batch: resize its photos to those of the state, and find the views that are new."""
     cameras = prepared.scene.cameras
     before = cameras[:0] if state is None else state.cameras
     photos = resize_photos(prepared.scene.images, cameras, before.width, before.height)
@@ -115,7 +115,7 @@ class StateKind:
 
 
 def view_ids(known_cameras: Cameras, cameras: Cameras) -> np.ndarray:
-    """Return the index ``[v]`` of each view: that of a known view with the same camera, or a new one."""
+    """Return the index ``[v]`` of each view: that of a known view with the same camera, or a new index."""
     known_ids = {row: i for i, row in reversed(list(enumerate(_rows(known_cameras))))}
     ids = np.array([known_ids.get(row, -1) for row in _rows(cameras)], np.int64)
     ids[ids < 0] = len(known_cameras) + np.arange(np.count_nonzero(ids < 0))
@@ -131,7 +131,10 @@ def _rows(cameras: Cameras) -> list[bytes]:
 def update_replay(
     replay: Replay, batch_photos: BatchPhotos, view_ids: np.ndarray, num_views: int, max_photos: int
 ) -> Replay:
-    """Add photos of the views ``view_ids [s]`` to those stored, then keep every n-th of all views, n a power of two."""
+    """Add photos of the views ``view_ids [s]`` to the stored ones, then keep every n-th of all views.
+
+    n is a power of two.
+    """
     ids, rows = np.unique(view_ids, return_index=True)
     new = ~np.isin(ids, replay.views)
     views, step = np.concatenate([replay.views, ids[new]]), 1
@@ -171,8 +174,8 @@ def fit_batch_colors(
 def groups_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = REACH) -> np.ndarray:
     """Return a mask ``[v,g]`` of groups that may be visible in each view, by position and size.
 
-    ``reach``: how far a group is visible, in standard deviations of all its axes together. This is the only step that
-    goes through all groups; later steps take time only for what the views see.
+    ``reach``: distance at which a group is visible, in standard deviations of all its axes together. This is the only
+    step that goes through all groups; the time of later steps depends only on what the views see.
     """
     means = features.means.astype(np.float64)
     radii = reach * np.sqrt(np.trace(features.covars, axis1=1, axis2=2, dtype=np.float64))
@@ -198,7 +201,7 @@ def rows_in_view(features: FeatureGaussians, cameras: Cameras, reach: float = RE
 
 
 def pixel_errors(gaussians: Gaussians, photos: Photos, height: int, width: int) -> np.ndarray:
-    """Return squared colour errors ``[v,h,w]`` plus squared transmittance, so that holes count in black photos, too."""
+    """Return squared colour errors ``[v,h,w]`` plus squared transmittance, so that holes count in black photos too."""
 
     def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
         errors = ((np.clip(image, 0, 1) - photos.images[view]) ** 2).mean(-1) + transmittance**2

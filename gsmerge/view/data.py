@@ -93,9 +93,9 @@ class ViewData:
 
     @property
     def start(self) -> int:
-        """Index of the view on which the page opens: the one of median score, or the first without scores.
+        """Index of the view on which the page opens: the view of median score, or the first without scores.
 
-        It is held out where there are such views, as the figures at the top are.
+        It is a held-out view if there are any, as for the figures at the top.
         """
         held_out = [i for i, view in enumerate(self.views) if view.held_out]
         counted = held_out or range(len(self.views))
@@ -124,10 +124,10 @@ def collect(
     threads: int | None = None,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
-    """Draw and score a scene, which has at least one view, and its results, if any, in all views.
+    """Draw and score a scene with at least one view, and its results, if any, in all views.
 
-    ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the sizes of the scene's file and of
-    theirs. Stills and scores are from ``cameras`` (as of :func:`gsmerge.evaluate`), 3D from the scene's own.
+    ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
+    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own.
     """
     pictures = photo_array(with_row_colors(scene).images)
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
@@ -223,8 +223,8 @@ def encode_still(picture: Picture) -> bytes:
 def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
 
-    Each is in the mean colour that its superpixel has in ``photo [h,w,3]``, a little lighter or,
-    where that is light, darker.
+    Each border has the mean colour of its superpixel in ``photo [h,w,3]``, slightly lighter or, for light colours,
+    darker.
     """
     factor = max(1, OUTLINE_SIDE // max(labels.shape))
     enlarged = labels.repeat(factor, 0).repeat(factor, 1)
@@ -248,7 +248,7 @@ def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: st
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose at most ``MAX_VIEWS`` views and the worst, sorted from the worst of the first result."""
+    """Choose at most ``MAX_VIEWS`` views and the worst one, sorted by the scores of the first result, worst first."""
 
     def quality(view: PageView) -> float:
         score = view.scores[:2][-1].psnr
@@ -260,7 +260,7 @@ def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
 
 
 def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
-    """List what the page leaves out."""
+    """List what the page leaves out: Gaussians, harmonics and views."""
     notes = []
     for side in sides:
         if side.splats is None:
@@ -278,7 +278,7 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
 def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
     """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
 
-    Neighbouring rows are alike, so the bytes of a ``.spz`` are stored as differences from the row before, column by
+    Neighbouring rows are similar, so the bytes of a ``.spz`` are stored as differences from the row before, column by
     column, in 60 % of its size. The gzip stream has the header of an uncompressed ``.spz`` of version 3, the checksum
     of its whole content (CRC-32, little-endian), and the columns; the page's script restores the ``.spz``.
     ``gaussians`` are in the page's frame, where the scene is about 1 large: browsers keep means in 16 bits.

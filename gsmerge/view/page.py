@@ -146,7 +146,7 @@ class Figure:
 
 
 def figures(data: ViewData, place: int) -> list[Figure]:
-    """Collect the figures at the top for one of the sides: size and mean quality."""
+    """Collect the figures at the top for one side: size and mean quality."""
     before, after = data.sides[0], data.sides[place]
     sizes = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", False),
@@ -190,12 +190,12 @@ def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
 
 
 def _unbroken(text: str) -> str:
-    """Keep units on the lines of their figures."""
+    """Prevent line breaks between numbers and their units."""
     return text.replace(" dB", "\u00a0dB").replace(" %", "\u00a0%")
 
 
 def _number(value: float | None, digits: int) -> str:
-    """Write a number; the PSNR of equal pictures, which is infinite, as none."""
+    """Format a number; a missing one and the infinite PSNR of equal pictures are written as none."""
     return NONE if value is None or value == float("inf") else f"{value:.{digits}f}"
 
 
@@ -216,7 +216,7 @@ def _view(view: PageView) -> dict[str, Any]:
 
 
 def _finite(value: float | None) -> float | None:
-    """Round a number for JSON, which has no infinity, the PSNR of equal pictures."""
+    """Round a number for JSON, where the infinite PSNR of equal pictures has no value."""
     return None if value is None or value == float("inf") else round(value, 4)
 
 

@@ -33,8 +33,8 @@ class JoinedScene:
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     """Join aligned scenes of one place, each with its own frame and scale, into one scene.
 
-    ``paths`` are their files, for messages. SceneError if one has no pixels, two differ in the size
-    of their views or in their harmonics, or no two show the same surfaces.
+    ``paths`` are their files, for messages. SceneError if a scene has no pixels, if views or harmonics differ in size,
+    or if no two scenes show the same surfaces.
     """
     _check(scenes, paths)
     registration = register(scenes)
@@ -58,7 +58,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Return the files' names, with their folders where they are called alike."""
+    """Return the names of the files, with folders where names are equal."""
     alike = len({path.name for path in paths}) < len(paths)
     return [os.path.join(path.parent.name, path.name) if alike else path.name for path in paths]
 
@@ -102,7 +102,7 @@ def move_scene(scene: Scene, place: Similarity) -> Scene:
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
     """Concatenate the views of scenes of one size and frame; either all are aligned, or none is.
 
-    ``photos``: those of all views, where they are together already.
+    ``photos``: the photos of all views, if they are in one array already.
     """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
@@ -130,7 +130,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 
 def _concat_masks(scenes: Sequence[Scene]) -> np.ndarray | None:
-    """Put masks one after the other, whole ones where a scene has none; None without any."""
+    """Concatenate masks; a scene without masks gets full ones. None if no scene has masks."""
     if all(scene.masks is None for scene in scenes):
         return None
     return np.concatenate([np.full(_grid(s), True) if s.masks is None else s.masks for s in scenes])
@@ -141,7 +141,7 @@ def _grid(scene: Scene) -> tuple[int, int, int]:
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
-    """Put large photos one after the other; None where some are missing or sizes differ."""
+    """Concatenate large photos; None if a scene has none or sizes differ."""
     sources = [source for source in photos if source is not None]
     if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None

@@ -94,7 +94,7 @@ def find_keypoints(scene: Scene) -> list[Photo]:
 def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return what a view shows, ``[h,w,3]`` uint8, and the intrinsics of that picture.
 
-    The largest photo that there is, up to SIDE, or the Gaussians' base colours.
+    It is the largest photo up to SIDE or, without photos, the base colours of the Gaussians.
     """
     if scene.large_photos is not None:
         large = scene.large_photos
@@ -115,7 +115,7 @@ def _picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.nda
 def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
     """Find keypoints of a picture ``[h,w,3]`` uint8: places ``[n,2]``, descriptors ``[n,128]``.
 
-    ``stretch``: width over height of what a pixel shows; pixels are made square.
+    ``stretch``: width over height of a pixel's footprint; the picture is resized to square pixels.
     """
     height, width = picture.shape[:2]
     wide = max(MIN_SIDE, round(width * max(stretch, 1)))
@@ -133,7 +133,7 @@ def _describe(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarr
 
 @contextmanager
 def _any_processor() -> Iterator[None]:
-    """Have OpenCV use only what all processors have, so that keypoints are the same on each."""
+    """Make OpenCV use only instructions of all processors in the block, so that keypoints are equal everywhere."""
     before = cv2.useOptimized()
     cv2.setUseOptimized(False)
     try:
@@ -143,9 +143,9 @@ def _any_processor() -> Iterator[None]:
 
 
 def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
-    """Return the depths ``[h,w]`` of what a camera sees, of the nearest opaque layer.
+    """Return the depths ``[h,w]`` of the nearest opaque layer of a camera; infinite where there is none.
 
-    ``layers`` are the views that have the camera. Infinite where there is nothing.
+    ``layers`` are the views with that camera.
     """
     views = list(layers)
     shape = len(scene), scene.cameras.height, scene.cameras.width
@@ -180,7 +180,7 @@ def match_photos(
 
 
 def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
-    """Collect the keypoints of these rows of each photo."""
+    """Collect the keypoints at the given rows of each photo."""
     chosen = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
     return End(
@@ -192,7 +192,7 @@ def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:
 
 
 def _match(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows that are each other's best match, and clearly better than the second."""
+    """Return the pairs of rows that are each other's best match, and clearly better than the second best."""
     if min(len(a), len(b)) < 2:
         return np.empty(0, int), np.empty(0, int)
     # whole numbers below 2^24: float32 has them exactly, in any order of summation

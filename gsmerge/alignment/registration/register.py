@@ -87,9 +87,9 @@ def register(scenes: Sequence[Scene]) -> Registration:
 
 
 def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
-    """Find the similarity from the first scene to the second that most matches agree with.
+    """Find the similarity from the first scene to the second that agrees with the most matches.
 
-    Returns it with those matches; None where they are too few.
+    Returns the similarity and the matches that agree; None if they are too few.
     """
     if len(matches) < MIN_MATCHES:
         return None
@@ -111,7 +111,7 @@ def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
 
 
 def _sample_places(matches: Matches) -> list[Similarity]:
-    """Fit similarities to triples of matches; return those that leave most matches close."""
+    """Fit similarities to triples of matches; return those that most matches agree with."""
     rng = np.random.default_rng(0)
     p, q = (end.points for end in matches.ends)
     near, far = (camera_depths(end.points, end.viewmats) for end in matches.ends)
@@ -146,9 +146,10 @@ class _Residuals:
 
 
 def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: float) -> _Residuals:
-    """Project one end's points into the other's photos, by the similarity between their frames.
+    """Compute the distances between projected points of one end and the keypoints of the other, in standard deviations.
 
-    ``pixels``, ``spread``: standard deviations of a keypoint and of the logarithm of a depth.
+    ``place`` maps between the frames of the two scenes. ``pixels``, ``spread``: standard deviations of a keypoint and
+    of the logarithm of a depth.
     """
     turns = other.viewmats[:, :3, :3]
     moved = place.move_points(end.points)
@@ -182,7 +183,7 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _squares(places: Places, matches: Matches, spread: float) -> np.ndarray:
-    """Return the squared residual ``[m]`` of each match, the larger of both ways."""
+    """Return the squared residual ``[m]`` of each match: the larger one of both directions."""
     both = [(residuals.values**2).sum(1) for residuals in _both_ways(places, matches, spread)]
     return np.asarray(np.maximum(*both))
 
@@ -197,9 +198,9 @@ def _both_ways(places: Places, matches: Matches, spread: float) -> list[_Residua
 
 
 def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[Matches], float]:
-    """Measure how far keypoints are off, and the logarithms of depths, robustly.
+    """Measure the errors of keypoints and of the logarithms of depths, robustly.
 
-    Returns the matches with the former, and the latter.
+    Returns the matches with the error of keypoints, and the error of logarithmic depths.
     """
     values = [_both_ways(places, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
@@ -234,7 +235,7 @@ def _num_placed(places: Places) -> int:
 
 
 def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
-    """Place scenes in the frame of one, each by the strongest link to those that are placed."""
+    """Place scenes in the frame of ``start``, each by its strongest link to a scene already placed."""
     places: list[Similarity | None] = [None] * count
     places[start] = IDENTITY
     while True:
@@ -252,9 +253,9 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: 
 
 
 def _refine(places: Places, matches: Sequence[Matches], spread: float, fixed: int | None = None) -> Places:
-    """Move all placed scenes but one until matches agree best, by damped Gauss-Newton steps.
+    """Move all placed scenes but one to the best agreement of matches, by damped Gauss-Newton steps.
 
-    ``fixed``: the scene that stays; None: the first that is placed.
+    ``fixed``: the scene that stays; None: the first placed scene.
     """
     placed = [i for i, place in enumerate(places) if place is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
@@ -286,7 +287,7 @@ def _make_step(step: np.ndarray) -> Similarity:
 def _normal_equations(
     places: Places, matches: Sequence[Matches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return the cost (Cauchy's), its curvature and its slope by the steps of the free scenes."""
+    """Return cost (Cauchy's), curvature and slope with respect to the steps of the free scenes."""
     size = len(free) * SIZE
     curvature = np.zeros((size, size))
     slope = np.zeros(size)
@@ -313,7 +314,7 @@ def _normal_equations(
 
 
 def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.ndarray:
-    """Derive residuals by a step of their points before ``place`` is applied: ``[m,3,7]``."""
+    """Differentiate residuals by a step of their points before ``place`` is applied: ``[m,3,7]``."""
     by_point = place.scale * matmul(slopes, place.rotation)
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -323,7 +324,7 @@ def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.nd
 
 
 def _unit(photos: Sequence[Sequence[Photo]], places: Places) -> float:
-    """Return the power of two next to the median depth of the first placed scene's points."""
+    """Return the power of two nearest to the median depth of the points of the first placed scene."""
     first = next(scene_photos for scene_photos, place in zip(photos, places, strict=True) if place is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

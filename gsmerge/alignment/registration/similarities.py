@@ -11,10 +11,10 @@ DIGITS = 7  # decimals of a rounded place: its last bits mean nothing
 
 
 def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit ``q = scale * rotation @ p + shift`` to b sets of points ``[b,n,3]``, weights ``[b,n]``.
+    """Fit ``q = scale * rotation @ p + shift`` to b sets of points ``[b,n,3]`` with weights ``[b,n]``.
 
-    Rotations by Horn (1987); the scale is that of both spreads, as both have errors. Returns
-    rotations ``[b,3,3]``, scales ``[b]`` and shifts ``[b,3]``.
+    Rotations by Horn (1987). The scale is the ratio of both spreads, as both sets have errors. Returns rotations
+    ``[b,3,3]``, scales ``[b]`` and shifts ``[b,3]``.
     """
     share = (weights / weights.sum(1, keepdims=True))[..., None]
     middle_p = (share * p).sum(1)
@@ -53,7 +53,7 @@ def invert_place(place: Similarity) -> Similarity:
 
 
 def round_place(place: Similarity, unit: float) -> Similarity:
-    """Round a similarity so that rounding errors in keypoints do not change results; ``unit``: of the shift."""
+    """Round a similarity so that rounding errors of keypoints do not change results; ``unit``: unit of the shift."""
     quat = normalize(rotmat_to_quat(place.rotation[None]).round(DIGITS))
     shift = unit * (place.shift / unit).round(DIGITS)
     return Similarity(quat_to_rotmat(quat)[0], round(place.scale, DIGITS), shift, kind="other")

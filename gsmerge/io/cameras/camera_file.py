@@ -63,7 +63,7 @@ class Lens:
 
 
 def make_lens(name: str, model: Literal["perspective", "fisheye"], coefficients: Sequence[float]) -> Lens | None:
-    """Make a lens; None for a perspective lens without distortion, which is a pinhole."""
+    """Make a lens; None for a pinhole, which is a perspective lens without distortion."""
     return Lens(name, model, tuple(coefficients)) if model == "fisheye" or any(coefficients) else None
 
 
@@ -167,7 +167,7 @@ def make_camera_file(
 
 
 def check_count(path: StrPath, count: int) -> None:
-    """Raise SceneError if a file has more cameras than are read, before anything is made for each."""
+    """Raise SceneError if a file has more cameras than the limit, before anything is allocated for each."""
     if count > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} cameras, found more")
 
@@ -179,7 +179,7 @@ def missing_intrinsics(path: StrPath, reason: str = "") -> SceneError:
 
 
 def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Multiply intrinsics that are divided by the image's size by it; an unknown size is taken as 1 x 1."""
+    """Multiply intrinsics that are relative to the image size by that size; an unknown size counts as 1 x 1."""
     small = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     small &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
     if not small.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
@@ -208,7 +208,7 @@ def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> N
 
 
 def is_orthonormal(axes: np.ndarray) -> bool:
-    """Return whether axes ``[3,3]`` are orthonormal up to rounding; mirrored ones are, too."""
+    """Return whether axes ``[3,3]`` are orthonormal up to rounding, mirrored or not."""
     return bool(np.abs(matmul(axes, axes.T) - np.eye(3)).max() <= _MAX_ROTATION_ERROR)
 
 
@@ -262,15 +262,15 @@ def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
-    """List the different (width, height) of a file's cameras, as far as they are known."""
+    """List the different (width, height) of a file's cameras, without unknown sizes."""
     return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:
     """Convert to cameras of one image size (width, height) in pixels; None: the file's size.
 
-    Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the file's
-    cameras have none, or several; or a lens is no pinhole.
+    Intrinsics of another size are scaled, each axis by itself. SceneError if no size is given and the cameras of the
+    file have no size or several, or if a lens is not a pinhole.
 
     Example:
         >>> gsmerge.to_cameras(gsmerge.read_cameras("demo/transforms.json")).Ks.shape
@@ -302,7 +302,8 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
 def as_pinholes(camera_file: CameraFile, photos: Photos) -> tuple[CameraFile, Photos, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
-    SceneError if a lens is no pinhole and there are no photos of the camera's shape, or shows next to nothing of one.
+    SceneError if a lens is not a pinhole and photos are missing or of another shape, or if a lens shows next to nothing
+    of a photo.
     """
     if not camera_file.lenses:
         return camera_file, photos, []
@@ -350,7 +351,7 @@ def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | Non
 
 
 def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y ``[h,w]`` float32 in the lens's image of each pixel of a pinhole's image."""
+    """Return for each pixel of a pinhole image its x and y ``[h,w]`` float32 in the image of the lens."""
     centred = K.astype(np.float64).copy()
     centred[:2, 2] -= 0.5  # OpenCV has the top-left pixel's centre at (0, 0)
     coefficients = np.pad(lens.coefficients, (0, len(COEFFICIENTS[lens.model]) - len(lens.coefficients)))
@@ -360,9 +361,9 @@ def _rectify_maps(K: np.ndarray, lens: Lens, size: Size) -> tuple[np.ndarray, np
 
 
 def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: float) -> list[dict[str, Any]]:
-    """List for each view its name, the degrees it turned, and the shift of its centre as a share of ``depth``.
+    """List the name, rotation in degrees, and shift of the centre as a share of ``depth`` for each view.
 
-    ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in their unit.
+    ``start`` and ``end`` are viewmats ``[v,4,4]``; ``depth`` is that of the scene, in the same unit.
     """
     degrees, distances = pose_changes(start, end)
     shifts = distances / depth if depth > 0 else distances

@@ -72,6 +72,6 @@ class CameraFormat:
         return self.convert(source.path, self.read(source))
 
     def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
-        """Convert the cameras that a file stores; SceneError if one is none."""
+        """Convert the cameras that a file stores; SceneError if one of them is invalid."""
         convention = stored.convention or self.convention
         return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)

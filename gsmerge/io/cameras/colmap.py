@@ -64,7 +64,7 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
 
 @contextmanager
 def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """Map a file, so that only bytes in use are read; an empty one raises ValueError."""
+    """Map a file into memory, so that only bytes in use are read; an empty file raises ValueError."""
     check_file(path)
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
@@ -141,9 +141,9 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, View]:
 
 
 def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, View]) -> list[_Image]:
-    """Parse the lines of the images: pose and name (maybe with spaces); each is followed by its points, or is not.
+    """Parse the lines of the images: pose and name, which may have spaces; a line of points may follow each.
 
-    Programs that rewrite ``images.txt`` leave out the lines of points, or only the empty ones.
+    Programs that rewrite ``images.txt`` leave out the lines of points, or only empty ones.
     """
     images: list[_Image] = []
     after_image = False
@@ -161,7 +161,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, View]) 
 
 
 def _lists_points(line: str, cameras: Mapping[int, View]) -> bool:
-    """Return whether a line after an image's lists its points, x y id each, and is no other image's."""
+    """Return whether the line after an image lists its points, x y id each, and is not another image."""
     start = line.split(maxsplit=9)
     if len(start) < 3 or not all(_WHOLE.fullmatch(number) for number in start[2:9:3]):
         return False

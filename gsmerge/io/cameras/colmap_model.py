@@ -26,7 +26,7 @@ _POINT = np.dtype(
 
 
 def files_beside(points: Path) -> tuple[Path, Path]:
-    """Return the paths of the cameras and views of a model; SceneError if files of COLMAP's own are beside them."""
+    """Return the paths of the cameras and views of a model; SceneError if other files of COLMAP are beside them."""
     foreign = next((points.with_name(name) for name in _FOREIGN if points.with_name(name).exists()), None)
     if foreign is not None:
         raise SceneError(foreign, "expected no model of another program in the folder", "choose another folder")
@@ -36,7 +36,7 @@ def files_beside(points: Path) -> tuple[Path, Path]:
 def model_files(
     gaussians: Gaussians, cameras: Cameras, names: Sequence[str], seen: Sequence[np.ndarray]
 ) -> dict[str, bytes]:
-    """Encode the files of a model by name; ``seen`` has for each view the rows of the Gaussians that it shows."""
+    """Encode the files of a model by name; ``seen``: for each view, the rows of the Gaussians that it shows."""
     Ks, camera_ids = np.unique(cameras.Ks.astype(np.float64), axis=0, return_inverse=True)
     files = {CAMERAS: _cameras(Ks, cameras.width, cameras.height)}
     files[IMAGES] = _images(gaussians, cameras, names, seen, camera_ids.reshape(-1) + 1)

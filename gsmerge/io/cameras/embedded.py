@@ -36,7 +36,7 @@ SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
 def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
     """Write cameras as comments for a ``.ply``: a compressed ``transforms.json`` in base64.
 
-    UsageError if they are so many that other programs would not read the header.
+    UsageError if there are so many that other programs would not read the header.
     """
     text = json.dumps(transforms_document(cameras, names, digits=DIGITS), separators=(",", ":"))
     packed = base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")

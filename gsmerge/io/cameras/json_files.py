@@ -58,7 +58,7 @@ def is_long_lrm(source: CameraSource) -> bool:
 
 @contextmanager
 def _number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Turn what missing keys and impossible numbers raise in the block into a SceneError."""
+    """Turn errors of missing keys and invalid numbers in the block into a SceneError."""
     try:
         yield
     except (KeyError, TypeError, ValueError, ArithmeticError) as error:
@@ -100,7 +100,7 @@ def transforms_views(path: Path, data: Any) -> list[View]:
 
 
 def _camera_values(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a file, or a frame in it, says of a camera's intrinsics; null counts as missing."""
+    """Return the values of a camera's intrinsics in a file, or in one of its frames; null counts as missing."""
     values: dict[str, Any] = {key: _number(entry[key]) for key in _NUMBER_KEYS if entry.get(key) is not None}
     values |= {key: entry[key] for key in ("camera_model", "is_fisheye") if entry.get(key) is not None}
     if "camera_model" in values:
@@ -111,14 +111,14 @@ def _camera_values(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _number(value: Any) -> float:
-    """Convert a number of JSON; TypeError for true, false and null, ValueError for text that is none."""
+    """Convert a JSON number; TypeError for true, false and null, ValueError for other text."""
     if isinstance(value, bool):
         raise TypeError(f"found {str(value).lower()}")
     return float(value)
 
 
 def _array(values: Any) -> np.ndarray:
-    """Convert lists of numbers to float64; errors as of :func:`_number`."""
+    """Convert lists of numbers to float64; errors as in :func:`_number`."""
     array = np.array(values, np.float64)
     if bool in set(map(type, np.array(values, object).flat)):
         raise TypeError("found true or false")
@@ -222,7 +222,7 @@ def read_world_mirror(source: CameraSource) -> StoredCameras:
 
 
 def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
-    """Return the (width, height) in whose middle all principal points are; (0, 0) without one."""
+    """Return the (width, height) that centres all principal points; (0, 0) without one."""
     sides = 2 * np.array([K[:2, 2] for K in Ks]).reshape(-1, 2)
     whole = np.abs(sides[:1]).clip(0, MAX_NUMBER).round()
     centred = len(sides) > 0 and bool((np.abs(sides - whole) <= _CENTRED).all())
@@ -249,10 +249,11 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
 def read_long_lrm(source: CameraSource) -> StoredCameras:
     """Read the cameras of a dataset file: ``frames`` of ``fx fy cx cy w h`` and ``w2c``.
 
-    Next to its Gaussians (or copied next to the dataset file) Long-LRM writes which frames it took, in
-    ``input_frame_idx.txt``, and how the cameras' world maps to the Gaussians': X = scene_scale (pos_avg_inv X_cameras).
-    Some versions write the frames alone, from which the rest follows. The cameras are moved into the Gaussians' world.
-    SceneError if an entry is missing or no number, or a frame does not exist.
+    Long-LRM writes further files next to its Gaussians (they may have been copied next to the dataset file): the chosen
+    frames in ``input_frame_idx.txt``, and the map from the world of the cameras to that of the Gaussians, X =
+    scene_scale (pos_avg_inv X_cameras). Some versions write only the frames, and the map is computed from these. The
+    cameras are moved into the Gaussians' world. SceneError if an entry is missing or not a number, or a frame does not
+    exist.
     """
     frames, path, folder = [], source.path, source.folder
     for i, frame in enumerate(source.json["frames"]):
@@ -349,7 +350,8 @@ def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 
-    :func:`read_inria` reads it. Viewers take the principal point to be in the middle; where it is not, it is added.
+    :func:`read_inria` reads it. Viewers assume a principal point in the middle; another one is written as ``cx`` and
+    ``cy``.
     """
 
     def point(K: np.ndarray) -> dict[str, float]:
@@ -371,10 +373,10 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean; empty without the file.
 
-    It says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]).
-    ``transform`` starts from the capture's own world. The poses of a ``transforms.json`` with ``applied_transform``
-    (and ``applied_scale``) are already moved by that, so it is undone; the reading has to be measured. SceneError
-    if the file lacks a rotation, shift and positive scale.
+    The file says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]). ``transform`` starts
+    from the world of the capture. Poses of a ``transforms.json`` with ``applied_transform`` (and ``applied_scale``)
+    have been moved by that already, so it is undone. Which reading is right has to be measured. SceneError if the file
+    lacks a rotation, shift and positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)

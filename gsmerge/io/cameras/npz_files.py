@@ -42,10 +42,10 @@ def is_da3(path: Path) -> bool:
 def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras (and images, if stored) of an npz: world-to-camera 3x4 or 4x4, intrinsics in pixels.
 
-    Intrinsics of another image size than the depth maps' (a COLMAP export in the same call writes those), or
-    normalised ones, are scaled to it. ``cameras.npz`` of Lyra 2, and what VGGT (``extrinsic``, world to camera) and
-    AnySplat (the same, camera to world, normalised, in a batch of one) return are read as well. SceneError if the file
-    cannot be read or lacks an array.
+    Intrinsics that are normalised, or of another image size than the depth maps (as after a COLMAP export in the same
+    call), are scaled to the depth maps. Other readable files: ``cameras.npz`` of Lyra 2; the output of VGGT
+    (``extrinsic``, world to camera); the output of AnySplat (the same, camera to world, normalised, in a batch of one).
+    SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
     sizes = () if holds_images(path) else _DEPTHS  # of depths only the shape counts, the confidence is never read
@@ -73,7 +73,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
 
 def read_dump(source: CameraSource) -> StoredCameras:
-    """Read the cameras and images of a ``views.npz``, which may lack ``K``; SceneError if another array is missing."""
+    """Read the cameras and images of a ``views.npz``; SceneError if an array other than ``K`` is missing."""
     path = source.path
     arrays = read_arrays(path, ("c2w", "K", "images", "order"))
     missing = [name for name in ("c2w", "images") if name not in arrays]
@@ -185,7 +185,7 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics to an image size: these networks keep the principal point in the middle."""
+    """Scale intrinsics to an image size with the principal point in the middle, as these networks assume."""
     size = np.array([width, height])
     ratio = 2 * np.maximum(Ks[:, :2, 2], _SMALL) / size
     normalised = (Ks[:, 0, 0] < 10) & (Ks[:, 0, 2] < 2) & (width > 10)
@@ -219,10 +219,10 @@ def array_shape(path: Path, name: str) -> tuple[int, ...]:
 
 
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
-    """Read arrays from an ``.npz`` by name; names that it lacks are left out.
+    """Read arrays from an ``.npz`` by name, without names that it lacks.
 
-    SceneError if it cannot be read, an array has anything but numbers and text, or they take more memory than the file
-    allows.
+    SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take more
+    memory than the file allows.
     """
     budget = read_budget(path)
     if not zipfile.is_zipfile(path):

@@ -56,7 +56,7 @@ def read_poses(source: CameraSource) -> StoredCameras:
 
 
 def list_frames(folder: Path) -> list[Path]:
-    """List DA3-Streaming's frames in its folder, or in ``results_output`` itself, by their numbers; none without poses.
+    """List the frames of DA3-Streaming in its folder or in ``results_output`` by number; empty without poses.
 
     SceneError if a number is missing.
     """
@@ -95,7 +95,7 @@ def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], first: int = 1) -> list[np.ndarray]:
-    """Parse the numbers of lines; SceneError, with the number of a line from ``first`` on, where one is wrong."""
+    """Parse the numbers of lines; SceneError with the line number, counted from ``first``, if one is wrong."""
     rows: list[np.ndarray] = []
     for number, line in enumerate(lines, first):
         words = _words(line)
@@ -112,5 +112,5 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], first: in
 
 
 def _words(line: str) -> list[str]:
-    """Split a line into words; the last has all that follows the most that a pose has."""
+    """Split a line into words; the last word holds the rest of the line after the numbers of a pose."""
     return line.replace(",", " ").split(maxsplit=_MOST_COLUMNS)

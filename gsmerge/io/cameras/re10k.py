@@ -112,13 +112,13 @@ class _Storage(NamedTuple):
 
 @dataclass
 class _TorchFile:
-    """A file whose tensors are read, all of which together have at most its bytes."""
+    """A file whose tensors are read; together they have at most as many bytes as the file."""
 
     budget: ReadBudget
     num_bytes: int = 0  # read so far
 
     def count(self, num_bytes: int) -> None:
-        """Count bytes that are read next; SceneError if they are more than the file has."""
+        """Count bytes before they are read; SceneError if the file has fewer."""
         self.num_bytes += num_bytes
         if self.num_bytes > self.budget.file_bytes:
             problem = f"expected tensors of at most the file's {self.budget.file_bytes:,} bytes in all, found more"
@@ -141,7 +141,7 @@ class StoredTensor:
         return prod(self.shape)
 
     def read(self) -> np.ndarray:
-        """Read the values; SceneError if the file does not hold each of them."""
+        """Read the values; SceneError if the file does not hold all of them."""
         path, dtype = self.file.budget.path, self.storage.dtype
         if dtype is None:
             raise SceneError(path, "expected plain numbers, found another type")
@@ -197,7 +197,7 @@ def read_torch_file(budget: ReadBudget) -> Any:
 
 
 def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
-    """Raise ValueError if a member lies outside of the file: what it says of itself is allocated to read it."""
+    """Raise ValueError if a member lies outside the file, since reading allocates the size that a member declares."""
     for member in members:
         places = member.header_offset, member.file_size, member.compress_size
         if not 0 <= min(places) <= max(places) <= budget.file_bytes:
@@ -205,7 +205,7 @@ def _check_places(budget: ReadBudget, members: list[zipfile.ZipInfo]) -> None:
 
 
 def _names(budget: ReadBudget) -> Names:
-    """Return what the globals of torch's pickles stand for: those of storages for the type of their numbers."""
+    """Return the globals that a pickle of torch may name: storages, each with the type of its numbers."""
     file = _TorchFile(budget)
     return {
         ("collections", "OrderedDict"): _make_dictionary,

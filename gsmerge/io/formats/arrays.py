@@ -36,7 +36,7 @@ def sh_degree(num_higher: int) -> int:
 
 
 def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
-    """Return the comments of a file that copies of its Gaussians keep: how to render them, in a few short lines."""
+    """Return the header comments that copies of a file keep: short lines on how to render the Gaussians."""
     lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
     kept = (line for line in lines if line.startswith(RENDER_COMMENT) and line.isascii() and line.isprintable())
     return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
@@ -105,7 +105,7 @@ class Packed:
 
 @dataclass(frozen=True)
 class PackedRows:
-    """Rows of a PLY file, of which each block is unpacked when it is taken."""
+    """Rows of a PLY file that are unpacked block by block when they are taken."""
 
     parts: Sequence[Packed]
     dtype: np.dtype[np.void]
@@ -151,7 +151,7 @@ class StoredRows:
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
-    """Make rows of a PLY file of packed Gaussians, with the harmonics of the part that has most."""
+    """Make rows of a PLY file from packed Gaussians, with as many harmonics as the part with the most."""
     num_rest = 3 * max(part.num_higher for part in parts)
     names = (*MEANS, *SH0, *(f"f_rest_{i}" for i in range(num_rest)), "opacity", *SCALES, *QUATS)
     return PackedRows(parts, np.dtype([(name, np.float32) for name in names]))
@@ -171,12 +171,12 @@ def to_stored(parts: Sequence[Packed], name: str, sizes: dict[str, int], *, mip:
 
 
 def most_in_memory(file_bytes: int) -> int:
-    """Return from how many bytes on an array of a file's Gaussians is mapped: harmonics may be many times the file."""
+    """Return the size in bytes from which arrays are mapped: harmonics may be many times the size of the file."""
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
-    """Raise SceneError if Gaussians of ``packed_bytes`` each are more than the file's bytes allow."""
+    """Raise SceneError if the file is too small for ``count`` Gaussians of ``packed_bytes`` each."""
     beside = min(12 * num_higher * count, most_in_memory(budget.file_bytes)) + _UNPACKING
     budget.check_memory(count * (packed_bytes + GAUSSIAN_BYTES) + beside, f"{count:,} Gaussians")
 

@@ -31,7 +31,7 @@ MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
-    """Return the rows of a compressed PLY as those of an ordinary one, with opacities as logits."""
+    """Return the rows of a compressed PLY as rows of an ordinary PLY, with opacities as logits."""
     vertex, chunk = data["vertex"], data["chunk"]
     for element, needed, types in ((vertex, PACKED, ("u4", "i4")), (chunk, RANGES, ("f4", "f8"))):
         dtypes = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
@@ -80,7 +80,7 @@ def _num_rest(path: Path, data: PlyData, count: int) -> int:
 
 
 def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...], ids: np.ndarray) -> np.ndarray:
-    """Return ``[n,3]`` numbers from shares between the least and largest values of chunks, if the file has them."""
+    """Return ``[n,3]`` numbers from shares between the least and largest values of chunks, or shares without these."""
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):
         ends = [chunk[name][ids].astype(np.float32) for name in ranges]
         shares = [low * (1 - share) + high * share for share, low, high in zip(shares, ends, ends[3:], strict=False)]
@@ -88,7 +88,7 @@ def _between(shares: list[np.ndarray], chunk: np.ndarray, ranges: tuple[str, ...
 
 
 def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
-    """Unpack numbers between 0 and 1 from words, the last at the bottom."""
+    """Unpack numbers between 0 and 1 from words; the last number is in the lowest bits."""
     out = []
     for i, width in enumerate(bits):
         shifted = words >> np.uint32(sum(bits[i + 1 :]))
@@ -129,7 +129,7 @@ def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Pack numbers between 0 and 1 side by side into words, the first at the top."""
+    """Pack numbers between 0 and 1 into words; the first number is in the highest bits."""
     words = np.zeros(len(shares), np.uint32)
     for column, width in zip(shares.T, bits, strict=True):
         top = 2**width - 1

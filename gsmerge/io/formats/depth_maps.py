@@ -47,7 +47,7 @@ _KEPT_BYTES = 128 << 20  # of images; more are read at each use
 
 
 def find_depth_maps(folder: Path) -> list[Path]:
-    """Find a folder's depth maps: one file of all views, or one for each in their order; none without any.
+    """Find the files of a folder's depth maps: one file of all views, or a file per view in order; else empty.
 
     SceneError if a frame is missing.
     """
@@ -81,9 +81,10 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
-    """Read DA3-Streaming's frames as :func:`read_rows`; SceneError if they need more memory than all their bytes allow.
+    """Read the frames of DA3-Streaming; SceneError if they take more memory than their total bytes allow.
 
-    What each alone may need is much for thousands of small ones.
+    Each frame is read as in :func:`read_rows`. The memory that each file may take is too much for thousands of small
+    files together.
     """
     budget = ReadBudget(frames[0].parent, sum(map(check_file, frames)))
     check_count(budget, sum(math.prod(array_shape(frame, "depth")) for frame in frames), 0, _PIXEL_BYTES)
@@ -91,7 +92,7 @@ def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
 
 
 def read_images(frames: Sequence[Path]) -> Photos:
-    """Read the images of DA3-Streaming's frames; many are read at each use."""
+    """Read the images of DA3-Streaming's frames; if there are many, they are read again at each use."""
     width, height = read_depth_frame(frames[0]).size
 
     def read(view: int) -> np.ndarray:

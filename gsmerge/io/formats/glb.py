@@ -82,7 +82,7 @@ def glb_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
 
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
-    """Return the attributes ``[n,width]`` by name; rows of fewer than 4 bytes are part of wider ones, as glTF asks."""
+    """Return the attributes ``[n,width]`` by name; short rows are columns of wider ones, as glTF requires."""
     wide = np.zeros((len(columns), 2), "<u2")
     wide[:, 0] = np.rint(columns.opacities.clip(0, 1) * 65535)
     values = {
@@ -101,7 +101,7 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
 
 
 def _to_linear(colors: np.ndarray) -> np.ndarray:
-    """Decode sRGB, 0 to 1, to linear light, which colours of vertices have in glTF (IEC 61966-2-1)."""
+    """Convert sRGB, 0 to 1, to linear light (IEC 61966-2-1), which glTF uses for vertex colours."""
     return np.where(colors <= 0.04045, colors / 12.92, power((colors + 0.055) / 1.055, 2.4))
 
 
@@ -111,7 +111,10 @@ def _chunk(kind: bytes, content: bytes, padding: bytes) -> bytes:
 
 
 def holds_gaussians(path: Path) -> bool:
-    """Return whether a ``.glb`` names the extension; True for one that cannot be read, so that its reader says why."""
+    """Return whether a ``.glb`` uses the extension for Gaussians.
+
+    True also for a file that cannot be read, so that the reader reports the error.
+    """
     try:
         with _damage(path), path.open("rb") as file:
             return NAME in str(_read_document(file, read_budget(path)).get("extensionsUsed"))
@@ -136,7 +139,7 @@ def read_rows(path: Path) -> StoredRows:
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn whatever damaged or foreign files make the reader raise into a SceneError."""
+    """Turn all errors that damaged or foreign files cause in the reader into a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -172,7 +175,7 @@ class _Content:
     num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, which are different ones
 
     def values(self, accessor_id: int) -> _Values:
-        """Read the values of an accessor, which have to be in the chunk."""
+        """Read the values of an accessor, which must lie in the chunk."""
         accessor = self.document["accessors"][accessor_id]
         if "sparse" in accessor or "bufferView" not in accessor:
             raise _ForeignError("one with sparse values")
@@ -216,7 +219,7 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> dict[str, Any]:
 
 
 def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield the primitives of Gaussians, and the matrix ``[4,4]`` of each into the frame of a ``.ply``."""
+    """Yield the primitives that hold Gaussians, each with its matrix ``[4,4]`` into the frame of a ``.ply``."""
     scenes, nodes, seen = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
     budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
     stack = [(node_id, _HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
@@ -293,14 +296,14 @@ def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray
 
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
-    """List the attributes of harmonics up to the highest degree of which a primitive has some; none in drafts."""
+    """List the attributes of harmonics up to the highest degree that a primitive contains; empty for drafts."""
     names = [[f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)] for degree in range(MAX_DEGREE + 1)]
     num_degrees = max((i for i, degree in enumerate(names, 1) if degree[0] in attributes), default=0)
     return [name for degree in names[:num_degrees] for name in degree]
 
 
 def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
-    """Return what moves Gaussians by the matrix of their node ``[4,4]``, which has to be a similarity."""
+    """Return a function that moves Gaussians by the matrix ``[4,4]`` of their node, which must be a similarity."""
     if np.array_equal(place, np.eye(4)):
         return lambda columns: columns
     if np.array_equal(place, _HALF_TURN):

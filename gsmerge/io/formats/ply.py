@@ -61,7 +61,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def is_from_gsmerge(comments: Sequence[str]) -> bool:
-    """Return whether comments of a header say that gsmerge wrote the file: a result, or Gaussians of any origin."""
+    """Return whether header comments say that gsmerge wrote the file: a result, or Gaussians of any origin."""
     return arrays.LOGIT_COMMENT in comments or arrays.RESULT_COMMENT in comments
 
 
@@ -162,7 +162,7 @@ def open_ply(path: Path) -> PlyData:
 
 
 def _stream(path: Path, end: int, *, text: bool) -> IO[Any]:
-    """Open a PLY file for the parser, without bytes beyond ASCII in the header and empty lines in the text."""
+    """Open a PLY file for the parser, with non-ASCII header bytes and empty text lines removed."""
     if text:
         return _TextRows(path.open("rb"), "ascii", "backslashreplace", newline="")
     file = _BinaryRows(FileIO(str(path)))
@@ -237,9 +237,9 @@ def header_counts(path: Path) -> tuple[int, int]:
 
 
 def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
-    """Tell from its first 4 KiB what a PLY file holds: a result of gsmerge, Gaussians, or columns of anything else.
+    """Return what the first 4 KiB of a PLY file show: a result of gsmerge, Gaussians, or other columns.
 
-    What cannot be read, or has a longer header, may hold Gaussians, too.
+    A file that cannot be read, or has a longer header, counts as Gaussians.
     """
     try:
         check_file(path)
@@ -257,7 +257,7 @@ def header_content(path: Path) -> Literal["result", "Gaussians", "other"]:
 def _check_header(start: bytes, budget: ReadBudget) -> tuple[int, bool]:
     """Return the size of a header and whether rows are text; SceneError if the file is too short for it.
 
-    ``start`` has the file's first bytes. Everything else is left to the parser.
+    ``start`` has the first bytes of the file. The parser checks the rest.
     """
     path, size = Path(budget.path), budget.file_bytes
     newline = b"\r\n" if start[3:5] == b"\r\n" else start[3:4]

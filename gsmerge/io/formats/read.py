@@ -85,7 +85,7 @@ def kept_comments(info: FileInfo) -> tuple[str, ...]:
 
 
 def file_notes(info: FileInfo) -> tuple[str, ...]:
-    """Describe what was adapted, or looks odd, in a file: one sentence each, without a full stop."""
+    """Describe adapted or unusual content of a file: one sentence each, without a full stop."""
     counted = {
         "row(s) with NaN or inf, set aside": info.num_nonfinite,
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
@@ -98,7 +98,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
-    """Describe harmonics of a degree that few programs read in a ``.ply``, as :func:`file_notes`."""
+    """Describe harmonics of a degree that few programs read in a ``.ply``, in the form of :func:`file_notes`."""
     if info.sh_degree <= ply.MAX_DEGREE or not PLY.names(info.path):
         return ()
     return (f"harmonics of degree {info.sh_degree}: splat-transform 3.7 and gsply refuse a .ply with them",)
@@ -126,7 +126,10 @@ def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
 
 
 def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read one PLY file, or several of the same columns or of depth maps as one, in order; see :func:`read_ply`."""
+    """Read several files as one, in the given order; see :func:`read_ply`.
+
+    They are one PLY file, PLY files with equal columns, or files of depth maps.
+    """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
     is_depth = input_format(paths[0]) is DEPTHS
@@ -208,7 +211,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
 
 
 def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of a file, and count what was clipped and what had no rotation."""
+    """Fill arrays with the rows of a file, and count clipped scales and missing rotations."""
     n, size = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
     with ply.open_rows(path, stored.rows) as read:
 
@@ -233,7 +236,10 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 
 
 def _convert_plain(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
-    """Fill arrays with the rows before the first one that is not plain, see :func:`convert_rows`; return how many."""
+    """Fill arrays with the rows before the first row that is not plain, and return their number.
+
+    See :func:`convert_rows`.
+    """
     columns, num_higher = dict(rows.dtype.fields or {}), out["shN"].shape[1]
     rest = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
     used = (*arrays.MEANS, *arrays.SH0, *rest, *arrays.SCALES, *arrays.QUATS, "opacity")
@@ -325,9 +331,10 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
-    """Return the encoding of opacities that the parts declare, None without any; SceneError where parts differ in it.
+    """Return the encoding of opacities that the parts declare; None if none does.
 
-    A part that declares none has the one that its values show, if they are enough to show any.
+    A part that declares none has the encoding that its values show, if there are enough values. SceneError if parts
+    differ.
     """
     first, seen = 0, dict[str, str]()  # name of the first part of each encoding
     for path, part in zip(paths, parts, strict=True):
@@ -345,9 +352,9 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
 
 
 def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) -> str:
-    """Convert stored opacities to [0, 1] in place, and return their encoding, guessed where it is not known.
+    """Convert stored opacities to [0, 1] in place, and return their encoding, which is guessed if unknown.
 
-    They are raw if all finite ones lie in [0, 1]. An infinite raw one makes its row invalid.
+    Opacities are raw if all finite values lie in [0, 1]. An infinite raw value makes its row invalid.
     """
     encoding = encoding or _guess_encoding(opacities)
     if encoding == "raw":

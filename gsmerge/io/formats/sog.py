@@ -49,7 +49,7 @@ _MAX_STEPS = 200
 
 
 class _Files(Protocol):
-    """The files of one ``.sog`` by their names, of which nothing is read that is larger than all may be."""
+    """The files of one ``.sog`` by name; a file larger than the limit for all of them is not read."""
 
     @property
     def size(self) -> int:
@@ -119,7 +119,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 
 def read_unbundled(path: Path) -> SogContent:
-    """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as of :func:`read_rows`."""
+    """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as in :func:`read_rows`."""
     check_file(path)
     with _damage(path):
         size = sum(entry.stat().st_size for entry in os.scandir(path.parent))
@@ -128,7 +128,7 @@ def read_unbundled(path: Path) -> SogContent:
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn whatever damaged files make a reader raise into a SceneError."""
+    """Turn all errors that damaged files cause in a reader into a SceneError."""
     try:
         with read_errors(path):
             yield
@@ -160,7 +160,7 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
 
 
 def _image_size(data: bytes) -> tuple[int, int]:
-    """Return width and height of a WebP image; ValueError if it is none, or one with loss."""
+    """Return width and height of a WebP image; ValueError if it is another file, or lossy."""
     at = 12
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         while at + 8 <= len(data) and data[at : at + 4] in (b"VP8X", b"ICCP"):  # before the image of an extended file
@@ -236,7 +236,10 @@ def _read_palette(files: _Files, part: dict[str, Any], count: int, budget: ReadB
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.sog`` along a space-filling curve; ``comments`` may mark it as antialiased. ValueError for NaN."""
+    """Encode a ``.sog`` along a space-filling curve; ``comments`` may mark it as antialiased.
+
+    ValueError if there is NaN or inf.
+    """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
@@ -300,7 +303,7 @@ def _texture(values: np.ndarray) -> bytes:
 
 
 def _webp(image: np.ndarray) -> bytes:
-    """Encode WebP without loss, but for colours of pixels whose alpha is 0."""
+    """Encode a WebP image without loss, except for colours of pixels whose alpha is 0."""
     order = [2, 1, 0, 3][: image.shape[2]]
     _, data = cv2.imencode(".webp", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS])
     return data.tobytes()
@@ -309,9 +312,9 @@ def _webp(image: np.ndarray) -> bytes:
 def fit_codebook(values: np.ndarray) -> np.ndarray:
     """Choose ``[256]`` rising values that represent finite numbers of any shape, by 1-D k-means.
 
-    Thousands of narrow cells are merged, always the two neighbours that add the least squared error
-    (Ward 1963), until 256 are left; Lloyd's steps improve those. So values far from all others keep
-    codes of their own. Unused codes repeat the last one.
+    Starting from thousands of narrow cells, the two neighbours with the least added squared error are merged (Ward
+    1963) until 256 cells are left. Lloyd's steps improve these. Therefore values far from all others keep codes of
+    their own. Unused codes repeat the last one.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
@@ -365,8 +368,8 @@ def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:
 def fit_palette(vectors: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray]:
     """Choose a palette of at most ``2**max_bits`` vectors for ``vectors [n,d]``, and each vector's index ``[n]`` in it.
 
-    Groups are halved at the median of the coordinate in which they differ most; the means of the last groups are the
-    palette. Where there are few enough vectors, each is its own.
+    Groups are halved at the median of the coordinate with the largest spread. The palette is the means of the final
+    groups. If there are few enough vectors, each vector is an entry of the palette.
     """
     count = len(vectors)
     if count <= 2**max_bits:

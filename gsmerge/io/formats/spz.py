@@ -114,8 +114,8 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
 def problem_at_end(path: Path) -> str | None:
     """Describe errors at the end of a ``.spz`` that readers skip; None without any.
 
-    These are a wrong checksum of the stream, and bytes beyond what the header promises, as under a wrong version.
-    Version 4 has neither.
+    The errors are a wrong checksum of the stream, and more bytes than the header declares, for example under a wrong
+    version. Version 4 has neither.
     """
     packed = path.read_bytes()
     if packed[:2] != GZIP_MAGIC:
@@ -133,7 +133,7 @@ def problem_at_end(path: Path) -> str | None:
 
 
 def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Read header and parts of version 4, without extensions, which do not describe the Gaussians."""
+    """Read header and parts of version 4; extensions, which do not describe the Gaussians, are skipped."""
     header = _read_header(path, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     try:
@@ -250,9 +250,9 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = (), *, version: int = 3) -> bytes:
-    """Encode a ``.spz`` file, of which one of the ``comments`` may say that the Gaussians are antialiased.
+    """Encode a ``.spz`` file; one of the ``comments`` may mark the Gaussians as antialiased.
 
-    ValueError if there is NaN or inf, or the version is not 3 or 4; UsageError if ``zstandard`` is missing for
+    ValueError if there is NaN or inf, or if the version is not 3 or 4; UsageError if ``zstandard`` is missing for
     version 4.
     """
     if version not in VERSIONS:

@@ -132,10 +132,9 @@ def streamed_files(
 ) -> dict[str, bytes]:
     """Encode levels of detail, the finest first, as files by path below one folder; the index comes last.
 
-    A chunk's folder has its level, its number and a hash of its content in its name, so that chunks of
-    two results are never mixed: neither where one replaces the other, nor in a browser's cache. ``mip``
-    marks antialiased Gaussians, the ``environment`` is part of no level, and ``measure`` gives the leaves
-    their errors. ValueError if a level is empty or not finite.
+    The name of a chunk's folder contains its level, its number and a hash of its content. So chunks of two results
+    never mix, on disk or in a browser's cache. ``mip`` marks antialiased Gaussians; the ``environment`` belongs to no
+    level; ``measure`` computes the errors of the leaves. ValueError if a level is empty or not finite.
     """
     if not levels or not all(len(level) for level in levels):
         raise ValueError("levels: expected Gaussians in each, got none")
@@ -185,7 +184,7 @@ class _Boxes:
         self.high = self.means + widths + rounding
 
     def split(self, leaves: list[Leaf], rows: np.ndarray | None = None) -> dict[str, Any]:
-        """Halve rows along their longest side until they are few; return the node, and add its leaves."""
+        """Halve rows along their longest side until they are few; return the node, and append its leaves."""
         rows = np.arange(len(self.means)) if rows is None else rows
         inside = self.means[rows]
         extent = np.ptp(inside, axis=0)
@@ -207,7 +206,7 @@ class _Boxes:
 
 
 def _pack(sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Yield the indices of neighbouring leaves that share a chunk; empty ones are in none."""
+    """Yield the indices of neighbouring leaves that share a chunk; empty leaves have no chunk."""
     members: list[int] = []
     total = 0
     for i, size in enumerate(sizes):
@@ -296,7 +295,7 @@ def _inside(index: Path, name: Any) -> Path:
 
 
 def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield level and run of all leaves in their order; ValueError for a node that is none."""
+    """Yield level and run of all leaves in order; ValueError for an invalid node."""
     nodes = [tree]
     while nodes:
         node = nodes.pop()
@@ -323,10 +322,10 @@ def _cover(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict
 
 
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
-    """Read the Gaussians of one level; level 0, the finest, comes with those of the environment.
+    """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
-    ``index``: what :func:`read_index` returned of the path. SceneError if the index or a chunk cannot be read, or they
-    do not agree.
+    ``index``: result of :func:`read_index` for the path. SceneError if the index or a chunk cannot be read, or they
+    contradict each other.
     """
     index = index or read_index(path)
     chunks: dict[Path, int | None] = {**index.levels[level]}
@@ -351,7 +350,10 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks, each with its number of Gaussians if the index has that, within the budget of all together."""
+    """Read chunks within the budget of all together.
+
+    Each chunk comes with its number of Gaussians if the index has it.
+    """
     root, seen = os.path.realpath(path.parent), set[str]()
     contents: list[sog.SogContent] = []
     num_bytes, total, num_higher = check_file(path), 0, 0
@@ -373,9 +375,9 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove chunks beside an index that the index does not name and that :func:`streamed_files` once made.
+    """Remove chunks of :func:`streamed_files` beside an index that does not name them.
 
-    Other files in the chunks' folders stay, with their folders; so does what cannot be removed.
+    Other files in the folders of the chunks stay, together with their folders; so do files that cannot be removed.
     """
     index = read_index(path)
     chunks = [chunk for level in index.levels for chunk in level]

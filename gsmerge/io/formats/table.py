@@ -36,7 +36,7 @@ class Format:
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
     def names(self, path: StrPath) -> bool:
-        """Return whether a path ends as files of this format do."""
+        """Return whether the name of a path has the ending of this format."""
         name = Path(path).name
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
@@ -101,9 +101,9 @@ SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*
 
 
 def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
-    """Return how many Gaussians a file of at most ``max_bytes`` has room for; UsageError if for none.
+    """Return how many Gaussians fit into a file of at most ``max_bytes``; UsageError if none does.
 
-    Exact of a ``.ply``, about right of other formats, whose bytes depend on their content.
+    The number is exact for a ``.ply``, and approximate for other formats, whose size depends on their content.
     """
     if chosen is PLY:
         return ply.count_for_bytes(max_bytes, sh_degree)
@@ -114,9 +114,10 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
 
 
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return about how many Gaussians files have together, and the most columns of harmonics above degree 0 of one.
+    """Estimate the number of Gaussians in all files, and the largest number of harmonics columns in any file.
 
-    Exact of a ``.ply`` by its header, of other formats by the bytes; zeros where nothing can be read.
+    Columns of degree 0 are not counted. A ``.ply`` is counted exactly by its header, other formats by their size in
+    bytes; zeros for files that cannot be read.
     """
     counts = [
         ply.header_counts(path) if input_format(path).read is ply.read_rows else _by_bytes(path) for path in paths
@@ -125,7 +126,7 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def _by_bytes(path: Path) -> tuple[int, int]:
-    """Return about how many Gaussians a file has, at degree 0, and no columns of harmonics."""
+    """Estimate the number of Gaussians of a file by its size, assuming degree 0; the second number is 0."""
     try:
         return int(path.stat().st_size / (input_format(path).each or (math.inf,))[0]), 0
     except OSError:
@@ -133,7 +134,7 @@ def _by_bytes(path: Path) -> tuple[int, int]:
 
 
 def input_format(path: StrPath) -> Format:
-    """Return the format of a path to read; PLY for unknown endings."""
+    """Return the format in which to read a path; PLY for unknown endings."""
     return next((row for row in FORMATS if row.names(path)), PLY)
 
 
@@ -143,15 +144,15 @@ def is_frame(path: Path) -> bool:
 
 
 def may_hold_gaussians(path: Path) -> bool:
-    """Return whether a file has an ending of Gaussians, and content where the ending has others, too."""
+    """Return whether the ending, and for endings with several uses the content, is that of Gaussians."""
     return path.suffix.lower() in SCENE_SUFFIXES and input_format(path).holds(path)
 
 
 def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: the name may be that of an index of levels of detail; ``cameras``: or that of a COLMAP model, which
-    holds cameras. ValueError if there is no such version.
+    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model, which needs cameras, is allowed.
+    ValueError for an unknown version of ``.spz``.
     """
     rows = [row for row in FORMATS if row.names(path) and row.max_degree >= 0]
     if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):

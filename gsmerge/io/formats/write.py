@@ -12,7 +12,7 @@ from gsmerge.types import Gaussians, StrPath
 
 
 def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
-    """Describe the harmonics that are not written in a format; None if all are. UsageError for an unknown ending."""
+    """Describe the harmonics that a format leaves out; None if it keeps all. UsageError for an unknown ending."""
     chosen = output_format(path, spz_version, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
@@ -54,7 +54,7 @@ def write_gaussians(
         overwrite: Replace an existing file.
         comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
-        normals: Of a ``.ply``, as of :func:`write_ply`.
+        normals: Of a ``.ply``, as in :func:`write_ply`.
         spz_version: Of a ``.spz``: 3, which most programs read, or 4, which has room for harmonics of degree 4 and
             needs ``zstandard``.
 

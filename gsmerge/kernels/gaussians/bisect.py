@@ -18,17 +18,17 @@ _split_groups = declare(
 
 
 def gather_groups(starts, ids, rows):
-    """Members of the groups ``rows``, one after the other: starts and ids of their own."""
+    """Gather the members of the groups ``rows``, one after the other: their starts and ids."""
     sizes = starts[rows + 1] - starts[rows]
     local = np.concatenate([[0], np.cumsum(sizes)])
     return local, ids[np.repeat(starts[rows] - local[:-1], sizes) + np.arange(local[-1])]
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
-    """Children of every group: the run of members with the largest spread is halved until there are ``num_children``.
+    """Divide every group: the run of members with the largest spread is halved until there are ``num_children``.
 
-    A member's features are its colour and its position about ``centres [g,3]`` in units of ``footprints [g]``.
-    Groups of identical members give fewer children, and children nest: those of 2 are unions of those of 4.
+    A member's features are its colour, and its position relative to ``centres [g,3]`` in units of ``footprints [g]``.
+    Groups of identical members give fewer children. Children nest: the children for 2 are unions of the children for 4.
     ``num_children`` is one number or ``[g]``, at least 1.
 
     Returns ``child_starts [m+1]`` into the returned ``child_ids``, and ``parents [m]``.
@@ -39,11 +39,11 @@ def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children
 
 
 def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
-    """``[g,max_children]`` squared error of every group with 1, 2, ... children, NaN beyond what its members give.
+    """Compute the squared error ``[g,max_children]`` of every group with 1, 2, ... children.
 
-    Children as in :func:`bisect`. A member's error is its squared distance from the child's mean colour, plus that
-    from the plane fitted to the child times ``plane_weight``, in features; members weigh one on average, opaque
-    ones more.
+    It is NaN beyond the number that the members give. Children are those of :func:`bisect`. The error of a member is
+    its squared distance from the child's mean colour, plus ``plane_weight`` times that from the plane fitted to the
+    child, in features. Members weigh one on average, opaque members more.
     """
     num_groups = len(starts) - 1
     counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
@@ -52,7 +52,7 @@ def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_ch
 
 
 def _split(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
-    """Children of every group as :func:`bisect` returns them; their errors go to ``errors [g, any]``."""
+    """Return the children of every group as :func:`bisect` does, and write their errors to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))
     longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())

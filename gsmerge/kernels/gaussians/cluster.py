@@ -45,10 +45,10 @@ _find_stars = declare(
 
 
 def leader_clusters(order, neighbors, scores, views, threshold, max_size):
-    """Cluster Gaussians in stars: each in ``order`` that is still free leads its free neighbours that overlap enough.
+    """Cluster Gaussians in stars: each free one, in ``order``, leads its free neighbours that overlap enough.
 
-    At most ``max_size`` to a cluster and one of each view, the best overlaps first; no member is reached through
-    another, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
+    A cluster has at most ``max_size`` members, at most one per view, the best overlaps first. All members are
+    neighbours of the leader, so clusters cannot chain. Returns the cluster of each Gaussian and the number of clusters.
 
     Args:
         order: ``[n]`` int64: all Gaussians.

@@ -36,7 +36,7 @@ _search_tree = declare(
 
 
 def nearest_of_others(points, views, order, axes, splits, first, last, most, out):
-    """Write the nearest points of other views than the own to rows ``first`` to ``last`` of ``out [n,k]``.
+    """Write the nearest points of other views to rows ``first`` to ``last`` of ``out [n,k]``.
 
     Args:
         points: As :func:`build_tree` took them.

@@ -23,10 +23,10 @@ def adam(
     x, x0, m, v, units, box_shares, min_sizes, ids, g_means, g_quats, g_scales, g_opacities, g_colors, rates, limits,
     betas, regs, step, first, last, means, quats, scales, opacities, colors,
 ):  # fmt: skip
-    """Adam on the rows ``ids[first]`` to ``ids[last - 1]`` of the state ``x [n,COLUMNS]``, then the box about ``x0``.
+    """Take an Adam step of rows ``ids[first]`` to ``ids[last - 1]`` of ``x [n,COLUMNS]``; clip to the box about ``x0``.
 
-    The mean and the quaternion share one second moment over their components, so that the step turns with the
-    scene. Sparse: rows that a view does not show keep their parameters and moments.
+    The components of the mean share one second moment, and so do those of the quaternion, so that the step rotates with
+    the scene. The step is sparse: rows that a view does not show keep their parameters and moments.
 
     Args:
         box_shares: ``[n]`` of the limits of mean and log scale that each Gaussian may use.

@@ -39,12 +39,12 @@ _agglomerate = declare(
 def agglomerate(
     means, covars, masses, colors, order, starts, color_weight, exponent, least_share, first, last, pairs, costs
 ):
-    """Write the merges of cells ``first`` to ``last``, in each the cheapest pair that is left, one after the other.
+    """Write the merges in cells ``first`` to ``last``: in each cell the cheapest remaining pair, again and again.
 
-    A pair costs Runnalls' bound (2007) on the divergence that its merging brings, per mass, plus the squared distance
-    of colours, times a power of its mass. Sizes and masses are in units of the cell's means, so the costs of cells
-    compare. A merge counts at least as much as those before it in its cell, so merges up to any cost are the first
-    ones of every cell.
+    The cost of a pair is Runnalls' bound (2007) on the divergence of its merging, per mass, plus the squared distance
+    of colours, times a power of its mass. Sizes and masses are in units of the means of the cell, so costs of different
+    cells can be compared. The cost of a merge is at least that of the merges before it in its cell, so the merges up to
+    any cost are the first ones of every cell.
 
     Args:
         means: ``[n,3]`` float64.
@@ -75,5 +75,6 @@ def agglomerate(
 def merge_pairs(pairs, means, covars, masses, sh, sizes):
     """Replace the first row of each pair by the Gaussian with the moments of both, one pair after the other.
 
-    Masses and ``sizes``, how many were merged, add up; harmonics are means by mass. The second rows stay as they are.
+    Masses add up, and so do ``sizes``, the numbers of merged Gaussians; harmonics are means by mass. The second rows
+    stay unchanged.
     """

@@ -10,7 +10,7 @@ _sort_labels = declare("sort_labels", STATUS, labels=i4("n"), starts=i8("ends", 
 
 
 def group_members(labels, count):
-    """Counting sort: int64 ``starts [count+1]`` and int32 members by label, rising; labels below 0 are left out.
+    """Sort members by label: int64 ``starts [count+1]`` and int32 members; labels below 0 are left out.
 
     Args:
         labels: ``[n]`` int32, below ``count``.

@@ -31,7 +31,7 @@ def normalise(x, gains, shifts, out):
     heads=i8(least=1), scratch=f4("space", out=True), out=f4("sets", "queries", "mixed", out=True),
 )  # fmt: skip
 def attend(query, pairs, mask, heads, scratch, out):
-    """Write the values of each set's tokens, mixed for each query by its likeness to their keys.
+    """Write for each query the values of its set's tokens, weighted by the similarity of their keys to the query.
 
     Args:
         query: ``[sets,queries,width]``, head by head.
@@ -45,7 +45,7 @@ def attend(query, pairs, mask, heads, scratch, out):
 
 
 def padded(count: int) -> int:
-    """Return a number of columns filled up to whole vectors."""
+    """Return a number of columns rounded up to whole vectors."""
     return -(-count // LANES) * LANES
 
 

@@ -16,7 +16,7 @@ def sort_bits(bits, order, keys, spare):
 
 
 def depth_order(bits):
-    """Stable order by the bit patterns ``[m]`` uint32 of positive floats, nearest first: ``[m]`` int32 positions."""
+    """Return the stable order of ``[m]`` uint32 bit patterns of positive floats, nearest first: ``[m]`` int32."""
     m = len(bits)
     order = np.empty(m, np.int32)
     sort_bits(bits, order, np.empty(m, np.uint64), np.empty(m, np.uint64))
@@ -28,11 +28,11 @@ def depth_order(bits):
     corners=i8("num_corners", out=True), counts=i8("tiles", out=True),
 )  # fmt: skip
 def count_boxes(boxes, tile_height, tile_width, corners, counts):
-    """Write the number of boxes over each tile; ``corners``, zero before, has a place for every corner of a tile."""
+    """Write the number of boxes over each tile; ``corners``, zero before, has an entry for every corner of a tile."""
 
 
 def count_tiles(boxes, tile_height, tile_width):
-    """``[tile_height * tile_width]`` int64 boxes over each tile.
+    """Count the boxes over each tile: ``[tile_height * tile_width]`` int64.
 
     ``boxes [m,4]`` int16: first and (exclusive) last tile column, first and last tile row.
     """
@@ -62,9 +62,10 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
     left=f4("tiles", out=True), cursors=i8("tiles", out=True), flatten_ids=i4("intersections", out=True),
 )  # fmt: skip
 def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
-    """Do the work of :func:`deal_tiles` for some lines of tiles, without what is behind Gaussians that hide a tile.
+    """Append Gaussians to the lists of a range of tile lines, without Gaussians hidden behind others.
 
-    Such a list ends with the Gaussian after which every pixel has stopped, so no walk misses the others.
+    The lists are those of :func:`deal_tiles`, but each ends with the Gaussian after which every pixel of the tile has
+    stopped, so no pixel misses any.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.

@@ -31,15 +31,15 @@ TILES = {"first": i8(), "last": i8()}
 def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, top, background, image, transmittance):
     """Blend a range of tiles over ``background [3]`` into ``image [h,w,3]`` and ``transmittance [h,w]``.
 
-    These hold the view's rows from ``top`` on; tiles that do not begin in them are left out.
+    These arrays hold the view's rows from ``top`` on; tiles that begin outside them are skipped.
     """
 
 
 @native(STATUS, **LISTS, **TILES, image=f4("h", "w", "channels"), slots=f4("n", CHANNELS, out=True))
 def weighted_sums(conics, flatten_ids, isect_offsets, tile_width, first, last, image, slots):
-    """Per intersection of a range of tiles: the weights times up to four channels of an image, summed.
+    """Sum the weights times up to four channels of an image, for each intersection of a range of tiles.
 
-    ``image [h,w,c]``, c <= CHANNELS; ``slots [intersections,CHANNELS]`` is written in the tiles' part.
+    ``image [h,w,c]``, c <= CHANNELS; ``slots [intersections,CHANNELS]`` is written at the intersections of these tiles.
     """
 
 
@@ -56,12 +56,12 @@ def add_slots(flatten_ids, slots, ids, first, sums):
 
 @native(STATUS, **LISTS, colors=f4("m", 3), image=f4("h", "w", 3, out=True), totals=f4("m", 2, out=True))
 def survey(conics, flatten_ids, isect_offsets, tile_width, colors, image, totals):
-    """Do the work of :func:`blend`, of all tiles over black, and of :func:`contributions` in one walk."""
+    """Blend all tiles over black, and sum the weights as :func:`contributions` does, in one pass."""
 
 
 @native(STATUS, **LISTS, height=i8(least=1), width=i8(least=1), totals=f4("m", 2, out=True))
 def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width, totals):
-    """Add every Gaussian's weights over the pixels to ``totals[:, 0]``; raise ``totals[:, 1]`` to the largest of them.
+    """Add each Gaussian's sum of weights to ``totals[:, 0]``, and raise ``totals[:, 1]`` to its largest weight.
 
     ``totals [m,2]`` float32.
     """
@@ -71,9 +71,9 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write where Gaussians show in the tile at a pixel, as all walks take it.
+    """Write the parts of the tile at a pixel in which Gaussians show, as all kernels use them.
 
-    ``parts``: first and last row, and the first of the eight columns that suffice; -1 where they do not.
+    ``parts``: first and last row, and the first of eight columns that are sufficient; -1 if eight are not.
     """
 
 
@@ -85,7 +85,7 @@ def blend_backward(
     conics, flatten_ids, isect_offsets, tile_width, colors, first, last,
     image, transmittance, grad_image, grad_left, slots,
 ):  # fmt: skip
-    """Gradient sums of a range of tiles, one row per intersection.
+    """Write the gradient sums of a range of tiles, one row per intersection.
 
     Args:
         image: ``[h,w,3]`` float32, the blended image, background included.

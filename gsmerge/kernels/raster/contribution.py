@@ -25,7 +25,7 @@ NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, COUNTS = 0, 1, 2, 3  # what the kernels count,
     stamps=i4("num_labels", most=-1, out=True), counts=i8(COUNTS, out=True),
 )  # fmt: skip
 def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads, pairs, active, stamps, counts):
-    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last that there is room for."""
+    """Append the pairs of a row of tiles, from tile ``counts[NEXT_TILE]`` to the last tile that the buffers hold."""
 
 
 @native(
@@ -35,13 +35,13 @@ def add_row(conics, flatten_ids, isect_offsets, tile_width, line, labels, heads,
     counts=i8(COUNTS, out=True),
 )  # fmt: skip
 def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_values, out_labels, counts):
-    """Add up the pairs of every Gaussian; decide on those that end above ``bottom``, carry over the others' sums."""
+    """Sum the pairs of every Gaussian: finish Gaussians that end above ``bottom``, and carry over other sums."""
 
 
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
-    """Return each Gaussian's largest sum of weights in one superpixel, ``[m]`` float32, and its label, ``[m]`` int32.
+    """Return each Gaussian's largest sum of weights in one superpixel, and the label of that superpixel.
 
-    Of equal sums the superpixel with the smallest label counts; 0 and -1 for Gaussians that are not seen.
+    They are ``[m]`` float32 and ``[m]`` int32. Of equal sums the smallest label counts; 0 and -1 for unseen Gaussians.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.

@@ -29,15 +29,16 @@ _loss_gradient = declare(
 
 
 def room_of(width):
-    """Return the values that a buffer of a row of ``width`` pixels holds."""
+    """Return the length of a buffer for a row of ``width`` pixels."""
     return -(-3 * width // CHUNK) * CHUNK + PAD
 
 
 def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    e is ``image - photo``, its differences are those to the next pixel of a row and of a column. Pixels have their
-    weights, a pair of pixels the lesser one. Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond the border.
+    e is ``image - photo``; differences of e are taken to the next pixel of a row and of a column. Pixels have weights,
+    and a pair of pixels has the smaller weight of the two. Windows of SSIM are uniform, of 7 x 7 pixels, zero beyond
+    the border.
 
     Args:
         image: ``[h,3w]`` float32, interleaved channels.

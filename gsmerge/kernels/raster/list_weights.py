@@ -48,7 +48,7 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
 
 @native(STATUS, **ENTRIES, colors=f4("m", LANES), image=f4("h", "w", LANES, out=True))
 def spread(starts, lanes, weights, flatten_ids, isect_offsets, tile_width, colors, image):
-    """Sums of weights times ``colors [m,LANES]`` -> ``image [h,w,LANES]``, every pixel of it."""
+    """Write sums of weights times ``colors [m,LANES]`` to every pixel of ``image [h,w,LANES]``."""
 
 
 @native(STATUS, **ENTRIES, image=f4("h", "w", LANES), sums=f8("m", LANES, out=True))

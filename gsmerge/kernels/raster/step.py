@@ -38,8 +38,8 @@ STEP = Table(
 
 @native(STATUS, table=i8("fields", out=True), phase=i8(least=0, below=len(PHASES)))
 def fit_phase(table, phase):
-    """Work on a phase of a step until nothing is left of it; every one of its ``threads`` makes one such call.
+    """Work on a phase of a step until it is finished; each of the ``threads`` makes one such call.
 
-    Phases follow in their order, each once all calls of the one before have ended. After "count" the table says how
-    many intersections there are; the buffers must have room for them before it goes on.
+    A phase begins when all calls of the phase before have ended. After "count" the table holds the number of
+    intersections, and the buffers must have room for them before the next phase.
     """

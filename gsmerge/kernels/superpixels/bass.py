@@ -42,7 +42,7 @@ ROW = 9  # columns of a region's parameters
 
 
 def sum_regions(labels, colours, marks, count):
-    """``[count,7]`` float64 sums over the marked pixels of every region.
+    """Sum the marked pixels of every region: ``[count,7]`` float64.
 
     Args:
         labels: Padded labels.
@@ -57,11 +57,11 @@ def sum_regions(labels, colours, marks, count):
 
 @native(f8(), sums=f8(SUMS), prior=f8(4))
 def log_evidence(sums, prior):
-    """Logarithm of ``Γ(n) f`` of a region's ``[7]`` sums.
+    """Compute the logarithm of ``Γ(n) f`` from a region's ``[7]`` sums.
 
-    With ``m ~ N(0, v σ²)`` and ``σ² ~ IG(a, b)`` for each channel, its colours have the likelihood ``(2π)^(-n/2)
-    (1 + n v)^(-1/2) Γ(a_n) / Γ(a) b^a / b_n^(a_n)``, where ``a_n = a + n / 2`` and ``b_n = b + (Σ c² - (Σ c)² v /
-    (1 + n v)) / 2`` (Murphy 2007, section 3).
+    With ``m ~ N(0, v σ²)`` and ``σ² ~ IG(a, b)`` for each channel, its colours have the likelihood ``(2π)^(-n/2) (1 + n
+    v)^(-1/2) Γ(a_n) / Γ(a) b^a / b_n^(a_n)``, where ``a_n = a + n / 2`` and ``b_n = b + (Σ c² - (Σ c)² v / (1 + n v)) /
+    2`` (Murphy 2007, section 3).
     """
 
 
@@ -74,10 +74,10 @@ _mark_halves = declare(
 
 
 def mark_halves(labels, count, across):
-    """``[h,w]`` bool: the second half of every region, both halves 4-connected; none of a region of one pixel.
+    """Mark the second half of every region, ``[h,w]`` bool; both halves are 4-connected.
 
-    A pixel goes with the nearer, in steps inside the region, of two ends in the middle of its top and bottom, or where
-    ``across`` of its left and right.
+    A region has two ends: the middle of its top and bottom, or with ``across`` of its left and right. Each pixel
+    belongs to the end that is nearer in steps inside the region. A region of one pixel has no second half.
     """
     height, width = labels.shape[0] - 2, labels.shape[1] - 2
     halves, queue = np.empty((height, width), np.uint8), np.empty((height * width, 2), np.int32)
@@ -93,7 +93,7 @@ _weigh_splits = declare(
 
 
 def weigh_splits(whole, second, prior):
-    """``[count]`` log H of splitting every region; -inf where there is nothing to split.
+    """Compute log H ``[count]`` of splitting every region; -inf where it cannot be split.
 
     Args:
         whole: ``[count,7]`` sums of the regions.
@@ -113,7 +113,7 @@ _choose_merges = declare(
 
 
 def choose_merges(pairs, sums, prior):
-    """Every region's best neighbour ``[count]`` (-1: none) and log H ``[count]`` of merging with it."""
+    """Choose every region's best neighbour ``[count]`` (-1: none) and compute log H ``[count]`` of merging with it."""
     count = len(sums)
     partners, ratios = np.full(count, -1, np.int32), np.full(count, -np.inf)
     _choose_merges(sums, pairs, prior, np.empty(count), partners, ratios)
@@ -152,7 +152,7 @@ def split(labels, colours, areas, prior, across, most, least=0.0):
 
 
 def merge(labels, colours, areas, prior, most, least=0.0):
-    """Merge pairs of regions that are each other's best neighbour; arguments and result as of :func:`split`."""
+    """Merge pairs of regions that are each other's best neighbour; arguments and result as in :func:`split`."""
     count = len(areas)
     sums = sum_regions(labels, colours, np.ones(colours.shape[:2], np.bool_), count)
     partners, ratios = choose_merges(adjacent_pairs(labels), sums, prior)
@@ -167,9 +167,10 @@ def merge(labels, colours, areas, prior, most, least=0.0):
 
 
 def simple_point_table():
-    """``[256]`` uint8: 1 where walking round the ring meets one arc with the label and one without, each with an edge.
+    """Make a table ``[256]`` uint8 of the rings of neighbours at which a pixel may change its label.
 
-    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
+    An entry is 1 if the ring has one arc of pixels with the label and one arc without, each with an edge neighbour. Bit
+    i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the label.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     changes = (cells != np.roll(cells, 1, axis=1)).sum(1)
@@ -185,10 +186,10 @@ _fit_regions = declare(
 
 
 def fit_regions(labels, colours, areas):
-    """``[count,9]`` float32 parameters of every region: means, inverse covariance and its determinant's logarithm.
+    """Fit ``[count,9]`` float32 parameters of every region: means, inverse covariance and its log-determinant.
 
-    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the area A of ``areas``
-    ``[count]`` float64 that the region is expected to have, pixels.
+    The covariance is ``(A² I + S) / (n + 50 A - 3)`` with the scatter S of n positions and the expected area A of the
+    region, pixels, from ``areas [count]`` float64.
     """
     rows = np.empty((len(areas), ROW), np.float32)
     _fit_regions(labels, colours, areas, np.zeros((len(areas), 9)), rows)
@@ -200,14 +201,14 @@ def fit_regions(labels, colours, areas):
     rows=f4("count", ROW), table=u1(256), foreign=f4(256), precision=f4(),
 )  # fmt: skip
 def label_pass(labels, colours, rows, table, foreign, precision):
-    """One pass over all border pixels, in four grids of pixels that do not touch; returns how many changed.
+    """Pass over all border pixels once, in four grids of pixels that do not touch; return how many changed.
 
     No two pixels of a grid are neighbours, so their order does not matter.
     """
 
 
 def infer_labels(labels, colours, count):
-    """Improve padded labels in place, as many rounds as a superpixel's side has pixels; returns them.
+    """Improve padded labels in place, in as many rounds as a superpixel's side has pixels; return them.
 
     Each of the ``count`` regions is 4-connected and not empty, and stays so. ``colours [h,w,3]`` are CIELAB / 100.
     """
@@ -219,7 +220,7 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as of :func:`fit_regions`."""
+    """Fit the regions' parameters and pass over the labels, in place; ``areas`` as in :func:`fit_regions`."""
     table = simple_point_table()
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)
     precision = np.float32(1 / COLOUR_DEVIATION**2)
@@ -230,7 +231,10 @@ def improve_labels(labels, colours, areas):
 
 
 def move_prior():
-    """``[4]`` float64 log α, a, b and v of the moves, whose colours deviate as much as those of the label passes."""
+    """Return the prior of splits and merges: ``[4]`` float64 log α, a, b and v.
+
+    The deviation of colours is that of the label passes.
+    """
     variance = COLOUR_DEVIATION**2
     return np.array([math.log(ALPHA), PRIOR_SHAPE, PRIOR_SHAPE * variance, MEAN_DEVIATION**2 / variance])
 
@@ -267,7 +271,7 @@ def adapt_labels(labels, colours, count, factor, share):
 
 
 def _meet_count(labels, colours, areas, prior, count):
-    """Merge or split, the highest ratios first, to exactly ``count`` regions, at most one per pixel."""
+    """Merge or split regions, highest ratios first, until there are exactly ``count``, at most one per pixel."""
     across = False
     while len(areas) > count:
         labels, areas = merge(labels, colours, areas, prior, most=len(areas) - count, least=-np.inf)

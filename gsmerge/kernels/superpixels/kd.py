@@ -17,7 +17,7 @@ _integral_image = declare("integral_image", STATUS, pixels=f4("height", "width",
 
 
 def integral_image(pixels):
-    """``[(h+1)·(w+1),3]`` float64: sum of all pixels above and to the left."""
+    """Sum all pixels above and to the left of each corner: ``[(h+1)·(w+1),3]`` float64."""
     height, width, _ = pixels.shape
     integral = np.empty(((height + 1) * (width + 1), 3))
     _integral_image(pixels, integral)

@@ -24,9 +24,9 @@ _region_sums = declare(
 
 
 def region_sums(labels, pixels, depths, count, rows):
-    """Fill the first ``count`` of ``rows [2·count,20]`` from padded labels; returns their error of colour.
+    """Fill the first ``count`` of ``rows [2·count,20]`` from padded labels; return their colour error.
 
-    Pixels with depth 0 count for nothing. Coordinates of the plane are those from the middle of the view.
+    Pixels with depth 0 do not count. Plane coordinates are relative to the middle of the view.
     """
     squares = np.empty(1)
     _region_sums(labels, pixels, depths, rows, np.empty((count, 4), np.int32), squares)
@@ -40,7 +40,7 @@ _merge_growth = declare(
 
 
 def merge_growth(rows, u, v, depth_weight, compactness):
-    """Growth of the error if u and v become one: of colour and depth, and of place times ``compactness``."""
+    """Compute the growth of the error if u and v merge: of colour and depth, and of position times ``compactness``."""
     growth = np.empty(2)
     _merge_growth(rows, u, v, depth_weight, compactness, growth)
     return tuple(growth.tolist())
@@ -57,7 +57,7 @@ _merge_order = declare(
 
 
 def merge_order(pairs, rows, depth_weight, compactness, max_extent):
-    """All merges of the regions of one view, each time the cheapest pair of neighbours.
+    """Merge the regions of one view into one, each time the cheapest pair of neighbours.
 
     Args:
         pairs: ``[e,2]`` int32 neighbouring regions, repeats allowed; together they connect all regions.
@@ -90,7 +90,7 @@ _cut_labels = declare(
 
 
 def cut_labels(parents, keep, num_leaves):
-    """Labels of the leaves, dense from 0 in order of their first leaf, when only the merges in ``keep`` are made."""
+    """Label the leaves from 0, in order of their first leaf, when only the merges in ``keep`` are made."""
     labels, tops, names = np.empty(num_leaves, np.int32), np.empty_like(parents), np.empty_like(parents)
     _cut_labels(parents, keep.view(np.uint8), tops, names, labels)
     return labels

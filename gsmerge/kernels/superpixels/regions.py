@@ -17,7 +17,7 @@ LEAVE, JOIN = 6, 7  # columns of a region's row: n / (n - 1) for a pixel that le
 
 
 def pad_labels(labels):
-    """A label picture ``[h,w]`` with the frame that the kernels expect."""
+    """Pad a label picture ``[h,w]`` with the frame that the kernels expect."""
     return np.pad(np.ascontiguousarray(labels, np.int32), 1, constant_values=-1)
 
 
@@ -29,7 +29,7 @@ _region_rows = declare(
 
 
 def region_rows(labels, pixels, count, capacity, spread):
-    """``[capacity,8]`` float32, of which the first ``count`` rows are filled; sums are float64.
+    """Fill the first ``count`` of ``[capacity,8]`` float32 rows with the regions of a picture, summed in float64.
 
     Raises ValueError where padded labels are not from 0 to ``count - 1``.
     """
@@ -39,11 +39,11 @@ def region_rows(labels, pixels, count, capacity, spread):
 
 
 def connectivity_table() -> np.ndarray:
-    """``[256]`` uint8: 1 where a pixel may leave its region without taking it apart.
+    """Make a table ``[256]`` uint8 of the rings at which a pixel may leave its region without splitting it.
 
-    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. The label's cells of
-    the ring must form one 4-connected part that touches the pixel by an edge; counted as edge cells less the
-    corners that join two of them (Yokoi's connectivity number); a closed ring has as many of both.
+    Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) has the pixel's label. An entry is 1 if the
+    cells with the label form one 4-connected part that touches the pixel by an edge. Parts are counted as edge cells
+    minus corner cells that join two edge cells (Yokoi's connectivity number); in a closed ring both numbers are equal.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
@@ -53,7 +53,7 @@ def connectivity_table() -> np.ndarray:
 
 @native(COUNT, labels=i4("rows", "columns"), y=i8(), x=i8(), label=i4())
 def ring_mask(labels, y, x, label):
-    """Bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) that have ``label``."""
+    """Return the bits of the eight neighbours (N, NE, E, SE, S, SW, W, NW) that have ``label``."""
 
 
 @native(
@@ -61,10 +61,10 @@ def ring_mask(labels, y, x, label):
     rows=f4("count", ROW, out=True), table=u1(256), spread=f4(), backward=i4(),
 )  # fmt: skip
 def sweep(labels, pixels, rows, table, spread, backward):
-    """One raster pass of border moves: each lowers the total squared error, and the means follow at once.
+    """Sweep once over the border pixels: each move lowers the total squared error, and the means are updated at once.
 
-    A pixel goes from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
-    connected without it. It needs a neighbour of its own label, so that no region can run empty.
+    A pixel moves from region A to a 4-neighbour's region B if ``n_A/(n_A-1)·d_A² > n_B/(n_B+1)·d_B²`` and A stays
+    connected without it. It needs a neighbour of its own label, so no region becomes empty.
 
     Args:
         labels: Padded labels 0 to ``count - 1``, changed.
@@ -83,7 +83,7 @@ CONNECTIVITY = connectivity_table()
 
 
 def refine(labels, pixels, count, num_sweeps, spread):
-    """Sweep in place, forth and back, until nothing moves or ``num_sweeps`` are done; returns the padded labels.
+    """Sweep in place, back and forth, until nothing moves or ``num_sweeps`` are done; return the padded labels.
 
     Each of the ``count`` regions is 4-connected and not empty, and stays so. ``spread``: square root of the weight of
     squared pixels against squared colours, float32.

@@ -19,10 +19,10 @@ _corner_response = declare(
 
 
 def corner_response(pixels):
-    """``[h,w]`` float32, at least 0: the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi).
+    """Compute the smaller eigenvalue of the grey picture's structure tensor (Shi and Tomasi): ``[h,w]`` float32.
 
-    Of Sobel's derivatives, over 3 x 3 pixels, mirrored at the border, in OpenCV's scale, whose
-    last bits depend on the processor. ``pixels [h,w,3]`` float32.
+    The tensor is averaged over 3 x 3 pixels from Sobel's derivatives, mirrored at the border, in OpenCV's scale;
+    OpenCV's own last bits depend on the processor. ``pixels [h,w,3]`` float32.
     """
     height, width, _ = pixels.shape
     response = np.empty((height, width), np.float32)
@@ -31,7 +31,7 @@ def corner_response(pixels):
 
 
 def hexagonal_seeds(height, width, count):
-    """``[count,2]`` int64 (y, x): distinct pixels near a hexagonal grid, whose rows share the seeds evenly."""
+    """Place ``count`` distinct pixels near a hexagonal grid with about equally many in each row: (y, x) int64."""
     row_distance = math.sqrt(height * width / count * math.sqrt(3) / 2)
     num_rows = min(max(round(height / row_distance), math.ceil(count / width)), height, count)
     first = np.arange(num_rows + 1) * count // num_rows
@@ -43,7 +43,10 @@ def hexagonal_seeds(height, width, count):
 
 
 def seed_density(saliency, count):
-    """``[h,w]`` float64 seeds per pixel, at most 1 and ``count`` in all; even where nothing is salient."""
+    """Compute seeds per pixel from saliency, ``[h,w]`` float64: at most 1 each and ``count`` in all.
+
+    The density is uniform where nothing is salient.
+    """
     density = np.sqrt(saliency, dtype=np.float64)
     density = DENSITY_FLOOR + (1 - DENSITY_FLOOR) * density / max(density.mean(), 1e-12)
     density *= count / density.sum()
@@ -63,7 +66,7 @@ _dither = declare(
 
 
 def dither(density):
-    """Serpentine Floyd-Steinberg dithering with a jittered threshold: ``[h,w]`` bool, True at a seed."""
+    """Choose seeds by serpentine Floyd-Steinberg dithering with a jittered threshold: ``[h,w]`` bool."""
     height, width = density.shape
     seeds = np.empty((height, width), np.uint8)
     _dither(density, JITTER, np.zeros((2, width + 2)), seeds)
@@ -71,7 +74,7 @@ def dither(density):
 
 
 def _spread_picks(weights, count):
-    """``count`` distinct indices, spread evenly over the running sum of the weights."""
+    """Choose ``count`` distinct indices, spread evenly over the cumulative sum of the weights."""
     total = np.cumsum(weights)
     order = np.arange(count)
     picks = np.searchsorted(total, (order + 0.5) * (total[-1] / count))
@@ -80,9 +83,10 @@ def _spread_picks(weights, count):
 
 
 def seeds_from_density(density, count):
-    """``[count,2]`` int64 (y, x): distinct pixels that follow the density.
+    """Choose ``count`` distinct pixels ``[count,2]`` int64 (y, x) that follow the density.
 
-    Dithering loses a few seeds at the picture's edge; they are added or taken away evenly, to the exact number.
+    Dithering loses a few seeds at the border of the picture; seeds are added or removed evenly to reach the exact
+    number.
     """
     seeds = dither(density).reshape(-1)
     surplus = np.count_nonzero(seeds) - count
@@ -99,9 +103,9 @@ _voronoi = declare(
 
 
 def voronoi(seeds, height, width):
-    """``[h,w]`` int32: the seed nearest to each pixel, counted in steps to 4-neighbours; every region is connected.
+    """Label each pixel with its nearest seed in steps to 4-neighbours: ``[h,w]`` int32; every region is connected.
 
-    ``seeds [count,2]`` int64 are y and x of pixels; ValueError for one outside of the picture.
+    ``seeds [count,2]`` int64 are y and x of pixels; ValueError for a seed outside the picture.
     """
     labels = np.empty((height, width), np.int32)
     _voronoi(seeds, np.empty((height * width + len(seeds), 2), np.int32), labels)

@@ -23,7 +23,10 @@ _adjacent_pairs = declare("adjacent_pairs", COUNT, labels=i4("rows", "columns"),
 
 
 def adjacent_pairs(labels):
-    """``[e,2]`` int32: labels of neighbouring regions, about one row per straight piece of common border."""
+    """List the labels of neighbouring regions, ``[e,2]`` int32; a pair may be repeated.
+
+    There is about one row for each straight piece of a common border.
+    """
     pairs = np.empty((2 * (labels.shape[0] - 2) * (labels.shape[1] - 2) + 1, 2), np.int32)
     return pairs[: _adjacent_pairs(labels, pairs)]
 
@@ -35,17 +38,17 @@ _merge_costs = declare(
 
 
 def merge_cost(rows, u, v):
-    """Growth of the squared error if u and v become one: n_u n_v / (n_u + n_v) |mean_u - mean_v|²."""
+    """Compute the growth of the squared error if u and v merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|²."""
     costs = np.empty(1, np.float32)
     _merge_costs(rows, np.array([[u, v]], np.int32), costs)
     return costs[0]
 
 
 def _first_ceiling(pairs, rows, share):
-    """A little above the dearest merge that will be needed when ``share`` of the regions are to vanish.
+    """Estimate a cost slightly above the most expensive merge that removes ``share`` of the regions.
 
-    Measured on photos, the share of the edges that are cheaper at the start than that merge is close to the share
-    of the regions that vanish, when the start is an over-split by 1.5 to 3.
+    Measured on photos that were over-segmented by 1.5 to 3: the share of edges that are cheaper than that merge at the
+    start is close to the share of regions that disappear.
     """
     step = max(1, len(pairs) // NUM_SAMPLES)
     costs = np.empty(len(pairs) // step, np.float32)
@@ -64,7 +67,7 @@ _merge_tree = declare(
 
 
 def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
-    """Merge until at least ``num_merges`` pairs are joined, or none is left that touches and has a cost.
+    """Merge neighbouring regions until at least ``num_merges`` pairs are merged, or no pair with a cost is left.
 
     Args:
         pairs: From :func:`adjacent_pairs`; overwritten.

@@ -135,9 +135,8 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
     """Choose at most ``limit`` disjoint pairs greedily, by rising cost ``[m]``.
 
-    A pair that is the cheapest of both its members is taken whatever comes before it; so all such pairs are taken at
-    once, and again among the rest. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by rising
-    cost.
+    A pair that is the cheapest of both its members is always taken, so all such pairs are taken at once, and again
+    among the rest. Of equal costs the first pair counts as cheaper. Returns indices of pairs, by rising cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))
@@ -184,7 +183,7 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge to exactly ``count`` Gaussians; return the input if it has no more."""
+    """Merge to exactly ``count`` Gaussians; return the input if it has no more than that."""
     gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians

@@ -35,7 +35,7 @@ MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as larg
 
 
 def own_gaussians(scene: Scene) -> Gaussians:
-    """Return the Gaussians of the file, without rows that stand in for missing or broken ones."""
+    """Return the Gaussians of the file, without rows that were added for missing or invalid ones."""
     if scene.aligned and not bool(scene.stored.all()):
         return scene.gaussians[scene.stored.reshape(-1)]
     return scene.gaussians
@@ -47,9 +47,9 @@ def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
 
 
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """Return the rising indices of the ``count`` most important Gaussians; the first of equals.
+    """Return the rising indices of the ``count`` most important Gaussians; among equal ones the first.
 
-    ``importance [n]`` is for instance the summed blending weight over all photos. A ValueError if ``count`` is below 0.
+    ``importance [n]`` is for instance the summed blending weight over all photos. ValueError if ``count`` is below 0.
     """
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")
@@ -71,9 +71,9 @@ def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Run the full fit on the input without merging, with our number of steps or time, for comparison.
+    """Run the full fit on the input without merging, with the steps or time of our own fit, for comparison.
 
-    Gaussians that no photo shows are replaced by others, so the number stays, whatever the count.
+    Gaussians that no photo shows are replaced by others, so the number of Gaussians stays, whatever the count.
     """
     gaussians = own_gaussians(prepared.scene)
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
@@ -81,7 +81,7 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` most opaque Gaussians, unchanged and in order; the first of equals."""
+    """Keep the ``count`` most opaque Gaussians, unchanged and in order; among equal ones the first."""
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
         return gaussians[most_important(gaussians.opacities, count)]
@@ -119,7 +119,10 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge the Gaussians of rectangular pixel blocks, as many per view; blocks without a valid pixel are left out."""
+    """Merge the Gaussians of rectangular pixel blocks, equally many per view.
+
+    Blocks without a valid pixel are left out.
+    """
     scene = prepared.scene
     height, width = scene.cameras.height, scene.cameras.width
     with stage("segment"):
@@ -155,10 +158,10 @@ def find_program() -> str:
 
 
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, by its own defaults.
+    """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
 
-    The input itself is returned where it has no more. Nothing is downloaded. Only the program's own run counts as time,
-    start-up included; handing the Gaussians over and back does not.
+    The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. Only the run of the program
+    counts as time, start-up included, not the transfer of Gaussians.
     """
     gaussians, program = own_gaussians(prepared.scene), find_program()
     if len(gaussians) <= count:

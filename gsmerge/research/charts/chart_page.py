@@ -99,7 +99,7 @@ def _results(results: Results) -> Table:
 
 
 def _verdicts(results: Results) -> list[tuple[str, Table]]:
-    """Say in a sentence whether any baseline's point lies above ours, and list the points."""
+    """State whether any baseline's point lies above ours, and list the points."""
     head = ("Baseline", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict")
     tables: list[tuple[str, Table]] = []
     for compared in make_verdict_tables(results):
@@ -121,7 +121,7 @@ def _verdicts(results: Results) -> list[tuple[str, Table]]:
 
 
 def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, str]], int]]:
-    """List views with their title, named pictures of input and results, and the number of ours among these."""
+    """List views with their title, named pictures of input and results, and the number of our own pictures."""
     views = []
     for scene in list(dict.fromkeys(record.scene for record in results.runs))[:MAX_SCENES]:
         records = [r for r in results.runs if r.scene == scene and r.views_asked == results.views and r.pictures]

@@ -95,7 +95,7 @@ def make_figures(results: Results) -> list[Figure]:
 
 
 def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[Panel], log: str = "") -> Figure | None:
-    """Make a figure of panels with the table of all their points; None without lines."""
+    """Make a figure of panels with a table of all their points; None without lines."""
     panels = [panel for panel in panels if panel.lines]
     if not panels:
         return None
@@ -120,13 +120,13 @@ def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[
 
 
 def _numbers(interval: Interval) -> list[str]:
-    """Write a mean and the ends of its interval, which few scenes do not have."""
+    """Write a mean and the ends of its interval, if there are enough scenes for one."""
     ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 
 
 def choose_lines(panel: Panel) -> set[str]:
-    """Choose the lines to draw in a panel: all or, if there are many, the best one of each method."""
+    """Choose the lines to draw in a panel: all or, if there are many, the best line of each method."""
     if len(panel.lines) <= MAX_LINES:
         return {line.name for line in panel.lines}
     sign = 1 if panel.higher else -1
@@ -148,7 +148,7 @@ def _quality_panels(results: Results, lines_of: Callable[[str], list[Line]], *, 
 
 
 def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]) -> Figure | None:
-    """Show quality against a cost, whose title, description and label are ``words``."""
+    """Plot quality against a cost; ``words``: its title, description and label."""
     title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
     caption = f"Quality against {described}. Measured on {PARTS[results.part]}."
@@ -221,7 +221,7 @@ def _over_views(results: Results) -> Figure | None:
 
 
 def _break_even(results: Results) -> Figure | None:
-    """Show when merging has saved as much render time as it took."""
+    """Plot the number of frames after which merging has saved its own time."""
     groups = results.typical_runs()
     scenes = sorted({record.scene for group in groups.values() for record in group})
     before = results.input_mean("render_ms", scenes)
@@ -309,7 +309,7 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
 
 
 def _set_ticks(axes: Axes, sizes: Sequence[float], log: str) -> None:
-    """Put ticks at sizes where they are few, otherwise at round numbers; ``log``: the axis that is logarithmic."""
+    """Put ticks at the sizes if there are few, otherwise at round numbers; ``log``: the logarithmic axis."""
     few = 0 < len(sizes) <= MAX_TICKS
     if log:
         axes.set(**{f"{log}scale": "log"})
@@ -339,7 +339,7 @@ def _label_sizes(axes: Axes, panel: Panel) -> None:
 
 
 def _plain(name: str) -> str:
-    """Keep matplotlib from taking a name for a formula."""
+    """Escape a name so that matplotlib does not read it as a formula."""
     return name.replace("$", r"\$")
 
 

@@ -90,7 +90,7 @@ def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Gri
 def read_grid(path: Path) -> Grid:
     """Read a grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
 
-    A SceneError if the file cannot be read, or holds anything else.
+    SceneError if the file cannot be read, or has any other content.
     """
     values, names = read_table(path), settings_of(Grid).keys()
     if values.keys() - names:

@@ -117,7 +117,7 @@ def mean_interval(values: Sequence[float]) -> Interval:
 
 
 def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
-    """Compute the mean difference over the scenes that both have, so that the difficulty of scenes cancels."""
+    """Compute the mean difference over scenes that both have, so that the difficulty of scenes cancels out."""
     return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
 
 
@@ -140,8 +140,8 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
 def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
     """Interpolate the best quality at a cost, linearly in log cost; None below the cheapest point.
 
-    Costs are positive, and a higher quality is better. Points that are dearer and no better than another do not count.
-    Beyond the most expensive point the quality is constant.
+    Costs are positive, and higher quality is better. Points with a higher cost and no better quality than another point
+    are ignored. Beyond the most expensive point the quality is constant.
     """
     if not len(costs) or cost < min(costs):
         return None
@@ -156,8 +156,8 @@ def judge(
 ) -> Verdict:
     """Judge whether a baseline's point lies above our curve at equal cost, scene by scene.
 
-    ``points`` has the (cost, quality) of the baseline's point by scene, at least one, ``ours`` all those of ours. A
-    side is named only where zero lies outside the interval of the difference, or the baseline has only one scene.
+    ``points`` has the (cost, quality) of the baseline by scene, at least one; ``ours`` has all points of ours. A winner
+    is named only if zero lies outside the interval of the difference, or if the baseline has only one scene.
     """
     sign = 1.0 if higher else -1.0
     our_qualities: dict[str, float] = {}
@@ -255,7 +255,7 @@ class Results:
         return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
 
     def typical_runs(self) -> dict[str, list[RunRecord]]:
-        """Group the runs of typical size and number of views by line, ours first, over the same scenes."""
+        """Group the runs of typical size and number of views by line, ours first, over common scenes."""
         rows = dict[str, list[RunRecord]]()
         for record in ours_first(self.runs):
             if self.is_typical(record) and record.views_asked == self.views:
@@ -311,9 +311,10 @@ def make_lines(
 
 
 def keep_common(scenes: Mapping[K, set[str]], min_share: float) -> dict[K, set[str]]:
-    """Restrict every key to the scenes that all keys share, so that means compare; without any, keep each key's own.
+    """Restrict every key to the scenes that all keys share, so that means can be compared.
 
-    Keys that have too few of the scenes are left out first, so that a few failed runs do not remove the others.
+    Keys with too few scenes are left out first, so that a few failed runs do not remove the other keys. Without common
+    scenes each key keeps its own.
     """
     fewest = min_share * len(set().union(*scenes.values()))
     kept = {name: scene_names for name, scene_names in scenes.items() if len(scene_names) >= fewest}
@@ -328,9 +329,9 @@ def _mean_cost(points: ByScene) -> float:
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Make an interval for each column, without differences between scenes.
+    """Compute an interval for each column, with differences between scenes removed.
 
-    Intervals have no width where columns have other scenes.
+    Intervals have no width if the columns have different scenes.
     """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]

@@ -309,10 +309,11 @@ def measure(
 def keep_pictures(
     out: Path, gaussians: Gaussians, scene: Scene, held_out: HeldOutViews | None
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Write renders and error maps of a few views, and the photos; return the paths of the first two, and view names.
+    """Write renders and error maps of a few views, and the photos.
 
-    The views are held-out ones or, without any, the scene's. ``scene`` and ``held_out`` have all views, so that all
-    runs of a scene have pictures of the same ones.
+    Returns the paths of renders and error maps, and the names of the views. The views are held-out views or, without
+    any, the scene's. ``scene`` and ``held_out`` have all views, so that all runs of a scene have pictures of the same
+    views.
     """
     views = scene if held_out is None else held_out
     photos, names = views.images, views.names
@@ -338,7 +339,7 @@ def _write(path: Path, picture: Picture) -> None:
 
 
 def environment(threads: int) -> dict[str, str]:
-    """Return processor, threads and versions, on which results and times depend."""
+    """Return processor, threads and versions, which affect results and times."""
     processor = platform.processor() or platform.machine()
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:  # only Linux has it
         models = (line.split(":", 1)[1].strip() for line in file if line.startswith("model name"))

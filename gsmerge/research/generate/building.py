@@ -63,7 +63,7 @@ class Wall:
 def build_building(rng: np.random.Generator, size: int, plan: FloorPlan) -> tuple[list[Zone], list[Portal]]:
     """Build all rooms, corridors and stairs with their colours and furniture, and the openings between them.
 
-    ``size`` is that of the textures. Corridors come first, then the stairs, if there are any, and the rooms.
+    ``size`` is the size of textures. The order is corridors, stairs if there are any, and rooms.
     """
     common = Palette(rng, size)
     shared: dict[str, list[int]] = {kind: [] for kind in SHARED}
@@ -96,13 +96,13 @@ def _sort(corners: Array) -> tuple[Array, Array]:
 
 
 def _portal(zones: tuple[int, int], low: Array, high: Array) -> Portal:
-    """Make the opening between two zones, from a box in the wall; its frame is a part of it."""
+    """Make the opening between two zones from a box in the wall; the frame of the opening lies in that box."""
     around = FRAME + 2 * PROUD
     return Portal(zones, low - around, high + around)
 
 
 def _panel(x: tuple[float, float], y: tuple[float, float], paper: Material) -> Shape:
-    """Build a part of a wall between two x and two heights; its texture goes on from part to part."""
+    """Build a part of a wall between two x and two heights; its texture continues over the parts."""
     centre = np.array([(x[0] + x[1]) / 2, -(y[0] + y[1]) / 2, 0.0])
     shift = paper.shift[0] + centre[0] * paper.repeat, paper.shift[1] + centre[1] * paper.repeat
     half = (x[1] - x[0]) / 2 + OVERLAP, (y[1] - y[0]) / 2 + OVERLAP
@@ -110,7 +110,7 @@ def _panel(x: tuple[float, float], y: tuple[float, float], paper: Material) -> S
 
 
 def _wall(wall: Wall, height: float, paper: Material, skirting: Material | None) -> Shapes:
-    """Build a wall with its openings, and its skirting unless it stands on another wall."""
+    """Build a wall with its openings, and with a skirting unless it stands on another wall."""
     out, x = [], -wall.half
     for left, right, top in (*sorted(wall.openings), (wall.half, wall.half, height)):
         if left > x:
@@ -132,7 +132,7 @@ def _frame(opening: Opening, material: Material) -> Shapes:
 
 
 def _hang(pal: Palette, wall: Wall, height: float) -> Shapes:
-    """Hang pictures on a wall, or windows in an outer one, between its openings."""
+    """Hang pictures on an inner wall, or windows on an outer wall, between its openings."""
     rng, out = pal.rng, []
     x = -wall.half + rng.uniform(0.3, 0.8)
     while True:

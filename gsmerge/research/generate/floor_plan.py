@@ -94,7 +94,7 @@ def draw_plan(rng: np.random.Generator, num_views: int) -> FloorPlan:
 
 
 def room_loop(room: RoomPlan) -> Array:
-    """Return points ``[n,3]`` of a walk inside a room, in the room's frame: in, round the middle, and out."""
+    """Return points ``[n,3]`` of a walk inside a room, in the room's frame: in, around the middle, and out."""
     half_x, half_z, middle = room.width / 2 - ASIDE, room.depth / 2 - ASIDE, room.depth / 2
     first = np.clip(room.door / half_x, -0.9, 0.9)  # the sine of the angle at which it begins
     way = -1.0 if first > 0 else 1.0  # the longer way comes first
@@ -283,7 +283,7 @@ def stand(
 ) -> Shapes:
     """Place pieces against the walls of a space ``[2,3]``, clear of each other and of the walk.
 
-    ``turns`` are the walls; each try draws one. A piece that fits nowhere is left out.
+    ``turns`` are the walls, one of which is drawn in each try. A piece that fits nowhere is left out.
     """
     out: Shapes = []
     taken: list[tuple[Array, Array]] = []

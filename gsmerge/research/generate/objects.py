@@ -238,7 +238,7 @@ SMALL: tuple[Callable[[Palette], Shapes], ...] = (carton, carton, can, bottle, b
 
 
 def small_object(pal: Palette) -> Shapes:
-    """Build a random small object, such as stands on tables."""
+    """Build a random small object of the kind that stands on tables."""
     return SMALL[pal.rng.integers(len(SMALL))](pal)
 
 

@@ -176,7 +176,7 @@ def _overlap(a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int32]:
 def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> dict[int, NDArray[np.int32]]:
     """Find the stages that a view may see, each with the box x0, y0, x1, y1 ``[4]`` of its samples.
 
-    A straight line enters and leaves a zone, which is a box, through portals and no more than once.
+    A straight line enters and leaves a zone, which is a box, through portals and at most once.
     """
     whole = np.array([0, 0, lens.width * samples, lens.height * samples], np.int32)
     if not scene.portals:
@@ -366,7 +366,7 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
 
 
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
-    """Find the exposure factor at which the pictures' mean is about ``brightness``, sRGB."""
+    """Find the exposure factor with which the mean of the pictures is about ``brightness``, sRGB."""
     values = np.concatenate([p.reshape(-1) for p in pictures])
     low, high = 1e-3, 1e3
     for _ in range(30):

@@ -203,7 +203,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
 
     def take(i: int) -> tuple[Float, Array, Gaussians | None]:
-        """Take the photo at a place; at views, estimate its pose and predict Gaussians from it."""
+        """Take the photo at one place; at the place of a view, also estimate its pose and predict Gaussians."""
         image = _photo(scene, poses[i], large, noise, gain, seeds[i])
         if i not in errors:
             return image, moved[i], None
@@ -231,7 +231,10 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
 
 
 def _held_out(num_views: int, most: int) -> list[int]:
-    """List places half-way between neighbouring views, which are the even ones: all, or ``most``, evenly spread."""
+    """List the places of held-out photos: all, or ``most`` evenly spread, midpoints between neighbouring views.
+
+    Views have the even places, midpoints the odd ones.
+    """
     count = min(num_views - 1, most)
     return [2 * ((2 * k + 1) * (num_views - 1) // (2 * count)) + 1 for k in range(count)]
 
@@ -247,7 +250,7 @@ def _texture_size(lens: Pinhole) -> int:
 def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
 ) -> tuple[LitScene, Pose]:
-    """Draw a stage and a path through it with usable views only, or the last try."""
+    """Draw a stage and a path through it on which all views are usable; after too many tries, return the last."""
     for _ in range(STAGE_TRIES):
         scene = LitScene((light_stage(STYLES[style](Palette(rng, _texture_size(lens)))),))
         for _ in range(PATH_TRIES):
@@ -259,7 +262,7 @@ def _find_stage(
 
 
 def _find_building(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitScene, Pose]:
-    """Draw a building and a walk through it, which keeps clear of all things."""
+    """Draw a building and a walk through it that avoids all objects."""
     plan = draw_plan(rng, num_views)
     zones, portals = build_building(rng, min(_texture_size(lens), MAX_TEXTURE), plan)
     walk = draw_walk(rng, plan, num_views)
@@ -288,7 +291,7 @@ def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: floa
 
 
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
-    """Add the network's error to a pose: ``deviation`` ``[2,3]`` of rotation and position, in their strengths."""
+    """Add the network's error to a pose; ``deviation [2,3]``: of rotation and position, in units of their strengths."""
     turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * deviation[0] / 3**0.5)
     out = pose.copy()
     out[:3, :3] = compose(pose[:3, :3], turn)

@@ -61,8 +61,8 @@ def courses(
 ) -> tuple[Grey, Grey]:
     """Draw ``rows`` courses of ``columns`` bricks or tiles; return a random tone per brick, and a mask of the joints.
 
-    ``joint`` is the width of the joints, as a share of a stone's height, and ``offset`` that of each second course, as
-    a share of a stone's width.
+    ``joint`` is the width of the joints as a share of a stone's height; ``offset`` is the shift of every second course
+    as a share of a stone's width.
     """
     x, y = grid(size)
     row = np.floor(y * rows).astype(int)
@@ -383,8 +383,7 @@ class Palette:
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
         """Make a material of one of the kinds, with a new texture, or an old one if the kind has enough.
 
-        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` None is drawn at random, mostly
-        none.
+        ``repeat`` is in repeats per world unit, 0: once over every face. ``gloss`` None: random, usually zero.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         ids = self.by_kind.setdefault(kind, [])

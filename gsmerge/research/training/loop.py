@@ -69,10 +69,10 @@ class TrainingRun:
 
 
 def validate(networks: Networks, shards: Sequence[Shard], run: TrainingRun, out: Path) -> Row:
-    """Measure the PSNR of renders with and without networks, and the share of Feature Gaussians that were merged.
+    """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
-    Where a loss uses the fit, also the loss of corrections, and the explained share of the targets' squares for each
-    kind of correction. A ``validation-NAME.png`` for each scene shows a photo, its analytic and its learned render.
+    If a loss uses the fit, also measure the loss of corrections, and the explained share of the squared targets for
+    each kind of correction. For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
     """
     scores = [_score(networks, shards, i, run, out) for i in run.processes.share(range(len(shards)))]
     every = run.processes.gather(scores)
@@ -255,7 +255,7 @@ def _train(
 
 
 def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[str, Any], options: TrainOptions) -> None:
-    """Write the checkpoints, the table of losses and what a resumed run goes on from."""
+    """Write the checkpoints, the table of losses, and the state for resuming the run."""
     figures = {name: value for name, value in rows[-1].items() if name not in ("step", "rate", "loss")}
     training = {"step": rows[-1]["step"], "loss": rows[-1]["loss"], "figures": figures, **head}
     networks = deepcopy(state.smooth)
@@ -294,9 +294,9 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
 
 
 def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> tuple[Tensor, float]:
-    """Do one step, and return its loss, and the share of the gradient that holds siblings apart.
+    """Do one step; return its loss, and the share of the gradient from the diversification of siblings.
 
-    The share is measured in the steps that are validated; 0 in others.
+    The share is measured in validated steps, and 0 in others.
     """
     options, parameters = run.options, list(state.networks.parameters())
     shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps

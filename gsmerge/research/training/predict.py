@@ -68,8 +68,8 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]`` (rising) and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.pooling.principal_axes`; gradients are of first-order perturbation theory. Axes
-    of nearly equal scales have no direction, so their turn is held back.
+    Values are those of :func:`gsmerge.pooling.principal_axes`; gradients follow from first-order perturbation theory.
+    Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
     if not covars.requires_grad:
@@ -240,7 +240,7 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens of Gaussians as tensors; those of members are arrays, as no network comes before the encoder."""
+        """Make tokens of Gaussians as tensors; members are arrays, since no network precedes the encoder."""
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
@@ -266,8 +266,8 @@ class Prediction:
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
     """Run a crop through all networks with gradients; each stage reads the results of the stages before.
 
-    Analytic children of K > 1 are pooled again from the members, so gradients reach earlier stages only through what
-    residual heads read.
+    For K > 1 analytic children are pooled again from the members, so gradients reach earlier stages only through the
+    inputs of residual heads.
     """
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
@@ -317,7 +317,7 @@ def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
 def match_crop(
     crop: Crop, parts: FeatureGaussians, options: TrainOptions, networks: Networks | None = None, seed: int = 0
 ) -> Matches:
-    """Match the Feature Gaussians ``parts`` of a crop, or return the clusters that its example was fitted with."""
+    """Match the Feature Gaussians ``parts`` of a crop, or return the clusters with which its example was fitted."""
     matches = crop.example.matches
     if matches is not None:
         ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)

@@ -1,4 +1,4 @@
-"""Examples in files: written once, hashed, and read in random order, of which few are in memory.
+"""Examples in files: written once, hashed, and read in random order, with few in memory at a time.
 
 A shard is a safetensors file with one example. A scene's shards are named in a record, a JSON file that is written
 when all of them are; its name is a hash of the scene's files and of the settings. So a call that was interrupted goes
@@ -84,7 +84,10 @@ def prepare_shards(
 
 
 def _in_all(report: Report | None, before: int, scenes: int) -> Report:
-    """Return a report of a scene's examples as a part of all: so many ``before``, then as many of each scene."""
+    """Return a progress report for one scene's examples that counts the examples of all scenes.
+
+    ``before`` examples come first, and each scene has equally many.
+    """
 
     def move(text: str, done: int, count: int) -> None:
         if report:
@@ -105,7 +108,7 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
 
 
 def _make_shards(scene: Path, options: TrainOptions, start: Path, report: Report) -> dict[str, str]:
-    """Write those examples of a scene that are missing, in files that begin with ``start`` -> hash of each by name."""
+    """Write the missing examples of a scene to files that begin with ``start``; return the hash of each by name."""
     hashes, count, name = dict[str, str](), 0, scene_name(scene)
 
     def move(step: int, steps: int) -> None:

@@ -65,7 +65,7 @@ class TrainOptions(Settings):
     average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
         "validated and saved; less in the first steps.", **PART)  # fmt: skip
     crops: int = setting(2, "Crops or windows per step, of all processes together; worked on in parallel.", **COUNT)
-    crop: int = setting(512, "Feature Gaussians of a crop: those nearest to one of them.", **COUNT)
+    crop: int = setting(512, "Number of Feature Gaussians of a crop: a random one and its nearest.", **COUNT)
     inner: float = setting(0.6, "Share of a crop that is scored; the rest are neighbours.", least=1e-6, most=1)
     turn_weight: float = setting(0.1, "Weight of the rotation in the loss; it is small because axes of similar length "
         "have no direction.", **WEIGHT)  # fmt: skip
@@ -98,7 +98,7 @@ class TrainOptions(Settings):
     opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity by the heads of the checkpoints.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
     save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT)
-    validation_examples: int = setting(24, "Most examples for validation, evenly spread over those that there are.",
+    validation_examples: int = setting(24, "Most examples for validation, spread evenly over all examples.",
         **COUNT)  # fmt: skip
     validation_crops: int = setting(8, "Crops of each of them, always the same; only where a loss uses the fit.",
         **COUNT)  # fmt: skip

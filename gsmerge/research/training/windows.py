@@ -123,7 +123,7 @@ def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
 
 
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Find the ascending rows of the Feature Gaussians that reach into the window, or nearly do."""
+    """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
     tiled = tile_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
     reached = np.zeros(len(example.base), bool)
@@ -132,7 +132,7 @@ def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
 
 
 def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
-    """Find the ascending rows of the ``chosen [g]`` Feature Gaussians, and of others fitted as one with them."""
+    """Find the ascending rows of the ``chosen [g]`` Feature Gaussians, and of those in the same clusters."""
     if example.matches is not None:
         inside = np.zeros(example.matches.count, bool)
         inside[example.matches.clusters[chosen]] = True
