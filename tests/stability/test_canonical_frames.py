@@ -45,20 +45,16 @@ def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
 @pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit": "none", "checkpoint": "none", "k": 2}], ids=str)
 def test_map_coordinates(room: Scene, settings: dict) -> None:
     far = scenes.move(room, np.eye(3), 1.0, UTM)
-    here, there = scenes.compacted(room, **settings).gaussians, scenes.compacted(far, **settings).gaussians
+    one, other = (scenes.compacted(scene, **settings) for scene in (room, far))
+    here, there = one.gaussians, other.gaussians
     footprint = float(np.median(scene_members(room).footprints))
     back = replace(there, means=there.means - UTM)
     assert there.means.dtype == np.float64
     # the axes of nearly round Gaussians turn by some thousand times the last bit, on each processor by others
     scenes.assert_same_set(here, back, atol=1e-3 * footprint + 1e-4)
-
-
-def test_map_coordinates_at_every_stage_of_the_report(room: Scene) -> None:
-    far = scenes.move(room, np.eye(3), 1.0, UTM)
-    here, there = scenes.compacted(room, fit="none").report, scenes.compacted(far, fit="none").report
-    assert there.psnr_before == pytest.approx(here.psnr_before, abs=0.01)
-    assert there.psnr_after == pytest.approx(here.psnr_after, abs=0.05)
-    assert ("networks" in there.choices) == ("networks" in here.choices)
+    assert other.report.psnr_before == pytest.approx(one.report.psnr_before, abs=0.01)
+    assert other.report.psnr_after == pytest.approx(one.report.psnr_after, abs=0.05)
+    assert ("networks" in other.report.choices) == ("networks" in one.report.choices)
 
 
 def test_map_coordinates_with_the_full_fit(room: Scene) -> None:
@@ -72,8 +68,8 @@ def test_map_coordinates_with_the_full_fit(room: Scene) -> None:
 # 38: similarity transforms
 
 
-@pytest.mark.parametrize("factor", [1e-4, 0.37, 1e4])
-@pytest.mark.parametrize("match", ["overlap", "none"])
+@sweep("factor", [1e4, 1e-4, 0.37])
+@sweep("match", ["overlap", "none"])
 def test_similarity(room: Scene, factor: float, match: str) -> None:
     transform = scenes.random_rotation(1), factor, factor * np.array([1.0, -2.0, 3.0])
     one, other = scenes.plain(room, match=match), scenes.plain(scenes.move(room, *transform), match=match)
