@@ -16,7 +16,9 @@ ENTRIES = [entry for row in (*FORMATS, *CAMERA_FORMATS) for entry in vars(row).v
 FUNCTIONS = [entry.func if isinstance(entry, partial) else entry for entry in (*ENTRIES, *vars(camera_reader).values())]
 
 
-@pytest.mark.parametrize("function", {entry for entry in FUNCTIONS if isinstance(entry, LazyFunction)}, ids=str)
+@pytest.mark.parametrize(
+    "function", sorted({entry for entry in FUNCTIONS if isinstance(entry, LazyFunction)}, key=str), ids=str
+)
 def test_a_function_that_a_table_names_is_there(function: LazyFunction) -> None:
     assert callable(function.load())
 
