@@ -13,6 +13,8 @@ import pytest
 from batches import FAST, NAMES, holders, results, start, statuses, until
 from messages import names
 
+from .conftest import Run
+
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
 
 
@@ -71,11 +73,10 @@ def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> N
     assert names(errors, "127.0.0.1:1", "Ray")
 
 
-def test_without_ray_one_line_says_what_to_install(rooms: Path, tmp_path: Path) -> None:
-    code = "import sys; sys.modules['ray'] = None\n"
-    code += "from gsmerge.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "batch", str(rooms), "--output", str(tmp_path / "out"), "--engine", "ray"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr == "gsmerge: error: engine ray: Ray is not installed; pip install 'ray>=2.9,<3'\n"
+def test_without_ray_one_line_says_what_to_install(
+    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    done = run("batch", small_scene, "--output", tmp_path / "out", "--engine", "ray", code=2)
+    assert done.err == "gsmerge: error: engine ray: Ray is not installed; pip install 'ray>=2.9,<3'\n"
     assert not (tmp_path / "out").exists()

@@ -67,10 +67,9 @@ def test_photos_of_a_given_size(scene_copy: Path, small: Path, run: Run) -> None
     document = json.loads(run(*call, "--photo-side", "48", "--speed", "--zoom", "1", "--json").out)
     assert document["photo_side"] == 48
     assert [speed["width"] for speed in document["results"][1]["speeds"]] == [48]
-    usual, as_they_are = (json.loads(run(*call, *more, "--json").out) for more in ((), ("--photo-side", "0")))
+    usual = json.loads(run(*call, "--json").out)
     assert "photo_side" not in usual
-    means = [one["results"][1]["mean"] for one in (document, usual, as_they_are)]
-    assert means[1] == means[2] != means[0]
+    assert usual["results"][1]["mean"] != document["results"][1]["mean"]
 
 
 def test_fewer_views(scene_copy: Path, run: Run) -> None:
