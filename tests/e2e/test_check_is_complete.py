@@ -125,7 +125,7 @@ KINDS = {
     "state": Kind("a.gsm", extended("."), STATE),
     "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
-OFTEN = ("rows", "photos", "views.npz", "state")  # in the default run; the others are in the sweep
+OFTEN = ("rows", "state")  # in the default run; the others are in the sweep
 
 
 def placed(words: tuple[str, ...], folder: Path) -> list[object]:

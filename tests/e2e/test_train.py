@@ -129,6 +129,7 @@ def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: R
     assert "--validation" in outcome.err
 
 
+@pytest.mark.slow
 def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root: Path) -> None:
     """Of ``torchrun``, on scenes of ``generate``: the same batch, so the same weights, tables and pictures."""
     config, made = tmp_path / "train.json", tmp_path / "made"

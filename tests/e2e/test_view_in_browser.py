@@ -107,14 +107,15 @@ def picture(tab: Browser) -> np.ndarray:
     return np.asarray(image[..., ::-1], np.float32) / 255
 
 
-def test_3d_is_what_we_render_at_every_input_view(opened: tuple[Browser, Any]) -> None:
+@pytest.mark.parametrize("views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=str)
+def test_3d_is_what_we_render_at_every_input_view(views: slice, opened: tuple[Browser, Any]) -> None:
     tab, (scene, small, _) = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
     inputs = tab.run(
         "data.views.map((view, i) => [view.held_out || view.outside, view.name, i]).filter(one => !one[0])"
     )
     assert len(inputs) == 3
-    for _, name, index in inputs:
+    for _, name, index in inputs[views]:
         view = next(i for i, path in enumerate(scene.names) if path.endswith(f"{name}.png"))
         tab.run(f"jump({index})")
         for other, gaussians in (("false", scene.gaussians), ("true", small)):

@@ -96,6 +96,7 @@ def test_photos_that_were_cropped(tmp_path: Path) -> None:
     assert [d.name for d in loaded.exporters] == ["depthsplat"]
 
 
+@pytest.mark.slow
 def test_some_views_of_many(tmp_path: Path) -> None:
     """A chunk holds the whole video; the file holds two of its views."""
     poses = np.tile(SMOOTH.c2w[1], (8, 1, 1))
