@@ -20,9 +20,9 @@ from result_cells import (
 )
 
 from gsmerge.measure.speed import break_even
-from gsmerge.report import human_bytes
 from gsmerge.research.charts.lines import Results, make_verdict_tables
 from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, RunRecord
+from gsmerge.runtime.memory import human_bytes
 
 OURS = "gsmerge"
 COMMAND = "python benchmarks/results.py"

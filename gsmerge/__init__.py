@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gsmerge import integrations as integrations
     from gsmerge.compaction.compact import compact as compact
     from gsmerge.compaction.inspect import inspect as inspect
-    from gsmerge.compaction.result import CompactReport as CompactReport
+    from gsmerge.compaction.report import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
     from gsmerge.errors import GsmergeError as GsmergeError
@@ -50,7 +50,8 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "compaction.compact": ("compact",),
     "compaction.inspect": ("inspect",),
-    "compaction.result": ("CompactReport", "CompactResult"),
+    "compaction.report": ("CompactReport",),
+    "compaction.result": ("CompactResult",),
     "compaction.tensors": ("compact_tensors",),
     "errors": ("GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),

@@ -20,7 +20,7 @@ from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import FileInfo, degree_notes
 from gsmerge.io.formats.table import SCENE_SUFFIXES
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.report import human_bytes
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.no_gaussians import check_scene_file
 from gsmerge.scene.read import load_files

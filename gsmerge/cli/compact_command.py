@@ -96,7 +96,7 @@ def compact(args: opt.Args) -> None:
         return
     _warn_of_memory(files, settings, quiet=args.silent)
     from gsmerge.compaction.files import Outputs, compact_files
-    from gsmerge.report import result_table, summary_lines
+    from gsmerge.compaction.report import result_table, summary_lines
 
     outputs = Outputs(
         out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,

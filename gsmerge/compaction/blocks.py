@@ -12,10 +12,9 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes
+from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.compaction.result import (
-    CompactReport,
     CompactResult,
-    Covered,
     measure_covered,
     measure_input,
     measure_result,

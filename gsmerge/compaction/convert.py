@@ -38,7 +38,8 @@ from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, input_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
-from gsmerge.report import document_head, human_bytes
+from gsmerge.report import document_head
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.files import result_cameras

@@ -18,8 +18,9 @@ from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.plan import choose_for_scene, load_networks, resolve_budget, stands_alone
-from gsmerge.report import document_head, human_bytes
+from gsmerge.report import document_head
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
 from gsmerge.scene.read import Loaded

@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
@@ -20,7 +21,7 @@ from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.table import COLMAP, INDEX
 from gsmerge.io.formats.write import output_notes
-from gsmerge.report import report_document, to_json
+from gsmerge.report import to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
@@ -66,8 +67,8 @@ def compact_files(
 
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
 
-    Returns the report, see :func:`gsmerge.report.report_document`. Raises SceneError if the scene cannot be read or the
-    result cannot be written, UsageError if the settings need what the scene does not have.
+    Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
+    read or the result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending

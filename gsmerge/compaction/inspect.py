@@ -18,7 +18,8 @@ from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.coverage import TRANSPARENT, coverage, extents
-from gsmerge.report import finite, human_bytes
+from gsmerge.report import finite
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints

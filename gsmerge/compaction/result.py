@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.fit import Fitted
@@ -17,90 +18,12 @@ from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
-from gsmerge.report import html_table
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians, Scene
 
 if TYPE_CHECKING:
     import torch
-
-
-@dataclass(frozen=True)
-class Covered:
-    """PSNR where the input covers the input views, which lacks some of their pixels.
-
-    Args:
-        share: Share of the scored pixels that the input covers: those that have a row of the file or, where pixels are
-            not known, in which it is opaque by half.
-        before: Mean PSNR (dB) of these pixels rendered from the input.
-        after: The same from the result.
-    """
-
-    share: float
-    before: float
-    after: float
-
-
-@dataclass(frozen=True)
-class CompactReport:
-    """Report of a run.
-
-    Args:
-        num_input: Gaussians in the scene.
-        num_output: Gaussians in the result.
-        seconds: Wall time of each stage.
-        psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
-            quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
-            :func:`gsmerge.evaluate` is exact.
-        psnr_after: The same from the result.
-        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit). Of a scene without cameras,
-            ``fidelity`` is the PSNR (dB) against the input from so many held-out ``views``.
-        notes: Warnings about the input and adaptations to it, one sentence each.
-        options: All settings by flat name.
-        peak_memory_bytes: Largest resident memory of the process so far.
-        unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
-        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
-            that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
-        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours"; None
-            where it is not measured.
-        covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
-            not.
-
-    Example:
-        >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
-        >>> report.num_input, report.num_output
-        (7680, 300)
-    """
-
-    num_input: int
-    num_output: int
-    seconds: dict[str, float]
-    psnr_before: float | None
-    psnr_after: float | None
-    choices: dict[str, Any]
-    notes: list[str]
-    options: dict[str, Any]
-    peak_memory_bytes: int
-    unmet: str | None = None
-    worse: str | None = None
-    covered: Covered | None = None
-    psnr_reference: str | None = None
-
-    def __repr__(self) -> str:
-        return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
-
-    def _repr_html_(self) -> str:
-        notes = [("note", text) for text in self.notes]
-        return html_table([*self._facts(), *notes])
-
-    def _facts(self) -> list[tuple[str, str]]:
-        """List what a reader wants first, by name."""
-        share = 100 * self.num_output / max(1, self.num_input)
-        facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
-        if self.psnr_before is not None and self.psnr_after is not None:
-            facts += [("PSNR of the input views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
-        return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
 @dataclass(frozen=True)

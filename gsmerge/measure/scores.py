@@ -11,7 +11,8 @@ from typing import Any
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
-from gsmerge.report import csv_text, document_head, human_bytes, text_table
+from gsmerge.report import csv_text, document_head, text_table
+from gsmerge.runtime.memory import human_bytes
 
 Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows

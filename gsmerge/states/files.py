@@ -21,8 +21,8 @@ from gsmerge.io import atomic_output, lock_folder, lost_harmonics, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
 from gsmerge.io.formats.table import PLY, count_for_bytes
 from gsmerge.plan import resolve_fit
-from gsmerge.report import document_head, file_sha256, human_bytes, seconds_document, seconds_line
-from gsmerge.runtime.memory import peak_memory
+from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line
+from gsmerge.runtime.memory import human_bytes, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles

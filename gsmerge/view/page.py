@@ -19,7 +19,7 @@ from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.measure.preview import Picture
 from gsmerge.measure.scores import filled_tables, page_notes, page_title
-from gsmerge.report import human_bytes
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.view.data import PageView, ViewData, encode_still
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ import numpy as np
 from floors import nudged
 
 from gsmerge import Cameras, Gaussians, Scene, compact, render
-from gsmerge.compaction.result import CompactReport, CompactResult
+from gsmerge.compaction.report import CompactReport
+from gsmerge.compaction.result import CompactResult
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit

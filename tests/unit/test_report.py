@@ -1,91 +1,12 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
-import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from gsmerge import report
-from gsmerge.compaction.result import CompactReport, Covered
-from gsmerge.settings.compact import CompactOptions
-
-
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
-    before, after = tmp_path / "scene.ply", tmp_path / "small.ply"
-    before.write_bytes(b"x" * 2_500_000)
-    after.write_bytes(b"y" * 700)
-    return before, after
-
-
-def make_document(files: tuple[Path, Path], **changes: Any) -> dict[str, Any]:
-    numbers: dict[str, Any] = {
-        "num_input": 1000,
-        "num_output": 25,
-        "seconds": {"segment": 1.0, "encode": 0.5},
-        "psnr_before": 20.0,
-        "psnr_after": 24.5,
-        "choices": {"scored_views": 4, "agreement": {"share": float("inf")}},
-        "notes": ["a note"],
-        "options": CompactOptions(seed=5).to_dict(),
-        "peak_memory_bytes": 10**9,
-    }
-    return report.report_document(
-        CompactReport(**{**numbers, **changes}),
-        input_paths=[files[0]],
-        output_path=files[1],
-        seconds_before={"read": 0.25},
-        seconds_after={"write": 0.125},
-    )
-
-
-def test_document_is_strict_json(files: tuple[Path, Path]) -> None:
-    document = json.loads(report.to_json(make_document(files)))
-    assert document["choices"]["agreement"]["share"] is None  # infinity is no JSON
-    assert document["input"]["sha256"] == hashlib.sha256(b"x" * 2_500_000).hexdigest()
-    assert document["ratio"] == 0.025
-    assert list(document["seconds"]) == ["read", "segment", "encode", "write"]
-    assert document["total_seconds"] == 1.875
-    assert document["seed"] == 5
-
-
-def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]) -> None:
-    document = make_document(files, covered=Covered(0.79, 26.1, 25.9))
-    assert document["psnr_covered"] == {"share": 0.79, "before": 26.1, "after": 25.9}
-    for text in (report.summary_line(document), "\n".join(report.result_table(document))):
-        assert all(part in text for part in ("79 %", "26.10", "25.90", "20.00", "24.50"))
-    assert make_document(files)["psnr_covered"] is None
-
-
-def test_summary_line(files: tuple[Path, Path]) -> None:
-    line = report.summary_line(make_document(files))
-    assert line == (
-        f"{files[1]}: 1,000 -> 25 Gaussians (2.50 %), 2.5 MB -> 700 B; input views 20.00 -> 24.50 dB;"
-        " 1.9 s (read 0.25, segment 1.00, encode 0.50, write 0.12)"
-    )
-
-
-def test_result_table(files: tuple[Path, Path]) -> None:
-    table = report.result_table(make_document(files), "gsmerge view scene small.ply")
-    assert table[0] == str(files[1])
-    assert [line.split() for line in table[1:]] == [
-        ["Gaussians", "1,000", "25", "2.50", "%"],
-        ["file", "2.5", "MB", "700", "B"],
-        ["PSNR", "20.00", "dB", "24.50", "dB", "in", "4", "of", "the", "input", "views"],
-        ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
-        ["next", "gsmerge", "view", "scene", "small.ply"],
-    ]
-    assert max(map(len, table[1:])) <= 80
-    short = report.result_table(make_document(files, psnr_before=None, psnr_after=None))
-    assert [line.split()[0] for line in short[1:]] == ["Gaussians", "file", "time"]
-
-
-def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
-    assert "dB" not in report.summary_line(make_document(files, psnr_before=None, psnr_after=None))
+from gsmerge.runtime.memory import human_bytes
 
 
 @pytest.mark.parametrize(
@@ -93,14 +14,7 @@ def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
     [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (1_234_567, "1.2 MB"), (7e9, "7.0 GB"), (2e12, "2000.0 GB")],
 )
 def test_human_bytes(count: float, text: str) -> None:
-    assert report.human_bytes(count) == text
-
-
-def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
-    points = [{"count": count, "psnr": 20.0, "ssim": 0.5, "lpips": None} for count in (10, 30, 90)]
-    *_, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
-    assert nearest.endswith("the result has 25")
-    assert "result" not in few + many
+    assert human_bytes(count) == text
 
 
 def test_text_in_tables_is_no_formula() -> None:

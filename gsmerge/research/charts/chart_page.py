@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsmerge.report import csv_text, human_bytes
+from gsmerge.report import csv_text
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import (
     METRICS,
@@ -19,6 +19,7 @@ from gsmerge.research.charts.lines import (
     size_label,
 )
 from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, picture_path
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.settings.compact import OURS
 from gsmerge.view.page import PICTURES, data_uri, render_template
 

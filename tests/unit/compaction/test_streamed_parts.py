@@ -10,7 +10,8 @@ import pytest
 from sky_scenes import HAZE, ZENITH, painted
 
 from gsmerge import CompactOptions, Gaussians, Scene
-from gsmerge.compaction.result import CompactReport, CompactResult
+from gsmerge.compaction.report import CompactReport
+from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.streamed_parts import split_levels
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.stages import CleanOptions
