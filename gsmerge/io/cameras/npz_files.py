@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import warnings
 import zipfile
 from collections.abc import Collection
@@ -236,7 +237,8 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever a damaged archive makes the libraries raise
-        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({error})") from error
+        cause = re.sub(r" at 0x[0-9a-f]+", "", str(error))  # of an object, which is another in every process
+        raise SceneError(path, f"expected a readable .npz file, found a damaged one ({cause})") from error
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
