@@ -15,8 +15,8 @@ from quality import score
 from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
-from gsmerge.io import read_ply, write_levels, write_ply
-from gsmerge.io.formats.read import read_level
+from gsmerge.io import read_ply, write_ply
+from gsmerge.io.formats.streamed import read_level, write_levels
 from gsmerge.research.baselines.simple import find_program
 
 WAYS = ("decimate", "decimate-adaptive")

@@ -39,8 +39,9 @@ import gsmerge
 from gsmerge.compaction.convert import ConvertOptions, convert_files
 from gsmerge.errors import UsageError
 from gsmerge.geometry import sh0_to_rgb
-from gsmerge.io.cameras.colmap_model import FOLDER, PLACE, POINTS
+from gsmerge.io.cameras.colmap_model import POINTS
 from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.formats.table import FOLDER, PLACE
 from gsmerge.research.baselines.simple import find_program
 from gsmerge.view.page import ENGINE
 
