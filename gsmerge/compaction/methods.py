@@ -1,4 +1,4 @@
-"""Other methods than ours behind one interface: ``compact(scene, method=NAME)``.
+"""All ways to compact a scene behind one interface: ours, that for scenes without cameras, and those of packages.
 
 A package adds one by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
 """
@@ -85,10 +85,10 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     """
     if stands_alone(scene, options):
         return PAIRS, _unused_alone(options)
-    method, size = find_method(options), measure_size(scene)
-    if options.method == OURS:
+    method = find_method(options)
+    if method is SUPERPIXELS:
         return method, []
-    place = f"method {method.name}"
+    place, size = f"method {method.name}", measure_size(scene)
     if "photos" in method.needs and not size.photos:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
     if "pixels" in method.needs and not size.aligned:

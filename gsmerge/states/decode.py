@@ -68,10 +68,10 @@ def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int
     remedy = "begin a state with that budget"
     if count is None:
         raise UsageError(f"budget: expected a number, a share or a size, got {budget}; {remedy}")
-    min_count = len(groups) + state.num_kept
+    min_count = len(groups) + len(state.kept)
     if count < min_count:
         raise UsageError(f"budget: expected at least {min_count}, one for each group, got {count}; {remedy}")
-    return count - state.num_kept
+    return count - len(state.kept)
 
 
 def _distribute(state: State, groups: DividedGroups, total: int) -> DecodeCounts:
@@ -80,7 +80,7 @@ def _distribute(state: State, groups: DividedGroups, total: int) -> DecodeCounts
     counts = 1 + np.bincount(order[:extra], minlength=len(groups))
     if extra <= len(order):
         return DecodeCounts(counts, 0.0, total)
-    limit, count = len(groups) + len(order) + state.num_kept, total + state.num_kept
+    limit, count = len(groups) + len(order) + len(state.kept), total + len(state.kept)
     note = f"{count} Gaussians were asked for, and the groups divide into {limit} at most"
     return DecodeCounts(counts, 0.0, total, (note,))
 
@@ -158,7 +158,7 @@ def decode_state(
     if options.photo_scale not in ("auto", 1):
         notes = *notes, f"photo_scale {options.photo_scale:g} is 1: a state stores its photos at the size of its views"
     max_count = int(counts.per_group.sum())
-    start_count = max(len(groups), int(start_share(options) * max_count)) + state.num_kept
+    start_count = max(len(groups), int(start_share(options) * max_count)) + len(state.kept)
     with use_threads(threads), record_run(progress) as record:
         gaussians = decode_counts(state, groups, count_children(state, groups, budget=start_count))
         images = state.replay.images.astype(np.float32) / np.float32(255)

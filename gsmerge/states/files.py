@@ -158,7 +158,7 @@ def compact_file(
     }  # fmt: skip
     if dry_run:
         counts = count_children(state, divide_groups(state), k=k, budget=count)
-        most = int(counts.per_group.sum()) + state.num_kept
+        most = int(counts.per_group.sum()) + len(state.kept)
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
         return document | output | {"notes": [*counts.notes, *notes]}
     with atomic_output(out, overwrite=overwrite) as temporary:

@@ -227,8 +227,3 @@ class State:
     def sh_degree(self) -> int:
         """Degree of the harmonics."""
         return self.groups.sh_degree
-
-    @property
-    def num_kept(self) -> int:
-        """Number of kept Gaussians that no view sees."""
-        return len(self.kept)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import touch
 from messages import refuses
 from tiny_scene import Tiny, write_npz
 
@@ -15,17 +16,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.scene.files import find_scene_files
 
 OUT = Path("out")
-
-
-@pytest.fixture(autouse=True)
-def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
-def touch(*names: str) -> None:
-    for name in names:
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
+pytestmark = pytest.mark.usefixtures("inside")
 
 
 def actual(*given: str, out: Path = OUT) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from batches import touch
 from messages import refuses
 
 from gsmerge.batch import BatchOptions, find_jobs
@@ -17,6 +18,7 @@ from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
 
 OUT = Path("out")
+pytestmark = pytest.mark.usefixtures("inside")
 
 
 @pytest.mark.parametrize(
@@ -38,17 +40,6 @@ def test_settings_out_of_range_are_refused(wrong: dict[str, Any], named: tuple[o
 def test_templates_that_make_no_sense_are_refused(template: str) -> None:
     with refuses(ValueError, "output"):
         BatchOptions(output=template)
-
-
-@pytest.fixture(autouse=True)
-def inside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-
-
-def touch(*names: str) -> None:
-    for name in names:
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 7\nend_header\n")
 
 
 def outputs(*arguments: str, options: BatchOptions | None = None, results: Collection[str] = ()) -> dict[str, str]:

@@ -226,7 +226,7 @@ def test_scenes_in_no_order_and_what_no_view_sees(pixels: Scene) -> None:
     state = one_batch(both, superpixels="10%", unseen="keep")
     shared = share(state)
     assert scenes.identical(shared.kept, state.kept)
-    assert shared.num_kept == state.num_kept > 0
+    assert len(shared.kept) == len(state.kept) > 0
 
 
 def test_colours_of_one_batch_are_fitted_for_later_ones(pixels: Scene) -> None:

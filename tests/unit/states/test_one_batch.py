@@ -54,7 +54,7 @@ def groups_of(state: State) -> DividedGroups:
 
 def most_of(state: State) -> int:
     """The largest number of Gaussians that a state is decoded to."""
-    return len(state) + groups_of(state).division.num_splits + state.num_kept
+    return len(state) + groups_of(state).division.num_splits + len(state.kept)
 
 
 def unfitted(scene: Scene, **settings: Any) -> Gaussians:
@@ -149,7 +149,7 @@ def test_what_no_view_sees_is_kept(settings: dict[str, Any], pixels: Scene) -> N
     hidden = far_behind(unaligned.gaussians, 200)
     both = replace(unaligned, gaussians=Gaussians.concat([unaligned.gaussians, hidden]))
     actual = one_batch(both, superpixels=SHARE, unseen="keep", **settings)
-    assert actual.num_kept > 0
+    assert len(actual.kept) > 0
     assert scenes.identical(decoded(actual), unfitted(both, unseen="keep", **settings))
 
 
@@ -165,7 +165,7 @@ def test_a_budget_of_the_decoder_is_met_and_dealt_where_it_helps(state: State) -
 
 def test_more_than_there_is_to_divide_is_told(state: State) -> None:
     counts = counts_of(state, budget=state.settings.num_input)
-    assert counts.per_group.sum() == most_of(state) - state.num_kept
+    assert counts.per_group.sum() == most_of(state) - len(state.kept)
     assert len(counts.notes) == 1
     assert names(counts.notes[0], most_of(state))
     assert len(decoded(state, budget=state.settings.num_input)) <= most_of(state)
