@@ -52,6 +52,7 @@ def render(args: opt.Args) -> None:
     """Draw scenes: side by side with their photos, a picture for each camera, a video along a path, or superpixels."""
     kind, overwrite = _choose_kind(args), args.overwrite or args.dry_run
     from gsmerge.measure import drawings
+    from gsmerge.measure.camera_path import parse_path
     from gsmerge.measure.preview import is_video
     from gsmerge.settings.stages import SegmentOptions
 
@@ -61,7 +62,9 @@ def render(args: opt.Args) -> None:
         like = drawings.frame_files(files, args.frame_of, args.cameras, args.images)
     inputs = (*input_files(files), *input_files(like))
     if kind in ("panel", "path"):
-        inputs = (*args.scenes, *inputs, *([] if args.path is None else [Path(args.path)]))
+        inputs = (*args.scenes, *inputs)
+        if args.path is not None and parse_path(args.path) is None:  # of a file
+            inputs = (*inputs, Path(args.path))
     if kind == "panel" or is_video(args.output):
         check_outputs((args.output,), inputs, overwrite=overwrite)
     else:

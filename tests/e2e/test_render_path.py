@@ -60,6 +60,14 @@ def test_a_spline_starts_and_ends_at_the_photos(made_scene: Path, tmp_path: Path
         assert errors[photo] == min(errors) < 20
 
 
+def test_a_folder_may_have_the_name_of_a_path(
+    made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run("render", made_scene, "--path", "orbit", "--frames", 2, "-o", "orbit", code=0)
+    assert list(listing(tmp_path / "orbit")) == ["frame_00000.png", "frame_00001.png"]
+
+
 def test_scenes_are_side_by_side(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     scene = scene_copy / "scene.ply"
     shutil.copy(scene, tmp_path / "small.ply")
