@@ -33,8 +33,8 @@ from gsmerge.types import Cameras, Gaussians, Views
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
 LPIPS_VIEWS = 2
 COUNTS = (3, 6, 9, 12)
-SIZES = ("0.5%", "2%", "4.4%", "8.7%", "20%")
-USUAL = "4.4%"
+SIZES = ("2.2%", "5.3%", "10.2%")  # the paper's 5, 12 and 23 thousand superpixels of 476 x 476 pixels
+USUAL = "5.3%"
 Runs = dict[str, dict[str, Any]]  # by scene
 
 
@@ -46,7 +46,7 @@ class Way:
         name: In the tables.
         settings: Of ``compact``; None: the input as it is.
         key: Of the paper's printed figures.
-        networks: The file that it depends on: "paper", "undiversified", "shipped", or "" for none.
+        networks: The file that it depends on: "paper", or "" for none.
         silent: Networks whose last layers are set to zero.
         equal: Whether it has as many Gaussians as ``--recipe paper`` with K = 1.
     """
@@ -78,23 +78,19 @@ WHOLE = recipe("`--recipe paper`, K = 1", "k1", k=1)
 CHILDREN = tuple(recipe(f"K = {k}", f"k{k}", k=k) for k in (2, 4))
 MIXED = recipe("mixed K, by thirds", "mixed", k="mixed")
 MOMENTS = Way("`moment-matching`", {"method": "moment-matching"}, "moments", equal=True)
-LEARNED = Way(
-    "`--fit none`, with networks", {"fit": "none", "k": 1, "checkpoint": "shipped"}, "", "shipped", equal=True
-)
-DRAFT = Way("`--effort draft`", {"effort": "draft"}, "", "shipped", equal=True)
 FIT = Way("the defaults", {}, equal=True)
-OURS = (LEARNED, DRAFT, FIT)
 VARIANTS = (
     recipe("no merging across views", k=1, match="none"),
     *(recipe(f"IoU of at least {iou}", k=1, iou=iou) for iou in (0.1, 0.4)),
     *(recipe(f"cosine of at least {cosine}", k=1, similarity=cosine) for cosine in (0.6, 0.95)),
-    recipe("geometry of the moments for matching", k=1, geometry="analytic"),
+    recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
+    recipe("BASS with splits and merges", k=1, segmentation="bass-adaptive"),
     recipe("the encoder's latents zero", silent="latent", k=1),
     *(recipe(f"without the {name}", silent=name, k=1) for name in ("merger", "refiner", "heads")),
 )
-RESIZED = {"2%": "larger superpixels", "8.7%": "smaller superpixels"}
+RESIZED = {"2.2%": "larger superpixels", "10.2%": "smaller superpixels"}
 PLAIN, STYLES = Case(), ("da3", "depthsplat", "anysplat")
-VIEW_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, MIXED, *OURS)
+VIEW_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, MIXED, FIT)
 STYLE_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, FIT)
 
 
@@ -172,7 +168,7 @@ class Bench:
     def compact(self, scene: gsmerge.Scene, way: Way, settings: dict[str, Any]) -> tuple[Gaussians, dict[str, Any]]:
         """A way's Gaussians, and the processor seconds and matches that they took."""
         with tempfile.TemporaryDirectory() as place:
-            if way.networks in ("paper", "undiversified"):
+            if way.networks:
                 file = self.files[way.networks]
                 file = silenced(file, way.silent, Path(place)) if way.silent else file
                 settings = {**settings, "checkpoint": str(file)}

@@ -3,7 +3,6 @@
 python benchmarks/paper_tables.py                                 # finished runs are kept, so it can be stopped
 python benchmarks/paper_tables.py --page docs/results.md          # and the section there is replaced
 python benchmarks/paper_tables.py fox,fern --only views sizes --no-lpips
-python benchmarks/paper_tables.py --undiversified FILE            # networks trained without diversification, too
 
 The recipe has no budget, so K counts; what it is compared with has as many Gaussians as K = 1. Every result is made
 once and scored once: held-out photos, visible and all pixels, and input views where a table shows them.
@@ -17,7 +16,6 @@ import sys
 import tempfile
 import textwrap
 from collections.abc import Callable, Iterator, Sequence, Sized
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +23,10 @@ import numpy as np
 import printed_figures as printed
 from networks import Store, applies, words
 from paper_runs import (
-    CHILDREN,
     COUNTS,
+    FIT,
     INPUT,
     MOMENTS,
-    OURS,
     PHOTO_SIDE,
     PLAIN,
     RESIZED,
@@ -128,13 +125,12 @@ def sizes_section(bench: Bench) -> str:
     for size in SIZES:
         case = Case(size=size)
         whole = bench.runs(WHOLE, case)
-        cells = [compared(bench.runs(way, case), whole) for way in (MOMENTS, *OURS)]
+        cells = [compared(bench.runs(way, case), whole) for way in (MOMENTS, FIT)]
         rows.append((size, share(whole), mean_cell(whole), *cells, printed.SIZES.get(size, "")))
-    others = [way.name for way in (MOMENTS, *OURS)]
-    head = ("`--superpixels`", "kept", "`--recipe paper`", *others, "printed: AnySplat")
+    head = ("`--superpixels`", "kept", "`--recipe paper`", MOMENTS.name, FIT.name, "printed: AnySplat")
     text = """All views, K = 1; the columns after `--recipe paper` have as many Gaussians. In brackets their
-    PSNR less that of the recipe, with the 95 % interval. Then the row of 4.4 % by capture."""
-    ways = (INPUT, MOMENTS, WHOLE, *OURS)
+    PSNR less that of the recipe, with the 95 % interval. Then the row of 5.3 % by capture."""
+    ways = (INPUT, MOMENTS, WHOLE, FIT)
     columns = [bench.runs(way, PLAIN) for way in ways]
     one = [(name, *(mean_cell({name: runs[name]}) for runs in columns)) for name in columns[0]]
     return section("By size", text, make_table(head, rows), make_table(("", *(way.name for way in ways)), one))
@@ -165,16 +161,13 @@ def ablation_section(bench: Bench) -> str:
     checkpoint = bench.files["paper"]
     known += [(way.name, bench.runs(way, PLAIN), whole) for way in VARIANTS if applies(way, checkpoint)]
     known += [(name, bench.runs(WHOLE, Case(size=size)), whole) for size, name in RESIZED.items()]
-    for way in CHILDREN if "undiversified" in bench.files else ():
-        other = replace(way, networks="undiversified")
-        known.append((f"{way.name}, trained without diversification", bench.runs(other, PLAIN), bench.runs(way, PLAIN)))
     rows = []
     for name, runs, base in known:
         kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f} %"
         gain = "" if runs is base else words(difference(runs, base))
         rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
     names = ("groups kept across views", "kept", "`--recipe paper`", "PSNR less the whole (95 %)")
-    text = "All views, K = 1; what was trained without diversification is compared with the same K."
+    text = "All views, K = 1."
     return section("Without a part", text, make_table(("", *names, "printed: AnySplat"), rows))
 
 
@@ -221,12 +214,10 @@ def planned(parts: Sequence[str], bench: Bench) -> Iterator[tuple[Way, Case]]:
         yield from ((way, Case(views=count)) for count in bench.counts for way in (INPUT, WHOLE))
     if "sizes" in parts:
         yield INPUT, PLAIN
-        yield from ((way, Case(size=size)) for size in SIZES for way in (WHOLE, MOMENTS, *OURS))
+        yield from ((way, Case(size=size)) for size in SIZES for way in (WHOLE, MOMENTS, FIT))
     if "ablation" in parts:
         yield from ((way, PLAIN) for way in (WHOLE, *VARIANTS) if applies(way, bench.files["paper"]))
         yield from ((WHOLE, Case(size=size)) for size in RESIZED)
-        others = ("paper", "undiversified") if "undiversified" in bench.files else ()
-        yield from ((replace(way, networks=name), PLAIN) for name in others for way in CHILDREN)
     if "backbones" in parts:
         yield from ((way, PLAIN) for way in STYLE_WAYS)
         yield from ((way, Case(style)) for style in STYLES for way in STYLE_WAYS)
@@ -237,13 +228,13 @@ def head_section(bench: Bench) -> str:
     training = load_checkpoint(bench.files["paper"]).training
     steps, scenes = training["step"], len(training["data"])
     names = ", ".join(f"{folder.name} ({num_views(folder)} views)" for folder in bench.folders)
-    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry decoded by the head for K = 1, matching by
-    latents and boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are
-    4.4 % of the pixels unless a table says otherwise. `moment-matching` and gsmerge's own settings have
-    at most as many Gaussians as the recipe with K = 1. Cells are means over the captures of PSNR / SSIM
-    / LPIPS, photos at {PHOTO_SIDE} pixels, held-out views, pixels that the input views see, unless a
-    table says otherwise; intervals are 95 % t intervals of differences that are paired by capture.
-    `python benchmarks/paper_tables.py --page docs/results.md` writes this section."""
+    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry of the head for K = 1, matching by latents and
+    boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are 5.3 % of the pixels, before
+    merging, unless a table says otherwise. `moment-matching` and gsmerge's defaults have at most as many Gaussians as
+    the recipe with K = 1. Cells are means over the captures of PSNR / SSIM / LPIPS, photos at {PHOTO_SIDE} pixels,
+    held-out views, pixels that the input views see, unless a table says otherwise; intervals are 95 % t intervals of
+    differences that are paired by capture. `python benchmarks/paper_tables.py --page docs/results.md` writes this
+    section."""
     data = f"""Captures: {names}, with the depth of a multi-view-stereo network, and
     [networks](laboratory/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
     of DL3DV-Bench, MipNeRF360 and Tanks and Temples together, with the backbone that is named, and networks trained for
@@ -281,7 +272,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=list(SECTIONS), choices=list(SECTIONS))
     parser.add_argument("--no-lpips", dest="lpips", action="store_false")
     parser.add_argument("--checkpoint", type=Path, default=IN_PACKAGE["paper"], help="networks of the recipe")
-    parser.add_argument("--undiversified", type=Path, help="the same trained without diversification")
     parser.add_argument("--page", type=Path, help="replace the section of this page")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
@@ -290,9 +280,7 @@ def main() -> None:
     if args.page and len(args.only) < len(SECTIONS):
         parser.error("--page: expected all parts, of which a page's section consists")
     args.cache.mkdir(parents=True, exist_ok=True)
-    files = {"paper": args.checkpoint, "shipped": IN_PACKAGE["shipped"]}
-    if args.undiversified:
-        files["undiversified"] = args.undiversified
+    files = {"paper": args.checkpoint}
     store = Store(args.cache / "paper_tables.jsonl")
     bench = Bench(scene_folders(args.scenes), store, args.cache, files, args.lpips)
     for folder in bench.folders:

@@ -36,7 +36,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     """Merge the superpixels of all views; compacting and adding views to a state share this part."""
     scene = prepared.scene
     segmentation = segment_scene(scene, plan.superpixels, count)
-    members = assign(scene, segmentation.groups, draws=plan.networks is None)
+    members = assign(scene, segmentation.groups, draws=plan.draws)
     networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
     pooled = encode(scene, members, segmentation.groups)
     features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)

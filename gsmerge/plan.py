@@ -100,6 +100,11 @@ class Plan:
         return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
 
     @property
+    def draws(self) -> bool:
+        """Whether Gaussians without pixels are given to superpixels by their blending weights, as in the paper."""
+        return self.networks is None or self.networks.options.makes_children
+
+    @property
     def weakens(self) -> bool:
         """Whether groups that other views see through start with less opacity, because a long fit follows."""
         return self.superpixels.start_share < 1 and self.checkpoint is None

@@ -61,12 +61,25 @@ class NetworkContext(Corrector):
         return self.options.max_children
 
     def encode(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the encoder, see :func:`encode_features`."""
-        return encode_features(features, self)
+        """Run the encoder, see :func:`encode_features`, and the head for K = 1 if its geometry is carried on."""
+        encoded = encode_features(features, self)
+        if self.options.geometry != "carried":
+            return encoded
+        # scales and rotations alone: the mean stays the encoder's (paper section 4.2)
+        return replace(encoded, covars=self.decode_one(encoded)[1])
 
-    def decode_for_matching(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the head for K = 1, see :func:`match_geometry`."""
-        return match_geometry(features, self)
+    def prepare_matching(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Replace means and covariances by those of the K = 1 head, if they serve matching alone."""
+        if self.options.geometry != "matched":
+            return features
+        means, covars = self.decode_one(features)
+        return replace(features, means=means, covars=covars)
+
+    def decode_one(self, features: FeatureGaussians) -> tuple[Array, Array]:
+        """Run the head for K = 1; return the means ``[g,3]`` and covariances ``[g,3,3]`` of its Gaussians."""
+        described = self.describe(features)
+        decoded = decode_with_group_features(described.base, np.arange(len(features)), described, self)
+        return decoded.means, covariances(decoded.quats, decoded.scales)
 
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
@@ -78,6 +91,16 @@ class NetworkContext(Corrector):
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
         """Run the refiner, see :func:`refine_features`."""
         return refine_features(features, self)
+
+    @property
+    def makes_children(self) -> bool:
+        """Whether the heads make children of nothing."""
+        return self.options.makes_children
+
+    def expand(self, features: FeatureGaussians, counts: np.ndarray) -> Gaussians:
+        """Run heads that make ``counts [g]`` children of every Feature Gaussian."""
+        described, parents = self.describe(features), np.repeat(np.arange(len(features)), counts)
+        return decode_with_group_features(described.base[parents], parents, described, self)
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Run the heads, see :func:`decode_gaussians`."""
@@ -141,17 +164,6 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     zeros = np.zeros((len(features), FEATURE - 3), np.float32)
     residuals = scale_outputs(concat_columns([encoded[:, -3:], zeros]), options.bounds, HALF)
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
-
-
-def match_geometry(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Replace means and covariances by those of the K = 1 head, for matching (paper section 4.3)."""
-    group_features, rows = context.describe(features), np.arange(len(features))
-    base = group_features.base
-    if context.options.outputs == "residual":  # of the moments themselves, exactly
-        residuals = as_array(run_heads(base, rows, group_features, context))
-        return context.correct_features(group_features, np.pad(residuals, ((0, 0), (0, 1))))
-    decoded = decode_with_group_features(base, rows, group_features, context)
-    return replace(features, means=decoded.means, covars=covariances(decoded.quats, decoded.scales))
 
 
 def merge_features(
@@ -231,8 +243,8 @@ def decode_gaussians(
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
     Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``features``, ascending. Three children
-    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own; heads
-    with absolute outputs leave them unchanged.
+    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own, which
+    heads with absolute outputs cannot do.
     """
     return decode_with_group_features(children, parents, context.describe(features), context)
 
@@ -252,24 +264,18 @@ def prepare_children(
     """Prepare the children that heads correct: unchanged, or round Gaussians for heads with absolute outputs.
 
     A round Gaussian has the mean of its group, its base colour, and the axes of its frame; the head's outputs are
-    offsets from these (paper section 4.3). It is as large as the group and half transparent. Five or more children of
-    one parent stay unchanged: no head corrects them.
+    offsets from these (paper section 4.3). It is as large as the group and half transparent.
     """
-    if options.outputs == "residual":
+    if not options.makes_children:
         return children
-    replaced = np.bincount(parents)[parents] <= options.max_children
     base, frames = group_features.base, group_features.frames.astype(np.float64)
-    round_ones = replace(
+    return replace(
         children,
         means=base.means[parents],
         quats=rotmat_to_quat(frames)[parents].astype(np.float32),
         scales=np.repeat(group_features.sizes[parents, None], 3, 1),
         opacities=np.full(len(children), 0.5, np.float32),
         sh0=base.sh0[parents],
-    )
-    columns = {name: (getattr(round_ones, name), column) for name, column in vars(children).items()}
-    return Gaussians(
-        **{name: np.where(replaced.reshape(-1, *[1] * (pair[1].ndim - 1)), *pair) for name, pair in columns.items()}
     )
 
 

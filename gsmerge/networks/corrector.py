@@ -20,8 +20,8 @@ class Corrector:
         """Correct pooled Feature Gaussians and add their latents."""
         return features
 
-    def decode_for_matching(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Replace means and covariances by decoded ones, for matching Feature Gaussians."""
+    def prepare_matching(self, features: FeatureGaussians) -> FeatureGaussians:
+        """Return Feature Gaussians with the geometry that is compared across views."""
         return features
 
     def merge(
@@ -33,6 +33,15 @@ class Corrector:
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
         """Correct merged Feature Gaussians by their neighbours."""
         return features
+
+    @property
+    def makes_children(self) -> bool:
+        """Whether :meth:`expand` makes the children of groups, instead of halving their members."""
+        return False
+
+    def expand(self, features: FeatureGaussians, counts: np.ndarray) -> Gaussians:
+        """Make ``counts [g]`` children of every Feature Gaussian, those of one adjacent."""
+        raise NotImplementedError
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Correct the children of Feature Gaussians; ``parents [n]`` are rows of ``features``, ascending."""

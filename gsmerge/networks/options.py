@@ -13,6 +13,7 @@ from gsmerge.settings.setting import Settings, setting
 SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
 OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
+GEOMETRIES = ("analytic", "matched", "carried")
 PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and its position in footprints and its colour
 GROUP = 19 + NUM_STATS  # columns of a whole group
@@ -58,6 +59,9 @@ class NetworkOptions(Settings):
     merger: bool = setting(True, "Whether there is one; without it clusters are pooled, and no more.")
     merger_start: str = setting("pooled", "What the merger corrects: `pooled`: the moments of the whole cluster.",
         "`first`, as in the paper: its 0th Feature Gaussian.", choices=STARTS)  # fmt: skip
+    geometry: str = setting("analytic", "Whose scales and rotations Feature Gaussians have.",
+        "`analytic`: those of the moments. `matched`: those of the K = 1 head, with its means, in matching alone. "
+        "`carried`: those of the K = 1 head from the encoder on, as in the paper.", choices=GEOMETRIES)  # fmt: skip
     refiner: bool = setting(True, "Whether there is one.")
     group_numbers: bool = setting(True, "Whether the heads read all numbers that describe a group, which are ours.",
         "Without them a head reads latent, base colour and mass, as in the paper.")  # fmt: skip
@@ -70,7 +74,12 @@ class NetworkOptions(Settings):
     @property
     def reads_children(self) -> bool:
         """Whether the heads read the Gaussians that they correct; absolute heads read only the group's size."""
-        return self.group_numbers or self.outputs == "residual"
+        return self.group_numbers or not self.makes_children
+
+    @property
+    def makes_children(self) -> bool:
+        """Whether heads make the children of a group of nothing, so that there are K of every group."""
+        return self.outputs == "absolute"
 
     @property
     def max_children(self) -> int:
@@ -78,12 +87,12 @@ class NetworkOptions(Settings):
 
         Five or more are corrected in two halves, which absolute heads cannot do.
         """
-        return SLOTS[-1] if self.outputs == "absolute" else 2 * SLOTS[-1]
+        return SLOTS[-1] if self.makes_children else 2 * SLOTS[-1]
 
     @property
     def head_bounds(self) -> Bounds:
         """Largest corrections of the heads."""
-        return WIDE if self.outputs == "absolute" else self.bounds
+        return WIDE if self.makes_children else self.bounds
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -23,11 +23,12 @@ from gsmerge.settings.stages import (
 OURS = "gsmerge"  # the method that is no plugin
 EFFORTS = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
-# Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: BASS from
-# saliency seeds, networks whose outputs are absolute, matching by latents and boxes of the decoded geometry, no fit.
+# Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: 12,000
+# superpixels of 476 x 476 pixels by BASS from saliency seeds, networks whose outputs are absolute, matching by latents
+# and boxes, no fit, and no pruning but by opacity.
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
-        "segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none",
+        "superpixels": "5.3%", "segmentation": "bass-st", "match": "aabb", "fit": "none", "min_contribution": 0.0,
         "k_low": 100 / 3, "k_high": 200 / 3, "checkpoint": "paper", "require_checkpoint": True,
     },
 }  # fmt: skip

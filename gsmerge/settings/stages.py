@@ -14,7 +14,6 @@ Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
 Unseen = Literal["drop", "keep"]
 Method = Literal["overlap", "aabb", "none"]
-Geometry = Literal["analytic", "decoded"]
 KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
@@ -102,9 +101,6 @@ class MatchOptions(Settings):
         "`overlap`: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and star "
         "clusters that cannot chain. `aabb`, as in the paper (section 4.4): box IoU, similar latents, and connected "
         "components. `none`: no merging across views. By default `overlap`, but `none` in a draft.")  # fmt: skip
-    geometry: Geometry = setting("analytic", "What is compared where networks are loaded: `analytic`, the moments, or "
-        "`decoded`, the K = 1 head's output.",
-        "The latter (paper section 4.3) merges less, takes longer and is no better.")  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of `overlap`.", least=0, most=1)
     iou: float = setting(0.2, "Least IoU of the boxes of `aabb` (tau_g).", least=0, most=1)
     similarity: float = setting(0.8, "Least cosine of the latents of `aabb` (tau_f).",

@@ -32,15 +32,17 @@ def decode(
     """Decode each Feature Gaussian into K Gaussians, fewer if its members are alike.
 
     Children are found by halving the members repeatedly across their widest direction in colour and position, so the
-    children of K = 2 are unions of those of K = 4. ``counts [g]``, from 1 on, sets K for each group and is required for
-    mixed K. Gaussians of one group are adjacent.
+    children of K = 2 are unions of those of K = 4; heads with absolute outputs make exactly K of every group.
+    ``counts [g]``, from 1 on, sets K for each group and is required for mixed K. Gaussians of one group are adjacent.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    gaussians, parents = divide(features, members, counts)
-    gaussians = networks.decode(gaussians, parents, features)
+    if networks.makes_children:
+        gaussians = networks.expand(features, counts)
+    else:
+        gaussians = networks.decode(*divide(features, members, counts), features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
@@ -128,14 +130,14 @@ def mixed_counts(
 def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
     """Return the number of Gaussians to decode merged views into; None: K for each Feature Gaussian.
 
-    It is a number if an exact count is requested and no fit grows to it, and for unaligned scenes. In unaligned scenes
-    a surface in both a near and a far view belongs to the near view, so many superpixels of the far view are empty, and
-    their Gaussians go to other groups.
+    It is a number if an exact count is requested and no fit grows to it, and for unaligned scenes, unless heads make K
+    of every group. In unaligned scenes a surface in both a near and a far view belongs to the near view, so many
+    superpixels of the far view are empty, and their Gaussians go to other groups.
     """
     segmentation, members = merged.segmentation, merged.members
     if segmentation.exact and not grows:
         return segmentation.count
-    if members.pixels is None or options.k == MIXED:
+    if members.pixels is None or options.k == MIXED or merged.networks.makes_children:
         return None
     groups = segmentation.groups
     sizes = np.array(groups.counts)

@@ -20,8 +20,8 @@ def match(features: FeatureGaussians, options: MatchOptions, networks: Corrector
     The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, in ties by position.
     Fully transparent Feature Gaussians form clusters of one.
     """
-    if options.geometry == "decoded" and options.match != "none":
-        features = networks.decode_for_matching(features)
+    if options.match != "none":
+        features = networks.prepare_matching(features)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0

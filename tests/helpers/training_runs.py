@@ -25,8 +25,10 @@ OPTIONS = TrainOptions(
 )  # fmt: skip
 # As the paper's, in small: absolute heads, random views, boxes, no fit.
 PAPER = replace(
-    OPTIONS, network=replace(TINY, outputs="absolute"), random_views=(1, 12), match="aabb",
-    geometry="decoded", photo_start=0.0, photo_loss="mse", photo_weight=1.0, ssim_weight=0.05, regression_weight=0.0,
+    OPTIONS,
+    network=replace(TINY, outputs="absolute", geometry="carried", group_numbers=False, merger_start="first"),
+    random_views=(1, 12), match="aabb", joint=True, photo_start=0.0, photo_loss="mse", photo_weight=1.0,
+    ssim_weight=0.05, regression_weight=0.0,
     teacher_weight=0.25, diversity_weight=1.0, window=16, validation_windows=1,
 )  # fmt: skip
 

@@ -294,9 +294,9 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
 
 
 def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> tuple[Tensor, float]:
-    """Do one step; return its loss, and the share of the gradient from the diversification of siblings.
+    """Do one step; return its loss, and the share of the gradient from the diversification of siblings, 0 to 1.
 
-    The share is measured in validated steps, and 0 in others.
+    It is that norm over the sum of the norms of both parts, measured in validated steps, and 0 in others.
     """
     options, parameters = run.options, list(state.networks.parameters())
     shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps
@@ -331,7 +331,13 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
-    return loss[0].cpu(), float(apart.norm() / gradients.norm().clamp_min(1e-30)) if shares else 0.0
+    return loss[0].cpu(), gradient_share(gradients, apart) if shares else 0.0
+
+
+def gradient_share(gradient: Tensor, part: Tensor) -> float:
+    """Compute the norm of a part of a gradient, as a share of the sum of its norm and that of the rest."""
+    own, rest = float(part.norm()), float((gradient - part).norm())
+    return own / max(own + rest, 1e-30)
 
 
 def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> WindowLoss:

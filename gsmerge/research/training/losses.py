@@ -22,16 +22,24 @@ from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_l
 from gsmerge.networks.corrections import ROTATION, residual_limits
 from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
-from gsmerge.pooling import Members, pool_members, principal_axes
+from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR
 from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.predict import Prediction, analytic_gaussians, crop_targets, match_crop, predict
+from gsmerge.research.training.predict import (
+    Prediction,
+    analytic_gaussians,
+    crop_targets,
+    decode_crop,
+    match_crop,
+    predict,
+    refine_crop,
+)
 from gsmerge.research.training.targets import Targets, corrections_between, nearest_axes
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window
 from gsmerge.stages.merge import take
-from gsmerge.types import Gaussians
+from gsmerge.types import SH_C0, Gaussians
 
 MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
 
@@ -129,25 +137,29 @@ def window_loss(
     step: int,
     rng: np.random.Generator,
 ) -> WindowLoss:
-    """Compute the loss of a window: its render on a random background against the photo, plus regularizers.
+    """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 
-    ``scales`` are the standard deviations of the targets of each K, see :func:`target_scales`.
+    It is the mean over all levels if they are trained jointly. ``scales`` are the standard deviations of the targets of
+    each K, see :func:`target_scales`. The diversification is a share of the photometric loss: its own scale is that of
+    volumes, which say nothing of how much it may weigh.
     """
-    crop = window.crop
-    prediction = predict(crop, networks, options, step)
-    image = draw_window(prediction.gaussians, window, rng.random(3, dtype=np.float32))
-    loss = photometric_loss(image, window, options, step)
+    crop, background = window.crop, rng.random(3, dtype=np.float32)
+    levels = options.levels if options.joint else (crop.k,)
     regression, teacher, diversity = options.regularizer_weights(step)
-    if regression:
-        scaled = scaled_corrections(crop, prediction, scales, options)
-        loss = loss + regression * correction_loss(*scaled, options)
-    if teacher:
-        loss = loss + teacher * teacher_loss(prediction, crop.example.members)
-    apart = torch.zeros(())
-    if diversity and crop.k > 1:
-        unit = crop.example.unit if options.diversity_unit == "scene" else None
-        apart = diversity * diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes, unit)
-    return WindowLoss(loss + apart, apart)
+    refined, total, apart = refine_crop(crop, networks, options, step), torch.zeros(()), torch.zeros(())
+    for k in levels:
+        prediction = decode_crop(refined, crop, k)
+        loss = photometric_loss(draw_window(prediction.gaussians, window, background), window, options, step)
+        if diversity and k > 1:
+            spread = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
+            apart = apart + diversity * float(loss.detach()) * spread / len(levels)
+        if regression:
+            scaled = scaled_corrections(crop, prediction, scales, options)
+            loss = loss + regression * correction_loss(*scaled, options)
+        if teacher:
+            loss = loss + teacher * teacher_loss(prediction, crop.example.members)
+        total = total + loss / len(levels)
+    return WindowLoss(total + apart, apart)
 
 
 MAX_DB = 100.0  # PSNR of windows without an error
@@ -209,22 +221,26 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     """Compute the distance of Gaussians from the moments of their groups (paper section 4.6).
 
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
-    teacher_mean, teacher_cov). The loss is the angle between the rotations, and the L1 distance of the means, in
-    sizes of the teacher, and of the logarithms of the scales. A Gaussian has 24 equal pairs of rotation and scales;
-    the one nearest to the prediction counts.
+    teacher_mean, teacher_cov), their mean colour, and the opacity that keeps their optical depth. The loss is the angle
+    between the rotations, and the L1 distance of the means, in sizes of the teacher, of the logarithms of the scales,
+    of the opacities and of the base colours. A Gaussian has 24 equal pairs of rotation and scales; the one nearest to
+    the prediction counts.
     """
     g, merged = prediction.gaussians, prediction.merged
     if len(g) == 0:
         return g.means.new_zeros(())
     moments = pool_members(members, merged.starts, merged.members, "paper")
-    scales, quats = (torch.from_numpy(axes).float()[prediction.parents] for axes in principal_axes(moments.covars))
+    teacher = to_gaussians(moments.covars, moments.extinctions, moments.means, moments.sh).to("cpu")[prediction.parents]
+    scales, quats = teacher.scales, teacher.quats
     orders = nearest_axes(quats, g.quats)
     scales = (scales[:, None] @ orders.abs())[:, 0]
     turns = _turn_angles(quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders)
     sizes = gaussian_sizes(scales)
-    means = torch.from_numpy(moments.means).float()[prediction.parents]
-    distances = (g.means - means).abs() / sizes[:, None]
-    return turns.mean() + distances.mean() + (torch.log(g.scales) - torch.log(scales)).abs().mean()
+    distances = (g.means - teacher.means).abs() / sizes[:, None]
+    stretches = (torch.log(g.scales) - torch.log(scales)).abs()
+    colors = SH_C0 * (g.sh0 - teacher.sh0).abs()
+    parts = (turns, distances, stretches, (g.opacities - teacher.opacities).abs(), colors)
+    return torch.stack([part.mean() for part in parts]).sum()
 
 
 def _turn_angles(turns: Tensor) -> Tensor:
@@ -237,22 +253,21 @@ GOAL = 0.5  # overlap of the boxes of two children that has no loss
 GEOMETRY, OPACITY = 0.75, 0.25  # weights of the two terms of the diversification
 
 
-def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor, unit: float | None = None) -> Tensor:
-    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D).
+def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
+    """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D); 0 to 1.
 
-    ``parents [n]`` of the children are ascending. Pairs are weighted by their volumes: in ``unit``, a length of the
-    scene, or, if None, in the ``sizes [n]`` of their groups, without a gradient, since small siblings are no goal. In
-    the paper's world units the weights of a million small Gaussians leave nothing of the loss.
+    ``parents [n]`` of the children are ascending. It is a mean over pairs, weighted by their volumes in units of the
+    ``sizes [n]`` of their groups, without a gradient, since small siblings are no goal. In the paper's world units the
+    weights of a million small Gaussians leave nothing of the loss.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:
         return gaussians.means.new_zeros(())
-    scales = gaussians.scales.detach() / sizes.detach()[:, None] if unit is None else gaussians.scales / unit
-    volumes = scales.prod(1)
+    volumes = (gaussians.scales.detach() / sizes.detach()[:, None]).prod(1)
     weights = (volumes[left] * volumes[right]).clamp_min(1e-30).sqrt()
     profile = overlap_profile(gaussians, left, right)
     opacity = (gaussians.opacities[left] - gaussians.opacities[right]).square()
-    return (weights * (GEOMETRY * profile + OPACITY * opacity)).mean()
+    return (weights * (GEOMETRY * profile + OPACITY * opacity)).sum() / weights.sum()
 
 
 def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:

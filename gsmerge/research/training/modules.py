@@ -36,6 +36,14 @@ def zero_init(layer: nn.Linear) -> nn.Linear:
     return layer
 
 
+def small_init(layer: nn.Linear) -> nn.Linear:
+    """Make a layer's first outputs small, but different: siblings that begin alike stay alike."""
+    with torch.no_grad():
+        for values in layer.parameters():
+            values.mul_(0.1)
+    return layer
+
+
 class Attention(nn.Module):
     """Multi-head attention from ``x [b,q,w]`` to ``context [b,n,w]`` with ``mask [b,n]``."""
 
@@ -131,7 +139,7 @@ class Head(nn.Module):
         self.seeds = mlp(options.latent + len(self.numbers), width, slots * width)
         self.child = nn.Linear(PART, width) if options.reads_children else None
         self.block, self.norm = AttentionBlock(width, options.heads), nn.LayerNorm(width)
-        self.out = zero_init(nn.Linear(width, RESIDUAL))
+        self.out = (small_init if options.makes_children else zero_init)(nn.Linear(width, RESIDUAL))
 
     def forward(self, latents: Tensor, group: Tensor, children: Tensor, mask: Tensor) -> Tensor:
         """Return raw corrections ``[b,slots,RESIDUAL]`` of ``children [b,slots,PART]`` with ``mask [b,slots]``."""

@@ -17,7 +17,6 @@ from torch.nn.functional import normalize
 
 from gsmerge.networks.apply import (
     NetworkContext,
-    encode_features,
     merge_features,
     prepare_children,
     refine_features,
@@ -211,7 +210,7 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
     """Make the round Gaussians that absolute heads correct; see :func:`gsmerge.networks.apply.prepare_children`.
 
-    ``children`` are the same ``n`` Gaussians as arrays.
+    ``children``: the same ``n`` Gaussians as arrays.
     """
     parent_ids, base, same = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
@@ -249,6 +248,24 @@ class TrainingContext(NetworkContext):
         """Apply corrections ``[g,14]`` to Feature Gaussians of tensors."""
         return move_feature_tensors(group_features, residuals)
 
+    def decode_one(self, features: FeatureGaussians) -> tuple[Array, Array]:
+        """Run the head for K = 1, whose geometry is carried on; return means and covariances as tensors."""
+        g, _ = self.correct_children(None, np.arange(len(features)), self.describe(features))
+        half = quat_to_rotmat(g.quats) * g.scales[:, None]
+        return g.means, half @ half.transpose(1, 2)
+
+    def correct_children(
+        self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
+    ) -> tuple[Gaussians, Tensor]:
+        """Run the heads on children (None: of nothing); return the corrected ones, and the frames of their groups."""
+        if children is None:
+            arrays = groups_to_arrays(group_features)
+            round_ones = prepare_children(arrays.base[parents], parents, arrays, self.options)
+            children = make_round_tensors(parents, group_features, round_ones)
+        corrections = as_tensor(run_heads(children, parents, group_features, self))
+        frames = group_features.frames[torch.from_numpy(parents)]
+        return move_tensors(children, corrections, frames), frames
+
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
@@ -263,27 +280,44 @@ class Prediction:
     matched: float  # share of the crop's Feature Gaussians that were merged with others
 
 
-def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
-    """Run a crop through all networks with gradients; each stage reads the results of the stages before.
+@dataclass(frozen=True, eq=False)
+class RefinedCrop:
+    """The Feature Gaussians of a crop after all stages before the heads, which every K shares."""
 
-    For K > 1 analytic children are pooled again from the members, so gradients reach earlier stages only through the
-    inputs of residual heads.
-    """
+    context: TrainingContext
+    described: GroupFeatures  # merged and refined, tensors with gradients
+    matches: Matches  # the crop's clusters
+
+
+def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> RefinedCrop:
+    """Run a crop through encoder, merger and refiner with gradients; each stage reads the results of those before."""
     example = crop.example
     context = TrainingContext(networks, example.members, example.cameras, seed)
-    encoded = encode_features(features_to_tensors(take(example.features, crop.rows)), context)
+    encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))
     matches = match_crop(crop, features_to_arrays(encoded), options, networks, seed)
     refined = refine_features(_merge(encoded, matches, context), context)
-    group_features, arrays = context.describe(refined), features_to_arrays(refined)
-    children, parents = _make_children(crop, arrays, group_features, networks)
-    corrections = as_tensor(run_heads(children, parents, group_features, context))
-    parent_ids = torch.from_numpy(parents)
-    frames, sizes = group_features.frames[parent_ids], group_features.sizes[parent_ids]
-    gaussians = move_tensors(children, corrections, frames)
-    counts = np.bincount(matches.clusters, minlength=matches.count)
-    matched = float(counts[counts > 1].sum()) / max(1, len(matches.clusters))
-    return Prediction(gaussians, parent_ids, arrays, frames, sizes, matches, matched)
+    return RefinedCrop(context, context.describe(refined), matches)
+
+
+def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
+    """Run the heads for ``k`` children of every Feature Gaussian of a crop, with gradients.
+
+    Analytic children of residual heads are pooled again from the members for K > 1, so gradients reach earlier stages
+    only through the inputs of these heads.
+    """
+    described, context = refined.described, refined.context
+    arrays = features_to_arrays(described.features)
+    children, parents = _make_children(crop, arrays, described, context, k)
+    gaussians, frames = context.correct_children(children, parents, described)
+    parent_ids, counts = torch.from_numpy(parents), np.bincount(refined.matches.clusters)
+    matched = float(counts[counts > 1].sum()) / max(1, len(refined.matches.clusters))
+    return Prediction(gaussians, parent_ids, arrays, frames, described.sizes[parent_ids], refined.matches, matched)
+
+
+def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
+    """Run a crop through all networks with gradients."""
+    return decode_crop(refine_crop(crop, networks, options, seed), crop, crop.k)
 
 
 def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext) -> FeatureGaussians:
@@ -296,16 +330,15 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 
 
 def _make_children(
-    crop: Crop, arrays: FeatureGaussians, group_features: GroupFeatures, networks: Networks
-) -> tuple[Gaussians, np.ndarray]:
+    crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
+) -> tuple[Gaussians | None, np.ndarray]:
     """Make the Gaussians that the heads correct, tensors, and the rising row ``[n]`` of the group of each."""
-    if networks.options.outputs == "residual" and crop.k == 1:
-        return group_features.base, np.arange(len(arrays))
-    children, parents = divide(arrays, crop.example.members, np.full(len(arrays), crop.k))
-    if networks.options.outputs == "residual":
-        return children.to("cpu"), parents
-    round_ones = prepare_children(children, parents, groups_to_arrays(group_features), networks.options)
-    return make_round_tensors(parents, group_features, round_ones), parents
+    if context.makes_children:
+        return None, np.repeat(np.arange(len(arrays)), k)
+    if k == 1:
+        return described.base, np.arange(len(arrays))
+    children, parents = divide(arrays, crop.example.members, np.full(len(arrays), k))
+    return children.to("cpu"), parents
 
 
 def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:

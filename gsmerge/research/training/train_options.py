@@ -14,7 +14,7 @@ from gsmerge.io.bounds import read_table
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.settings.setting import Settings, setting
-from gsmerge.settings.stages import SEGMENTATIONS, Geometry, MatchOptions, Method
+from gsmerge.settings.stages import SEGMENTATIONS, MatchOptions, Method
 
 COUNT: dict[str, Any] = {"least": 1, "most": 10**9}
 FROM_0: dict[str, Any] = {"least": 0, "most": 10**9}
@@ -47,12 +47,12 @@ class TrainOptions(Settings):
     overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
     iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)
     similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
-    geometry: Geometry = setting("analytic", "What is matched in every step: `analytic`: the moments, `decoded`: the K "
-        "= 1 head's output.")  # fmt: skip
     fit_steps: int = setting(300, "Steps of the full fit whose result is the target; fitted only where a loss uses it: "
         "`regression_weight` or `photo_start` above 0.", **COUNT)  # fmt: skip
     levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained, each needs a fit, if "
         "there is one.", choices=SLOTS, filled=True, unique=True)  # fmt: skip
+    joint: bool = setting(False, "Whether every window trains the heads of all levels, as in the paper, or that of a "
+        "level drawn at random.", "Not with a loss that uses the fit.")  # fmt: skip
     buffer: int = setting(4, "Examples in memory for each crop of a step, which draws one of them.", **COUNT)
     refresh: int = setting(4, "Steps after which the next example takes the place of the oldest of these.", **COUNT)
     workers: int = setting(1, "Threads that read examples ahead.", **COUNT)
@@ -89,11 +89,8 @@ class TrainOptions(Settings):
     teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
         "teacher_mean, teacher_cov).", **WEIGHT)  # fmt: skip
     teacher_steps: int = setting(2000, "Steps that compare renders over which it falls to 0.", **COUNT)
-    diversity_weight: float = setting(0.0, "Weight of the diversification of several children.", **WEIGHT)
-    diversity_unit: str = setting("group", "Unit of the volumes by which pairs of children are weighted: `group`: the "
-        "size of theirs, so that weights start near 1.",
-        "`scene`: the scene's median depth, which is closest to the paper's letter and leaves nothing of the loss.",
-        choices=("group", "scene"))  # fmt: skip
+    diversity_weight: float = setting(0.0, "Weight of the diversification of several children, as a share of the "
+        "photometric loss: it is at most that loss times this.", **WEIGHT)  # fmt: skip
     diversity_steps: int = setting(50_000, "Steps that compare renders over which it falls to 0.", **COUNT)
     opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity by the heads of the checkpoints.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
@@ -113,6 +110,8 @@ class TrainOptions(Settings):
             raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
         if self.random_views and self.uses_fit:
             raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
+        if self.joint and self.uses_fit:
+            raise ValueError("joint: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
 
     @property
     def uses_fit(self) -> bool:
@@ -126,7 +125,7 @@ class TrainOptions(Settings):
 
     def match_options(self) -> MatchOptions:
         """Return the options for matching Feature Gaussians across views."""
-        names = ("match", "overlap", "iou", "similarity", "geometry")
+        names = ("match", "overlap", "iou", "similarity")
         return MatchOptions(**{name: getattr(self, name) for name in names})
 
     def photo_level(self, width: int, height: int) -> float:
@@ -203,15 +202,23 @@ def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
 # for the densities, of which the fit alone needs two.
 PAPER: Mapping[str, Any] = {
-    "network": {"outputs": "absolute", "merger_start": "first"},
+    "network": {
+        "outputs": "absolute",
+        "merger_start": "first",
+        "geometry": "carried",
+        "group_numbers": False,
+        "members": 256,
+    },
     "random_views": (1, 12),
-    "densities": (0.044,),
+    "densities": (0.053,),
     "segmentation": "bass-st",
     "match": "aabb",
     "iou": 0.2,
-    "geometry": "decoded",
     "photo_side": 476,
     "levels": (1, 2, 4),
+    "joint": True,
+    "window": 476,  # whole photos
+    "most": 10**9,
     "steps": 300_000,
     "warmup": 2_000,
     "rate": 5e-5,
@@ -249,7 +256,6 @@ SHIPPED: Mapping[str, Any] = {
 PAPER_SHIPPED: Mapping[str, Any] = {
     **PAPER,
     "recolor": True,
-    "iou": 0.35,  # at 0.2 clusters that grow and Gaussians that grow feed each other at this rate
     "steps": 2_600,
     "warmup": 80,
     "rate": 1e-3,
@@ -258,8 +264,8 @@ PAPER_SHIPPED: Mapping[str, Any] = {
     "average": 0.995,
     "lpips_weight": 0.0,
     "window": 192,
-    "teacher_steps": 1_000,
-    "diversity_weight": 0.1,
+    "most": 4000,
+    "teacher_steps": 500,
     "diversity_steps": 1_000,
     "save_every": 100,
     "validation_examples": 6,

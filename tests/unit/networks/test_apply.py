@@ -11,14 +11,14 @@ from gsmerge.geometry import covariances
 from gsmerge.networks.apply import (
     NetworkContext,
     decode_gaussians,
+    decode_with_group_features,
     encode_features,
     find_neighbors,
-    match_geometry,
     refine_features,
     run_heads,
 )
 from gsmerge.networks.corrector import ANALYTIC
-from gsmerge.networks.options import NetworkOptions
+from gsmerge.networks.options import GROUP, PAPER_NUMBERS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pooling import feature_to_gaussians
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
@@ -26,6 +26,8 @@ from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_array
+
+PAPER = replace(SMALL, outputs="absolute", merger_start="first", geometry="carried", group_numbers=False)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def test_untrained_networks_change_no_bit(scene: Made) -> None:
     assert encoded.latents.shape == (len(scene.features), SMALL.latent)
     bare = replace(encoded, latents=np.zeros((len(encoded), 0), np.float32))
     assert_close(bare, scene.features)
-    assert_close(match_geometry(encoded, context), encoded)
+    assert_close(context.encode(scene.features), encoded)
     merged = merge(encoded, pairs(encoded), context)
     assert_close(merged, merge(encoded, pairs(encoded)))
     assert_close(refine(merged, context), merged)
@@ -70,12 +72,11 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
     encoded = encode_features(scene.features, context)
     assert not np.array_equal(encoded.means, scene.features.means)
     assert np.array_equal(encoded.covars, scene.features.covars)  # paper: the encoder leaves the geometry to the head
-    geometry = match_geometry(encoded, context)
     merged, plain = merge(encoded, pairs(encoded), context), merge(encoded, pairs(encoded))
     assert np.array_equal(merged.means[:2], plain.means[:2])  # alone
     refined, children = refine(merged, context), decode(merged, scene.members, DecodeOptions(k=2))
     decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), networks=context)
-    for after, before in ((geometry, encoded), (merged, plain), (refined, merged)):
+    for after, before in ((merged, plain), (refined, merged)):
         for name in ("means", "covars", "extinctions", "sh0"):
             assert not np.array_equal(getattr(after, name), getattr(before, name)), name
     assert len(decoded) >= len(children)
@@ -257,47 +258,52 @@ def test_sizes_are_checked() -> None:
 
 
 def test_absolute_heads_know_no_children(scene: Made) -> None:
-    """Whatever the children are, what is decoded is the same; untrained, a round Gaussian in the group's place."""
-    absolute = replace(SMALL, outputs="absolute")
-    plain, start = DecodeOptions(k=2, min_opacity=0.0), scene.networks(untrained(absolute))
+    """Exactly K of every group, whatever its members; untrained, round Gaussians in the group's place."""
+    plain, start = DecodeOptions(k=2, min_opacity=0.0), scene.networks(untrained(PAPER))
     encoded = encode_features(scene.features, start)
-    analytic = decode(encoded, scene.members, plain)
+    assert (np.diff(encoded.starts) == 1).any()  # groups of one member, which halving leaves whole
+    parents = np.repeat(np.arange(len(encoded)), 2)
     actual = decode(encoded, scene.members, plain, networks=start)
-    parents = np.linalg.norm(actual.means[:, None] - encoded.means, axis=2).argmin(1)
     np.testing.assert_allclose(actual.means, feature_to_gaussians(encoded).means[parents], rtol=1.3e-6, atol=1e-5)
     assert (actual.scales == actual.scales[:, :1]).all()
     assert (actual.opacities == 0.5).all()
     np.testing.assert_allclose(actual.sh0, encoded.sh0[parents], rtol=1.3e-6, atol=1e-5)
-    context = scene.networks(noisy(absolute))
+    moved = decode(encoded, scene.members, plain, networks=scene.networks(noisy(PAPER)))
+    assert not np.array_equal(moved.means[::2], moved.means[1::2])  # slots tell siblings apart
+    assert float(moved.scales.max() / actual.scales.max()) < np.exp(6.1)
+
+
+def test_the_geometry_of_the_first_head_is_carried_on(scene: Made) -> None:
+    """Scales and rotations are those of the K = 1 head from the encoder on; the means stay the encoder's."""
+    context, moments = (scene.networks(noisy(replace(PAPER, geometry=name))) for name in ("carried", "analytic"))
+    encoded, carried = moments.encode(scene.features), context.encode(scene.features)
     ones = decode(encoded, scene.members, DecodeOptions(min_opacity=0.0), networks=context)
-    geometry = match_geometry(encoded, context)
-    np.testing.assert_allclose(geometry.means, ones.means, rtol=1.3e-6, atol=1e-5)
-    np.testing.assert_allclose(geometry.covars, covariances(ones.quats, ones.scales), rtol=1e-4, atol=1e-9)
-    assert np.array_equal(geometry.latents, encoded.latents)
-    rows = np.repeat(np.arange(len(encoded)), 2)
-    both = analytic[: 2 * len(encoded)] if len(analytic) >= 2 * len(encoded) else None
-    for start in (feature_to_gaussians(encoded)[rows], both):
-        if start is not None:
-            moved = decode_gaussians(start, rows, encoded, context)
-            assert not np.array_equal(moved.means[::2], moved.means[1::2])  # slots tell siblings apart
-            assert float(moved.scales.max() / actual.scales.max()) < np.exp(6.1)
+    np.testing.assert_allclose(carried.covars, covariances(ones.quats, ones.scales), rtol=1e-4, atol=1e-9)
+    assert not np.allclose(carried.covars, encoded.covars, rtol=0.1)
+    assert_close(replace(carried, covars=encoded.covars), encoded)
+    for stage in (lambda f, c: merge(f, pairs(f), c), lambda f, c: c.refine(f)):
+        assert not np.array_equal(stage(carried, context).latents, stage(encoded, context).latents)
+    assert not np.allclose(
+        context.describe(carried).sizes, context.describe(encoded).sizes, rtol=1e-3
+    )  # what heads read
 
 
-def test_absolute_heads_leave_alone_what_no_head_looks_at(scene: Made) -> None:
-    context = scene.networks(noisy(replace(SMALL, outputs="absolute")))
-    features = encode_features(scene.features, context)
-    options = DecodeOptions(k=6, min_opacity=0.0)
-    plain, actual = decode(features, scene.members, options), decode(features, scene.members, options, networks=context)
-    sizes = np.bincount(parents_of(features, scene, 6), minlength=len(features))
-    whole = np.repeat(sizes > 4, sizes)
-    assert whole.any()
-    assert_close(actual[whole], plain[whole])
-    assert not np.array_equal(actual.means[~whole], plain.means[~whole])
-
-
-def parents_of(features: FeatureGaussians, scene: Made, k: int) -> np.ndarray:
-    """The Feature Gaussian of each child."""
-    return divide(features, scene.members, np.full(len(features), k))[1]
+def test_heads_of_the_paper_read_latent_mass_and_base_colour_alone(scene: Made) -> None:
+    context = scene.networks(noisy(PAPER))
+    features = context.encode(scene.features)
+    described = context.describe(features)
+    parents, changed = np.arange(len(features)), described.group.copy()
+    changed[:, [i for i in range(GROUP) if i not in PAPER_NUMBERS]] += 1
+    before, after = (
+        decode_with_group_features(described.base, parents, replace(described, group=group), context)
+        for group in (described.group, changed)
+    )
+    assert_close(before, after)
+    for column in PAPER_NUMBERS:
+        changed = described.group.copy()
+        changed[:, column] += 1
+        other = decode_with_group_features(described.base, parents, replace(described, group=changed), context)
+        assert not np.array_equal(other.scales, before.scales)
 
 
 @pytest.mark.parametrize("name", ["encoder", "merger", "refiner"])

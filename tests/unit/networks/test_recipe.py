@@ -10,15 +10,22 @@ import pytest
 import scenes
 from messages import refuses
 from network_fixtures import noisy, untrained, written
+from unaligned_scenes import shuffled
 
-from gsmerge import Scene
+from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.assign import find_owners
+from gsmerge.stages.superpixels import segment
 from gsmerge.states.extend import extend
 
-SMALL = NetworkOptions(width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute")
+SMALL = NetworkOptions(
+    width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute", merger_start="first", geometry="carried",
+    group_numbers=False,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +40,9 @@ def absolute(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_recipe_is_its_settings(scene: Scene, absolute: Path) -> None:
-    actual = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute))
-    settings = {"segmentation": "bass-st", "match": "aabb", "geometry": "decoded", "fit": "none"}
-    expected = scenes.compacted(scene, **settings, checkpoint=str(absolute))
+    actual = compact(scene, recipe="paper", checkpoint=str(absolute))
+    settings = {"segmentation": "bass-st", "superpixels": "5.3%", "match": "aabb", "fit": "none", "min_contribution": 0}
+    expected = compact(scene, **settings, checkpoint=str(absolute))
     assert np.array_equal(actual.gaussians.means, expected.gaussians.means)
     assert actual.report.options["recipe"] == "paper"
     assert actual.report.choices["networks"]["options"]["outputs"] == "absolute"
@@ -50,15 +57,22 @@ def test_what_is_set_besides_goes_before() -> None:
     assert options.with_settings({"k": 2}).match.match == "none"
 
 
-def test_decoded_geometry_decides_what_is_merged(scene: Scene, absolute: Path) -> None:
-    """Also with absolute outputs, whose heads do not read the moments."""
-    counts = {
-        geometry: scenes.compacted(
-            scene, recipe="paper", checkpoint=str(absolute), geometry=geometry, similarity=-1.0
-        ).report.choices["clusters"]
-        for geometry in ("analytic", "decoded")
-    }
-    assert counts["analytic"] != counts["decoded"]
+@pytest.mark.parametrize("k", [1, 2, 3, 4])
+def test_every_group_has_k_children(scene: Scene, absolute: Path, k: int) -> None:
+    """Also groups of fewer members, and nothing is left out but by opacity."""
+    result = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=k, superpixels="20%", min_opacity=0.0)
+    assert len(result.gaussians) == k * result.report.choices["clusters"]
+
+
+def test_gaussians_without_pixels_go_to_superpixels_by_blending_weight(absolute: Path) -> None:
+    """All of them in one superpixel are one group; those that no view draws are left out."""
+    scene = shuffled(scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01))
+    groups = segment(scene.images, SegmentOptions(superpixels=40, segmentation="bass-st"))
+    owners = find_owners(scene, groups)
+    assert (owners.labels < 0).any()  # negligible: drawn nowhere
+    result = compact(scene, recipe="paper", checkpoint=str(absolute), superpixels=40, match="none", min_opacity=0.0)
+    filled = np.unique(np.stack([owners.views, owners.labels])[:, owners.labels >= 0], axis=1).shape[1]
+    assert len(result.gaussians) == filled
 
 
 @pytest.mark.parametrize("checkpoint", ["auto", "none"])

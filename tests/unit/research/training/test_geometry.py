@@ -15,7 +15,7 @@ from training_runs import PAPER, TINY, noisy_networks, torch
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
-from gsmerge.networks.options import FEATURE
+from gsmerge.networks.options import FEATURE, NetworkOptions
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.pooling import feature_to_gaussians
 from gsmerge.research.training import Example, make_example, make_training_scene
@@ -115,7 +115,7 @@ def test_axes_turn_with_their_covariance() -> None:
 def example() -> Example:
     """Two views in which every cluster is known, so that no step changes a choice."""
     whole = make_example(make_training_scene(make_scene(room(), arc(2, 24, 18)), range(2)), PAPER, 0.1, "room")
-    matches = match_crop(whole_photo(whole, 0).crop, whole.features, replace(PAPER, geometry="analytic"))
+    matches = match_crop(whole_photo(whole, 0).crop, whole.features, PAPER)
     assert matches.count < len(whole.features)
     return replace(whole, matches=matches)
 
@@ -148,12 +148,11 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("fixed_choices")
-@sweep(("outputs", "start"), [("absolute", "first"), ("residual", "pooled")])
+@sweep("network", [PAPER.network, TINY])
 @sweep("k", [1, 2, 4])
-def test_gradients_are_central_differences(example: Example, outputs: str, start: str, k: int) -> None:
+def test_gradients_are_central_differences(example: Example, network: NetworkOptions, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
-    options = replace(TINY, outputs=outputs, merger_start=start)
-    networks = noisy_networks(options, scale=0.15).requires_grad_(True)
+    networks = noisy_networks(network, scale=0.15).requires_grad_(True)
     crop = whole_photo(example, 0, k).crop
     rows = {"encoder.shift": {"shift": slice(0, 3)}, "encoder.latent": {"latent": slice(0, TINY.latent)}}
     rows |= {"merger.out": OF_FEATURES, "refiner.out": OF_FEATURES, f"heads.{k}.out": COLUMNS}

@@ -14,6 +14,7 @@ from training_runs import PAPER, TINY, noisy_networks, torch, written
 from gsmerge.geometry import rotmat_to_quat
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.tensors import quat_to_rotmat
+from gsmerge.pooling import MAX_OPACITY, pool_members
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
@@ -21,7 +22,7 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, match_crop, predict
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.stages.merge import merge
-from gsmerge.types import Gaussians, Matches
+from gsmerge.types import SH_C0, Gaussians, Matches
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -133,11 +134,12 @@ def teacher_of(example: Example) -> Prediction:
     """The Gaussians of the paper's two equations, by hand, for a whole example."""
     crop, m = whole_photo(example, 0).crop, example.members
     merged = merge(example.features, match_crop(crop, example.features, PAPER))
-    means, covars = [], []
+    means, covars, colors = [], [], []
     for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
         ids = merged.members[first:last]
         weights, points = m.opacities[ids].astype(float)[:, None], m.means[ids].astype(float)
         means.append((weights * points).sum(0) / weights.sum())  # eq. teacher_mean
+        colors.append((weights * m.sh0[ids, 0]).sum(0) / weights.sum())
         offsets = points - means[-1]
         covars.append((weights * offsets).T @ offsets / weights.sum())  # eq. teacher_cov
     floor = (0.1 * merged.footprints.astype(float))[:, None, None] ** 2 * np.eye(3)  # one pixel has no spread
@@ -145,9 +147,13 @@ def teacher_of(example: Example) -> Prediction:
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]
     count = len(merged)
     columns = np.stack(means), rotmat_to_quat(axes), np.sqrt(values)
+    depths = (pool_members(m, merged.starts, merged.members, "paper").extinctions) / (
+        columns[2][:, 1] * columns[2][:, 2]
+    )
     gaussians = Gaussians(
         *(torch.from_numpy(column).float() for column in columns),
-        torch.full((count,), 0.5), torch.zeros(count, 1, 3), torch.zeros(count, 0, 3),
+        torch.from_numpy(1 - np.exp(-depths)).float().clamp(0, MAX_OPACITY),
+        torch.from_numpy(np.stack(colors)).float()[:, None], torch.zeros(count, 0, 3),
     )  # fmt: skip
     frames, sizes = torch.eye(3).expand(count, 3, 3), torch.ones(count)
     return Prediction(gaussians, torch.arange(count), merged, frames, sizes, Matches(np.arange(count), count), 0.0)
@@ -158,6 +164,10 @@ def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
     assert int((exact.merged.views < 0).sum()) > 0  # clusters too
     assert float(teacher_loss(exact, example.members)) < 0.02  # rounding of nearly round ones
     g = exact.gaussians
+    fainter = replace(exact, gaussians=replace(g, opacities=g.opacities - 0.1))
+    assert float(teacher_loss(fainter, example.members)) == pytest.approx(0.1, abs=0.02)
+    lighter = replace(exact, gaussians=replace(g, sh0=g.sh0 + 0.2 / SH_C0))
+    assert float(teacher_loss(lighter, example.members)) == pytest.approx(0.2, abs=0.02)
     wider = replace(exact, gaussians=replace(g, scales=g.scales * 2))
     difference = float(teacher_loss(wider, example.members)) - float(teacher_loss(exact, example.members))
     assert difference == pytest.approx(np.log(2), abs=1e-3)

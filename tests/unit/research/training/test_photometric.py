@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scenes import arc, make_scene, room
 from scipy.ndimage import uniform_filter
-from training_runs import OPTIONS, TINY, noisy_networks, torch, written
+from training_runs import OPTIONS, PAPER, TINY, noisy_networks, torch, written
 
 from gsmerge.errors import GsmergeError
 from gsmerge.measure.lpips import lpips, lpips_available
-from gsmerge.networks.apply import NetworkContext, encode_features, refine_features
+from gsmerge.networks.apply import NetworkContext, refine_features
+from gsmerge.networks.options import NetworkOptions
 from gsmerge.raster import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.examples import recolor
-from gsmerge.research.training.loop import is_best
+from gsmerge.research.training.loop import gradient_share, is_best
 from gsmerge.research.training.losses import (
     color_loss,
     diversity_loss,
@@ -215,8 +216,8 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
 
     The mean squared error has no kink, and a step in a random direction moves all weights of a layer at once.
     """
-    weights = {"regression_weight": 0.3, "teacher_weight": 0.1, "diversity_weight": 0.2}
-    options = replace(PHOTO, photo_loss="mse", diversity_unit="scene", **weights)  # whose weights have a gradient, too
+    weights = {"regression_weight": 0.3, "teacher_weight": 0.1}
+    options = replace(PHOTO, photo_loss="mse", **weights)
     networks = noisy_networks(TINY).requires_grad_(True)
     scales = target_scales([example.targets])
     generator = torch.Generator().manual_seed(1)
@@ -251,12 +252,12 @@ def test_untrained_networks_render_what_the_analytic_stages_do(example: Example)
         assert window_psnr(window, plain) > 10
 
 
-@pytest.mark.parametrize("outputs", ["residual", "absolute"])
+@pytest.mark.parametrize("network", [TINY, PAPER.network], ids=["ours", "paper"])
 @pytest.mark.parametrize("k", [1, 2])
-def test_what_is_rendered_is_what_the_stages_make(example: Example, outputs: str, k: int) -> None:
-    networks = noisy_networks(replace(TINY, outputs=outputs))
+def test_what_is_rendered_is_what_the_stages_make(example: Example, network: NetworkOptions, k: int) -> None:
+    networks = noisy_networks(network)
     learned = NetworkContext(networks, example.members, example.cameras, 0)
-    merged = merge(encode_features(example.features, learned), example.matches, learned)
+    merged = merge(learned.encode(example.features), example.matches, learned)
     options = DecodeOptions(k=k, min_opacity=0)
     expected = decode(refine_features(merged, learned), example.members, options, networks=learned)
     with torch.no_grad():
@@ -286,26 +287,37 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     together = torch.zeros(2, dtype=torch.int64)
     overlap = 0.125
     attraction = 0.5 * ((0.5 - overlap) / 0.5) ** 3
-    weight = (1 * 0.5**3) ** 0.5  # the root of both volumes, as printed
-    expected_loss = weight * (0.75 * attraction + 0.25 * 0.16)
-    assert float(diversity_loss(pair, together, torch.ones(2), 1.0)) == pytest.approx(expected_loss, rel=1e-5)
+    near = 0.75 * attraction + 0.25 * 0.16
+    assert float(diversity_loss(pair, together, torch.ones(2))) == pytest.approx(near, rel=1e-5)
     assert float(diversity_loss(pair, torch.arange(2), torch.ones(2))) == 0
+    both = boxes([[0.0, 0, 0], [0, 0, 0], [9.0, 0, 0], [9.0, 0, 0]], [1.0, 0.5, 1.0, 1.0], [0.2, 0.6, 0.5, 0.5])
+    weight = (1 * 0.5**3) ** 0.5  # the root of both volumes, as printed; the other pair has 1, and overlaps in full
+    expected_loss = (weight * near + 0.75) / (weight + 1)
+    parents = torch.tensor([0, 0, 1, 1])
+    assert float(diversity_loss(both, parents, torch.ones(4))) == pytest.approx(expected_loss, rel=1e-5)
 
 
-@pytest.mark.parametrize("unit", [None, 2.0])
-def test_diversification_does_not_depend_on_the_unit_of_the_world(unit: float | None) -> None:
+def test_diversification_does_not_depend_on_the_unit_of_the_world() -> None:
     parents, sizes = torch.tensor([0, 0, 1, 1]), torch.tensor([2.0, 2.0, 0.2, 0.2])
     gaussians = boxes([[0.0, 0, 0], [0.2, 0, 0], [9.0, 0, 0], [9.1, 0, 0]], [1.0, 1.0, 0.1, 0.1], [0.5] * 4)
-    loss = float(diversity_loss(gaussians, parents, sizes, unit))
+    loss = float(diversity_loss(gaussians, parents, sizes))
     larger = replace(gaussians, means=gaussians.means * 5, scales=gaussians.scales * 5)
-    assert float(diversity_loss(larger, parents, sizes * 5, unit and unit * 5)) == pytest.approx(loss, rel=1e-4)
+    assert float(diversity_loss(larger, parents, sizes * 5)) == pytest.approx(loss, rel=1e-4)
 
 
-def test_small_groups_count_as_much_as_large_ones() -> None:
-    """In the sizes of their groups; in the scene's unit only large ones do."""
-    parents, small = torch.tensor([0, 0]), boxes([[0.0, 0, 0], [0, 0, 0]], [0.01, 0.01], [0.5, 0.5])
-    assert float(diversity_loss(small, parents, torch.full((2,), 0.01))) == pytest.approx(0.75)
-    assert float(diversity_loss(small, parents, torch.full((2,), 0.01), 1.0)) == pytest.approx(0.75e-6)
+def test_diversification_is_a_share_of_the_photometric_loss(example: Example) -> None:
+    """Twice the loss of colours, twice that of siblings; of its gradient a share between 0 and 1 is told."""
+    networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
+    window = whole_photo(example, 0, 2)
+    options = replace(PHOTO, photo_loss="mse", ssim_weight=0.0, regression_weight=0.0, diversity_weight=0.5)
+    parts = []
+    for weight in (1.0, 2.0):
+        loss = window_loss(networks, window, {}, replace(options, photo_weight=weight), 0, np.random.default_rng(0))
+        total, apart = float(loss.total.detach()), float(loss.diversity.detach())
+        parts.append(apart)
+        assert 0 < apart <= 0.5 * (total - apart) + 1e-9
+    assert parts[1] == pytest.approx(2 * parts[0], rel=1e-5)
+    assert gradient_share(torch.tensor([3.0, 4.0]), torch.tensor([3.0, 0.0])) == pytest.approx(3 / 7)
 
 
 def test_renders_change_colours_as_photos_do(example: Example) -> None:

@@ -233,9 +233,9 @@ def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
     assert preset_options("default") == TrainOptions()
     config.write_text(json.dumps({"steps": 10, "network": {"width": 16, "bounds": {"mean": 0.5}}}))
-    network = NetworkOptions(width=16, outputs="absolute", merger_start="first", bounds=Bounds(mean=0.5))
+    network = replace(paper.network, width=16, bounds=Bounds(mean=0.5))
     assert read_config(config, paper) == replace(paper, steps=10, network=network)
-    ours = replace(network, outputs="residual", merger_start="pooled")
+    ours = NetworkOptions(width=16, bounds=Bounds(mean=0.5))
     assert read_config(config) == replace(TrainOptions(), steps=10, network=ours)
     assert not paper.uses_fit
     assert paper.photo_level(952, 100) == 2
