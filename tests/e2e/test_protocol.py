@@ -58,3 +58,20 @@ def test_a_benchmark_is_repeated(
     assert float(rows["gsmerge"]) > float(rows["input"]) > 15
     with pytest.raises(SystemExit):
         protocol.main([*words, "--scenes", "cellar"])
+
+
+def test_without_a_list_the_paper_s_rule_makes_one(
+    protocol: ModuleType, made_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, exports = tmp_path / "data", tmp_path / "exports"
+    entry = write_data(made_scene, data / "room")
+    protocol.main([str(data), "--views", "5"])
+    assert json.loads(capsys.readouterr().out) == {"room": entry}
+    protocol.main([str(data), "--views", "9"])  # as many as there are, which leaves none to look at
+    assert json.loads(capsys.readouterr().out) == {}
+    shutil.copytree(made_scene, exports / "room")
+    protocol.main([str(data), str(exports), "--views", "5", "--set", "effort=draft", "superpixels=200"])
+    assert "1 of 1 scenes" in capsys.readouterr().out
+    for words in ([str(data)], [str(data), str(exports)], [str(data), str(exports), "x.json", "--views", "5"]):
+        with pytest.raises(SystemExit):
+            protocol.main(words)
