@@ -1,8 +1,9 @@
 """A published benchmark on this machine: view lists, folders that people have, and the exports of a model.
 
-python benchmarks/protocol.py DL3DV EXPORTS ctx_6v.json --published dl3dv-6 --size 252x252 --lpips
+python benchmarks/protocol.py DL3DV EXPORTS ctx_6v_tgt_8v.json --published dl3dv-6 --size 252x252 --lpips
+python benchmarks/protocol.py RE10K/test EXPORTS ctx_6v_tgt_8v.json --published re10k-6 --size 252x252 --lpips
 python benchmarks/protocol.py 360_v2 EXPORTS ctx_32v.json --published mipnerf360-32 --set budget=auto
-python benchmarks/protocol.py DL3DV --views 6 > ctx_6v.json
+python benchmarks/protocol.py DL3DV --views 6 > views.json
 python benchmarks/protocol.py DL3DV EXPORTS --views 6
 
 DATA is what gsmerge.research.captures reads: a folder for each scene with its cameras and photos (DL3DV, Mip-NeRF 360),
