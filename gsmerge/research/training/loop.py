@@ -200,8 +200,9 @@ def train(
     processes.require_even(options.crops)
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    sources, apart = (bind_backbone(part, backbone, options) for part in (shards, validation))
-    chosen = apart or sources
+    bound = bind_backbone([*shards, *validation], backbone, options)
+    sources = bound[: len(shards)]
+    chosen = bound[len(shards) :] or sources
     chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
         targets = (read_targets(shard) for shard in sources if isinstance(shard, Shard)) if options.uses_fit else ()
