@@ -1,12 +1,16 @@
 """A published benchmark on this machine: view lists, folders that people have, and the exports of a model.
 
-python benchmarks/protocol.py DL3DV EXPORTS ctx_6v.json --published dl3dv-6 --size 252x252 --lpips
+python benchmarks/protocol.py DL3DV EXPORTS ctx_6v_tgt_8v.json --published dl3dv-6 --size 252x252 --lpips
+python benchmarks/protocol.py RE10K/test EXPORTS ctx_6v_tgt_8v.json --published re10k-6 --size 252x252 --lpips
 python benchmarks/protocol.py 360_v2 EXPORTS ctx_32v.json --published mipnerf360-32 --set budget=auto
+python benchmarks/protocol.py DL3DV --views 6 > views.json
+python benchmarks/protocol.py DL3DV EXPORTS --views 6
 
-DATA has a folder for each scene with its cameras and photos (DL3DV: transforms.json, also below nerfstudio/; Mip-NeRF
-360: sparse/0 and images/ or images_4/), or is one of pixelSplat's, with index.json and .torch chunks (RE10K). EXPORTS
-has a folder of that name with what the model wrote from the context views. The list is that of pixelSplat and ZipSplat:
-for each scene "context" and "target", positions of the views in the order of their names, in chunks in their own order.
+DATA is what gsmerge.research.captures reads: a folder for each scene with its cameras and photos (DL3DV, Mip-NeRF 360),
+or index.json and .torch chunks (RE10K, ACID). EXPORTS has a folder for each scene, of its name, with what the model
+wrote from the context views. The list is that of pixelSplat and ZipSplat: for each scene "context" and "target",
+positions of the views in the order of their names, in chunks in their own order. --views N is the list of the paper:
+N views at equal intervals, targets midway between them; without EXPORTS it is printed, for the model to be run on.
 Exports may be in a world of their own: the context cameras say how it lies to the data's.
 """
 
@@ -25,19 +29,15 @@ import numpy as np
 from quality import setting
 
 import gsmerge
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
-from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.facts.views import context_views
+from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.measure.evaluate import Quality
-from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
+from gsmerge.research.captures import Capture, find_capture, list_captures
 from gsmerge.scene.held_out import fit_similarity
 from gsmerge.scene.read import Loaded, load_scene
-from gsmerge.scene.views import stored_photos
 from gsmerge.types import Cameras, Views
 
 Entry = dict[str, list[int]]  # "context" and "target" of a scene
-CAMERAS = ("transforms.json", "nerfstudio/transforms.json", "sparse/0", "colmap/sparse/0", "cameras.json")
-PHOTOS = ("images_4", "images_8", "images_2", *IMAGE_PLACES)  # smaller ones first: models look at less
 # PSNR / SSIM / LPIPS of methods without poses, as ZipSplat measured them; the PSNR of EcoSplat is its own
 METHODS = "ZipSplat", "DA3", "YoNoSplat"
 PUBLISHED: dict[str, tuple[str, ...]] = {
@@ -52,32 +52,19 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
 ECOSPLAT = {"re10k-24": "24.7"}  # at 5 % of the pixels
 
 
-@dataclass(frozen=True)
-class Source:
-    """Cameras of a scene of the data, in the order of the list, and where its photos are."""
-
-    cameras: CameraFile
-    path: Path
-    photos: Path | None
+def read_lists(path: Path) -> dict[str, Entry]:
+    """The entries of a published list; scenes that it leaves out are null there."""
+    return {name: entry for name, entry in json.loads(path.read_text()).items() if entry}
 
 
-def find_source(data: Path, scene: str) -> Source:
-    """Find the cameras and photos of a scene; SystemExit says where they were expected."""
-    index = data / "index.json"
-    if index.is_file():
-        chunk = data / json.loads(index.read_text())[scene]
-        return Source(read_cameras(chunk, scene=scene), chunk, chunk)
-    folder = data / scene
-    path = next((folder / name for name in CAMERAS if (folder / name).exists()), None)
-    if path is None:
-        raise SystemExit(f"{folder}: expected {', '.join(CAMERAS)}, or {index.name} and chunks in {data}")
-    cameras = read_cameras(path)
-    order = np.argsort(np.array(cameras.names), kind="stable").tolist()
-    photos = next((root / name for root in (folder, path.parent) for name in PHOTOS if (root / name).is_dir()), None)
-    return Source(select_views(cameras, order), path, photos)
+def make_lists(captures: Sequence[Capture], count: int) -> dict[str, Entry]:
+    """The entries of captures by the paper's rule, where they leave views for targets."""
+    sizes = {capture.name: len(capture.read_cameras()) for capture in captures}
+    views = {name: context_views(size, count) for name, size in sizes.items() if size > count > 1}
+    return {name: {"context": context, "target": targets} for name, (context, targets) in views.items()}
 
 
-def read_targets(load: Loaded, source: Source, entry: Entry, size: tuple[int, int] | None) -> Views:
+def read_targets(load: Loaded, capture: Capture, entry: Entry, size: tuple[int, int] | None) -> Views:
     """Read the target views of a list's entry in the world of a scene's Gaussians, cropped to ``size`` (w, h) if given.
 
     The scene has one view for each of the entry's context, in the order of their names.
@@ -85,15 +72,10 @@ def read_targets(load: Loaded, source: Source, entry: Entry, size: tuple[int, in
     context, views = sorted(entry["context"]), np.argsort(np.array(load.scene.names), kind="stable")
     if len(views) != len(context):
         raise SystemExit(f"{load.files.ply}: expected {len(context)} views, as the list has, found {len(views)}")
-    ours = load.scene.cameras.viewmats[views].astype(np.float64)
-    world = fit_similarity(source.cameras.viewmats[context].astype(np.float64), ours)
-    chosen = select_views(source.cameras, entry["target"])
-    chosen = replace(chosen, viewmats=world.move_viewmats(chosen.viewmats))
-    photos = stored_photos(SceneFiles(load.files.ply, source.path, source.photos), chosen)
-    pinholes, photos, _ = as_pinholes(chosen, photos)
-    if not len(photos):
-        raise SystemExit(f"{source.path}: no photo found for {chosen.names[0]}")
-    read = Views(to_cameras(pinholes, photo_size(photos)), as_floats(photos), chosen.names)
+    ours, cameras = load.scene.cameras.viewmats[views].astype(np.float64), capture.read_cameras()
+    world = fit_similarity(cameras.viewmats[context].astype(np.float64), ours)
+    chosen = select_views(cameras, entry["target"])
+    read = capture.read_views(replace(chosen, viewmats=world.move_viewmats(chosen.viewmats)))
     return read if size is None else crop_views(read, size)
 
 
@@ -122,12 +104,10 @@ class Row:
     seen: Quality
 
 
-def measure_scene(
-    folder: Path, source: Source, entry: dict[str, list[int]], args: argparse.Namespace
-) -> dict[str, Row]:
+def measure_scene(folder: Path, capture: Capture, entry: Entry, args: argparse.Namespace) -> dict[str, Row]:
     """Compact a model's export and measure it, and the export itself, on the held-out views of a list's entry."""
     load = load_scene(folder)
-    targets = read_targets(load, source, entry, args.size)
+    targets = read_targets(load, capture, entry, args.size)
     start = time.perf_counter()
     result = gsmerge.compact(load.scene, **dict(args.set))
     seconds = time.perf_counter() - start
@@ -180,8 +160,9 @@ def parse_size(text: str) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("exports", type=Path)
-    parser.add_argument("views", type=Path, help="list of context and target views")
+    parser.add_argument("exports", type=Path, nargs="?", help="without it, the list of --views is printed")
+    parser.add_argument("list", type=Path, nargs="?", help="published list of context and target views")
+    parser.add_argument("--views", type=int, metavar="N", help="in place of a list: N views at equal intervals")
     parser.add_argument(
         "--published", choices=[*PUBLISHED, *ECOSPLAT], help="print published figures of this benchmark as well"
     )
@@ -192,24 +173,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, as the published figures have it")
     args = parser.parse_args(arguments)
-    entries = {name: entry for name, entry in json.loads(args.views.read_text()).items() if entry}
+    if (args.list is None) == (args.views is None):
+        parser.error("expected either a list or --views")
+    if args.exports is None:
+        print(json.dumps(make_lists(list_captures(args.data), args.views)))
+        return
+    source = args.list or args.data
+    known = [] if args.list else [one for one in list_captures(args.data) if (args.exports / one.name).exists()]
+    entries = read_lists(args.list) if args.list else make_lists(known, args.views)
     if unknown := set(args.scenes or ()) - entries.keys():
-        parser.error(f"--scenes: {args.views} has no {', '.join(sorted(unknown))}")
+        parser.error(f"--scenes: {source} has no {', '.join(sorted(unknown))}")
     measured: dict[str, list[Row]] = {}
     for name in args.scenes or entries:
         if not (args.exports / name).exists():
             print(f"{name}: no export, left out", flush=True)
             continue
-        rows = measure_scene(args.exports / name, find_source(args.data, name), entries[name], args)
+        rows = measure_scene(args.exports / name, find_capture(args.data, name), entries[name], args)
         for method, row in rows.items():
             measured.setdefault(method, []).append(row)
         print(f"{name}: " + ", ".join(f"{method} {row.full.psnr:.2f} dB" for method, row in rows.items()), flush=True)
     if not measured:
-        raise SystemExit(f"{args.exports}: expected exports named as the scenes of {args.views}, found none")
+        raise SystemExit(f"{args.exports}: expected exports named as the scenes of {source}, found none")
     means = {method: mean_row(rows) for method, rows in measured.items()}
     print(f"\n{len(measured['gsmerge'])} of {len(entries)} scenes\n")
     print("\n".join(table(means, args.published)))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except gsmerge.GsmergeError as error:
+        raise SystemExit(str(error)) from error

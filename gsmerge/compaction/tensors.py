@@ -125,11 +125,11 @@ def compact_tensors(
         "sh0": _read_base(sh0, colors),
     }
     columns["shN"] = _read_harmonics(shN, len(columns["means"]))
-    gaussians, valid, notes = _make_gaussians(columns)
+    gaussians, valid, notes = make_gaussians(columns)
     cameras, photos = NO_CAMERAS, None
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _read_views(viewmats, Ks, images, shape)
-    scene, more = _make_scene(gaussians, valid, cameras, photos, names, order)
+    scene, more = make_scene(gaussians, valid, cameras, photos, names, order)
     if scene.aligned and check_rotations:
         _check_rotations(scene)
     more += _rotation_notes(scene, check_rotations=check_rotations)
@@ -138,7 +138,7 @@ def compact_tensors(
     return result.to(means.device if hasattr(means, "detach") else None)
 
 
-def _make_scene(
+def make_scene(
     gaussians: Gaussians,
     valid: np.ndarray,
     cameras: Cameras,
@@ -184,8 +184,8 @@ def _rows(name: str, values: Any, *tail: int) -> np.ndarray:
     return array.copy() if name == "means" and array.dtype == np.float64 else to_float32(array)
 
 
-def _make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Make Gaussians from columns; rows that are not finite become transparent.
+def make_gaussians(out: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
+    """Make Gaussians from columns, which are changed in place; rows that are not finite become transparent.
 
     Returns the Gaussians, a mask of the finite rows, and notes.
     """

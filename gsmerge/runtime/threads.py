@@ -35,7 +35,7 @@ class _Pool:
             thread.start()
 
     def _run(self) -> None:
-        _local.inside = True
+        work_alone()
         while (work := self.work.get()) is not None:
             work()
             del work  # it would keep what it worked on until the next one comes
@@ -72,6 +72,11 @@ _local, _libraries = _Local(), _Libraries()
 def available_threads() -> int:
     """Return the number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def work_alone() -> None:
+    """Let :func:`parallel_map` on the calling thread compute items one by one, as on the pool's own threads."""
+    _local.inside = True
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Training of the networks on renders compared with photos, and on the corrections that the full fit makes."""
 
+from gsmerge.research.training.backbones import Backbone
 from gsmerge.research.training.examples import Example, make_example
 from gsmerge.research.training.loop import TrainResult, choose_device, train
 from gsmerge.research.training.processes import Processes, join_processes
@@ -8,6 +9,7 @@ from gsmerge.research.training.shards import Shard, prepare_shards, read_shard, 
 from gsmerge.research.training.train_options import TrainOptions, preset_options, read_config
 
 __all__ = [
+    "Backbone",
     "Example",
     "Processes",
     "Shard",

@@ -76,6 +76,7 @@ class Example:
     matches: Matches | None  # the clusters that were fitted; None: matched in every step
     targets: Mapping[int, Targets]  # of the fit, by number of children K; empty without a fit
     colors: ColorMap = ColorMap()  # of the photos, whose bytes stay as they are
+    drawn: bool = False  # whether its views are a random subset already, predicted from them alone
 
     def mask(self, photo: int) -> np.ndarray:
         """Return a mask ``[h,w]`` of a photo's pixels that the views cover."""
@@ -175,11 +176,16 @@ def select_views(example: Example, ids: Sequence[int]) -> Example:
 
 def draw_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
     """Draw a random subset of an example's views, as ``options.random_views`` says (paper supplement C)."""
-    if not options.random_views:
+    if example.drawn or not options.random_views:
         return example
-    least, most = (min(count, len(example.cameras)) for count in options.random_views)
+    return select_views(example, draw_ids(len(example.cameras), options, rng))
+
+
+def draw_ids(num_views: int, options: TrainOptions, rng: np.random.Generator) -> list[int]:
+    """Draw the ascending ids of a random subset of views, as many as ``options.random_views`` says."""
+    least, most = (min(count, num_views) for count in options.random_views)
     count = int(rng.integers(least, most + 1))
-    return select_views(example, sorted(rng.choice(len(example.cameras), count, replace=False).tolist()))
+    return sorted(rng.choice(num_views, count, replace=False).tolist())
 
 
 def recolor(example: Example, rng: np.random.Generator) -> Example:

@@ -30,6 +30,8 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
+from gsmerge.research.captures import Capture
+from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import (
     WindowLoss,
@@ -43,7 +45,7 @@ from gsmerge.research.training.losses import (
 from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.predict import predict
 from gsmerge.research.training.processes import ALONE, Processes
-from gsmerge.research.training.shards import ExampleStreams, Shard, open_streams, read_shard, read_targets
+from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example, read_targets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop, Window, sample_crop, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -68,7 +70,7 @@ class TrainingRun:
     processes: Processes
 
 
-def validate(networks: Networks, shards: Sequence[Shard], run: TrainingRun, out: Path) -> Row:
+def validate(networks: Networks, shards: Sequence[Source], run: TrainingRun, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
     If a loss uses the fit, also measure the loss of corrections, and the explained share of the squared targets for
@@ -90,10 +92,11 @@ def validate(networks: Networks, shards: Sequence[Shard], run: TrainingRun, out:
     return {"validation_loss": float(np.mean(losses)), **row, **shares}
 
 
-def _score(networks: Networks, shards: Sequence[Shard], number: int, run: TrainingRun, out: Path) -> Scores:
+def _score(networks: Networks, shards: Sequence[Source], number: int, run: TrainingRun, out: Path) -> Scores:
     """Score one of the shards, and write its picture if it is the first of its scene."""
     options = run.options
-    example, rng = read_shard(shards[number]), np.random.default_rng([options.seed, VALIDATION, number])
+    rng = np.random.default_rng([options.seed, VALIDATION, number])
+    example = read_example(shards[number], options, rng)
     windows = [
         sample_window(draw_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
         for _ in range(options.validation_windows)
@@ -157,11 +160,12 @@ class TrainResult:
 
 
 def train(
-    shards: Sequence[Shard],
-    validation: Sequence[Shard],
+    shards: Sequence[Shard | Capture],
+    validation: Sequence[Shard | Capture],
     out: Path,
     options: TrainOptions | None = None,
     *,
+    backbone: Backbone | None = None,
     threads: int | None = None,
     device: str = "cpu",
     processes: Processes = ALONE,
@@ -170,11 +174,14 @@ def train(
     """Train networks, or continue the run in the folder.
 
     Args:
-        shards: Examples to learn from, at least one.
+        shards: Examples to learn from, at least one, or captures, whose examples are drawn and predicted as needed.
         validation: Examples that choose the best checkpoint; empty: other windows of the first ones.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv``, ``state.safetensors`` and a picture
             of each validation scene.
         options: Settings.
+        backbone: Predicts the Gaussians of captures: called with photos ``[v,h,w,3]``, sRGB in [0, 1], at most
+            ``photo_side`` pixels wide or high, and their cameras; returns ``v·h·w`` Gaussians, view by view, in the
+            cameras' world. What it returns must depend on these alone, or a run cannot be repeated.
         threads: Threads to use; None: all processors. The result does not depend on it.
         device: Where the networks run, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
             repeats up to rounding, not to the bit.
@@ -182,8 +189,8 @@ def train(
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, the crops of a step cannot be shared evenly, or torch finds no CUDA
-            device and ``device`` asks for it.
+        ValueError: If there are no examples, captures have no backbone or a loss uses a fit of them, the crops of a
+            step cannot be shared evenly, or torch finds no CUDA device and ``device`` asks for it.
         GsmergeError: If LPIPS has a weight, and its weights are not installed.
         SceneError: If a shard is damaged, or the folder holds another run or cannot be written.
     """
@@ -193,12 +200,14 @@ def train(
     processes.require_even(options.crops)
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    chosen = validation or shards
+    bound = bind_backbone([*shards, *validation], backbone, options)
+    sources = bound[: len(shards)]
+    chosen = bound[len(shards) :] or sources
     chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
-        targets = map(read_targets, shards) if options.uses_fit else ()
+        targets = (read_targets(shard) for shard in sources if isinstance(shard, Shard)) if options.uses_fit else ()
         run = TrainingRun(options, target_scales(targets), processes)
-        return _train(run, shards, chosen, out, choose_device(device), progress)
+        return _train(run, sources, chosen, out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -216,8 +225,8 @@ def choose_device(name: str) -> str:
 
 def _train(
     run: TrainingRun,
-    shards: Sequence[Shard],
-    validation: Sequence[Shard],
+    shards: Sequence[Source],
+    validation: Sequence[Source],
     out: Path,
     device: str,
     progress: Progress | None,

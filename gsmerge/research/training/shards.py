@@ -6,8 +6,9 @@ on with the first example that is missing, and what is complete is not made agai
 
 Threads read ahead. Every crop of a step has a stream of its own: every ``crops``-th of the shards, in an order that is
 shuffled anew for each pass over them. A stream holds ``buffer`` examples, from which the crop draws one at random;
-every ``refresh`` steps the next in the order takes the place of the oldest. Which examples these are depends on seed
-and step alone. So a run that is resumed goes on as if it had not stopped, and so does one that is shared among
+every ``refresh`` steps the next in the order takes the place of the oldest. A capture takes the place of a shard: what
+its backbone predicts is another example at every place in the order. Which examples these are depends on seed and step
+alone. So a run that is resumed goes on as if it had not stopped, and so does one that is shared among
 processes, each of which reads the streams of its own crops.
 """
 
@@ -32,10 +33,12 @@ from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
+from gsmerge.research.training.backbones import PredictedCapture
 from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
 from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.targets import Targets
 from gsmerge.research.training.train_options import TrainOptions
+from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
@@ -48,7 +51,8 @@ REMEDY = "remove it; the next call makes it again"
 SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 FIT_SETTINGS = ("match", "overlap", "iou", "fit_steps", "levels")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
-ORDER = 2**32 + 1  # takes the place of the step in the seed of the order's random numbers
+# Each takes the place of the step in the seed of random numbers: of the order, and of what a capture draws
+ORDER, DRAWN = 2**32 + 1, 2**32 + 2
 
 
 @dataclass(frozen=True)
@@ -235,44 +239,62 @@ def read_targets(shard: Shard) -> dict[int, Targets]:
     return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}
 
 
-class ExampleStreams:
-    """Streams of examples from shards, one stream for each crop that this process draws per step."""
+Source = Shard | PredictedCapture
 
-    def __init__(self, shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> None:
+
+def read_example(source: Source, options: TrainOptions, rng: np.random.Generator, *, check: bool = True) -> Example:
+    """Read the example of a shard as :func:`read_shard`, or draw one of a capture."""
+    if isinstance(source, Shard):
+        return read_shard(source, check=check)
+    return source.draw(options, rng)
+
+
+class ExampleStreams:
+    """Streams of examples, one stream for each crop that this process draws per step."""
+
+    def __init__(self, shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> None:
         self.shards, self.options, self.crops = shards, options, crops
-        self.pool = ThreadPoolExecutor(options.workers, thread_name_prefix="gsmerge-read")
-        self.examples: dict[int, Future[Example]] = {}  # by number of the shard: those in memory, or being read
+        self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
+        # Those in memory, or being read, by number of the shard; of a capture also by place in the order, else 0
+        self.examples: dict[tuple[int, int], Future[Example]] = {}
         self.checked: set[int] = set()
 
     def move_to(self, step: int) -> None:
         """Load the shards that ``step`` may draw from and the next ones; forget all others."""
         ahead = self.options.buffer + 1
-        ids = [self.shard_id(step, crop, slot) for slot in range(ahead) for crop in self.crops]
-        for number in self.examples.keys() - set(ids):
-            self.examples.pop(number).cancel()
-        for number in ids:
-            if number not in self.examples:
-                self.examples[number] = self.pool.submit(self._read, number)
+        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in self.crops]
+        for key in self.examples.keys() - set(keys):
+            self.examples.pop(key).cancel()
+        for key in keys:
+            if key not in self.examples:
+                self.examples[key] = self.pool.submit(self._read, *key)
 
     def draw(self, step: int, crop: int, rng: np.random.Generator) -> Example:
         """Return a random example for crop number ``crop`` of the current step."""
         slot = int(rng.integers(self.options.buffer))
-        return self.examples[self.shard_id(step, crop, slot)].result()
+        return self.examples[self._key(step, crop, slot)].result()
 
     def shard_id(self, step: int, crop: int, slot: int) -> int:
         """Return the number of the shard in one slot of a crop's stream; slot 0 is the oldest."""
-        position = (step // self.options.refresh + slot) * self.options.crops + crop
-        epoch, index = divmod(position, len(self.shards))
+        epoch, index = divmod(self._position(step, crop, slot), len(self.shards))
         return int(_order(self.options.seed, epoch, len(self.shards))[index])
 
-    def _read(self, number: int) -> Example:
-        example = read_shard(self.shards[number], check=number not in self.checked)
+    def _position(self, step: int, crop: int, slot: int) -> int:
+        return (step // self.options.refresh + slot) * self.options.crops + crop
+
+    def _key(self, step: int, crop: int, slot: int) -> tuple[int, int]:
+        number = self.shard_id(step, crop, slot)
+        return number, 0 if isinstance(self.shards[number], Shard) else self._position(step, crop, slot)
+
+    def _read(self, number: int, position: int) -> Example:
+        rng = np.random.default_rng([self.options.seed, DRAWN, position])
+        example = read_example(self.shards[number], self.options, rng, check=number not in self.checked)
         self.checked.add(number)
         return example
 
 
 @contextmanager
-def open_streams(shards: Sequence[Shard], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
+def open_streams(shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
     """Open streams of examples; their threads end with the block."""
     streams = ExampleStreams(shards, options, crops)
     try:

@@ -12,6 +12,7 @@ from messages import noted, refuses
 from gsmerge.facts.views import (
     MAX_SCORED_VIEWS,
     REPORT_VIEWS,
+    context_views,
     distinct_views,
     even_views,
     midpoint_views,
@@ -61,6 +62,20 @@ def test_targets_lie_midway() -> None:
     assert midpoint_views([10, 0], [4.0, 6.0]) == [0]  # the earlier of two that are as near
     assert midpoint_views([0, 1, 2], [1.5]) == [0]
     assert midpoint_views([3], [1, 2]) == []
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "count", "expected"),
+    [
+        (31, 3, ([0, 15, 30], [7, 22])),
+        (61, 6, ([0, 12, 24, 36, 48, 60], [6, 18, 30, 42, 54])),
+        (4, 3, ([0, 2, 3], [1])),  # no frame between the last two
+        (4, 4, ([0, 1, 2, 3], [])),
+        (9, 1, ([4], [])),
+    ],
+)
+def test_the_paper_s_lists(num_frames: int, count: int, expected: tuple[list[int], list[int]]) -> None:
+    assert context_views(num_frames, count) == expected
 
 
 def test_subset_is_the_scene_of_those_views() -> None:

@@ -12,7 +12,7 @@ import cv2
 import pytest
 from messages import refuses
 
-from gsmerge.runtime.threads import in_turn, parallel_map, use_threads
+from gsmerge.runtime.threads import in_turn, parallel_map, use_threads, work_alone
 
 
 @pytest.fixture(autouse=True)
@@ -83,6 +83,20 @@ def test_pool_threads_do_not_wait_for_their_own_pool() -> None:
 
     with use_threads(2):
         assert parallel_map(outer, range(4)) == [[10 * i + j for j in range(3)] for i in range(4)]
+
+
+def test_a_thread_that_works_alone_has_no_helpers() -> None:
+    seen = list[set[int]]()
+
+    def read() -> None:
+        work_alone()
+        seen.append(set(parallel_map(lambda _: threading.get_ident(), range(50))))
+
+    reader = threading.Thread(target=read)
+    with use_threads(3):
+        reader.start()
+        reader.join()
+    assert seen == [{reader.ident}]
 
 
 def test_errors_come_through_and_leave_the_pool_usable() -> None:

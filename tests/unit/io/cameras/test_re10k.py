@@ -6,14 +6,13 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene, turned
 from messages import refuses
-from tiny_scene import Tiny
+from re10k_chunks import entry, rows_of, save, torch
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
@@ -21,35 +20,7 @@ from gsmerge.io.photo_files import resize_and_crop
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene
 
-torch = pytest.importorskip("torch", reason="torch is not installed")
-
 SMOOTH = smooth_scene(48, 36)
-
-
-def rows_of(tiny: Tiny) -> torch.Tensor:
-    """``[v,18]``: fx fy cx cy divided by the size, two zeros, world to camera."""
-    K = tiny.K / np.array([[tiny.width], [tiny.height], [1.0]])
-    head = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0], (len(tiny.names), 1))
-    return torch.from_numpy(np.concatenate([head, tiny.w2c[:, :3].reshape(-1, 12)], 1)).float()
-
-
-def jpeg(image: np.ndarray) -> torch.Tensor:
-    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])
-    assert ok
-    return torch.from_numpy(data.reshape(-1).copy())
-
-
-def entry(tiny: Tiny, key: str) -> dict[str, Any]:
-    return {
-        "url": "", "timestamps": torch.arange(len(tiny.names)), "key": key, "cameras": rows_of(tiny),
-        "images": [jpeg(image) for image in tiny.images],
-    }  # fmt: skip
-
-
-def save(folder: Path, *entries: dict[str, Any]) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.save(list(entries), folder / "000000.torch")
-    return folder / "000000.torch"
 
 
 def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
