@@ -65,7 +65,6 @@ ABLATION = (
     Condition("all latents zero", PLAIN, silent="latents", learned=(True,)),
     Condition("without the heads", PLAIN, silent="heads", learned=(True,)),
     Condition("no merging across views", {**PLAIN, "match": "none"}),
-    Condition("matching by the K = 1 head", {**PLAIN, "geometry": "decoded"}, learned=(True,)),
     Condition("larger superpixels", {"superpixels": "2%", **PLAIN}),
     Condition("smaller superpixels", {"superpixels": "8.7%", **PLAIN}),
 )

@@ -41,7 +41,7 @@ from gsmerge.states.state_file import load_state, save_state
 from gsmerge.types import grid_ids
 
 OUTPUTS = ("absolute", "residual")
-PLAIN = {"match": "aabb", "geometry": "decoded", "superpixels": "10%", "tolerance": 0}
+PLAIN = {"match": "aabb", "superpixels": "10%", "tolerance": 0}
 
 
 @pytest.fixture(scope="module")
