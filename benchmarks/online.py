@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 from many_views import many_views
-from matplotlib.figure import Figure
 from quality import score, setting
 from result_cells import QUALITY, make_table
 from shared_scenes import Targets, export, read_held_out, scene_folders
@@ -143,6 +142,8 @@ def end_table(ends: dict[str, dict[str, Figures]]) -> str:
 
 def draw(growth: Growth, path: Path) -> None:
     """Gaussians and memory over the views so far, in the paper's colours."""
+    from matplotlib.figure import Figure  # here, so that it is in no way's memory
+
     figure = Figure((9, 3.2), layout="constrained")
     counts, memory = figure.subplots(1, 2)
     for way, color in WAYS.items():
