@@ -1,175 +1,191 @@
-"""Views that arrive in batches against all of them at once: growth, seconds per step, memory, quality.
+"""The superpixel merging paper's online experiment: views that arrive in batches, merged, and the naive way.
 
-python benchmarks/online.py desk,carton                          # 84 views of each, in steps of 12
-python benchmarks/online.py eval --order cycle --whole none full  # every batch sees the whole scene; and in one go
-python benchmarks/online.py apples,fern,fox --views 0 --size 3 1 --whole none --fits none --set recipe=paper
+python benchmarks/online.py fern,apples,lightfield            # as in the paper: 84 views, in steps of 12
+python benchmarks/online.py fern,apples,lightfield --size 84  # the same views at once
+python benchmarks/online.py desk --views 0 --size 3 --set     # its own views alone, and the defaults without a fit
 
-Scenes have fewer views: they are repeated from jittered poses (benchmarks/many_views.py); with --views 0 they have
-their own alone. Every run is a process of its own. Quality is that of held-out views, visible pixels. The table at the
-end has one row for each scene and way, decoded without a fit.
+The naive way keeps all Gaussians of all batches. Captures have fewer views than the paper's: they are repeated from
+jittered poses (benchmarks/many_views.py). Two tables are printed, means over the scenes: growth, and what is there in
+the end, on held-out photos, visible pixels. The picture shows growth. Each way has a process of its own, whose memory
+is the most that it has taken so far. Frames are drawn by the native rasterizer at the photos' size.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
-import subprocess
-import sys
+import re
 import tempfile
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from many_views import many_views
 from quality import score, setting
-from shared_scenes import Targets, export, exporter, read_held_out, scene_folders
+from result_cells import QUALITY, make_table
+from shared_scenes import Targets, export, read_held_out, scene_folders
 
-import gsmerge
-from gsmerge import Compactor
-from gsmerge.scene.files import find_scene_files
+from gsmerge import Compactor, Gaussians, read_scene
+from gsmerge.measure.lpips import INSTALL, lpips_available
+from gsmerge.measure.speed import measure_costs
 
 KS = (1, 2, 4)  # Gaussians of each group
+NAIVE = "naive"
+WAYS = {NAIVE: "#D62728", **dict(zip((f"K = {k}" for k in KS), ("#1F77B4", "#2CA02C", "#9467BD"), strict=True))}
+NEAR = 0.01  # world units, that of gsmerge.render
+Figures = dict[str, float]  # by name
+Growth = dict[int, Figures]  # by number of views so far
 
 
-def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[Path]:
-    """A scene's views in batches, each exported as its own scene; created once."""
-    source = views_of(name, views, cache)
+def make_batches(folder: Path, views: int, size: int, cache: Path) -> list[Path]:
+    """The exports of a scene's views, ``size`` at a time in the order of the trajectory; made once."""
+    source = many_views(folder, cache / f"{folder.name}-{views}", views) if views else folder
     document = json.loads((source / "transforms.json").read_text())
-    context = [f for f in document["frames"] if f["role"] == "context"]
-    ids = np.arange(len(context))
-    if order == "cycle":  # every batch goes once through the scene
-        ids = np.concatenate([ids[i :: -(-views // size)] for i in range(-(-views // size))])
-    results = []
-    for number, first in enumerate(range(0, len(ids), size)):
-        folder = cache / f"{name}-{views}-{order}-{size}" / f"{number:03d}"
-        ply = folder / "plain" / "scene.ply"
-        if not (folder / "done").exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            for part in ("images", "depth"):
-                if not (folder / part).exists():
-                    (folder / part).symlink_to((source / part).resolve())
-            frames = [context[i] for i in ids[first : first + size]]
-            (folder / "transforms.json").write_text(json.dumps(document | {"frames": frames}))
-            ply = Path(exporter().export(folder, folder / "plain", "plain"))
-            (folder / "done").touch()
-        results.append(ply)
-    return results
+    frames = [frame for frame in document["frames"] if frame["role"] == "context"]
+    plys = []
+    for first in range(0, len(frames), size):
+        batch = cache / f"{folder.name}-{views}-{size}" / f"{first:03d}"
+        batch.mkdir(parents=True, exist_ok=True)
+        for part in ("images", "depth"):
+            if not (batch / part).exists():
+                (batch / part).symlink_to((source / part).resolve())
+        (batch / "transforms.json").write_text(json.dumps(document | {"frames": frames[first : first + size]}))
+        plys.append(export(batch, batch.parent))
+    return plys
 
 
-def views_of(name: str, views: int, cache: Path) -> Path:
-    """The folder of a scene with so many views; 0: its own."""
-    folder = scene_folders(name)[0]
-    return many_views(folder, cache / f"{name}-{views}", views) if views else folder
+def peak_memory() -> float:
+    """The most memory of this process so far, GB; unlike ``ru_maxrss`` without that of the process that began it."""
+    found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    return 1024 * int(found[1]) / 1e9 if found else float("nan")
 
 
-def online(args: argparse.Namespace) -> dict:
-    """One batch after the other, and what is decoded in the end."""
-    targets = read_held_out(scene_folders(args.scenes)[0])
-    compactor, steps = Compactor(**{"replay": args.replay} | settings_of(args)), []
-    for ply in batches(args.scenes, args.views, args.size[0], args.order, args.cache):
-        scene = gsmerge.read_scene(find_scene_files(ply).ply)
-        start = time.perf_counter(), time.process_time()
-        report = compactor.extend(scene)
-        seconds = time.perf_counter() - start[0], time.process_time() - start[1]
-        names = ("num_input", "num_new", "num_covered", "num_joined", "num_hidden", "num_groups")
-        step = {name: getattr(report, name) for name in names}
-        steps.append(step | {"seconds": round(seconds[0], 2), "processor": round(seconds[1], 2)})
-        print(steps[-1], {k: round(v, 2) for k, v in report.seconds.items()}, file=sys.stderr, flush=True)
-        del scene
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    with tempfile.TemporaryDirectory() as folder:
-        compactor.save(Path(folder) / "state.gsm")
-        size = (Path(folder) / "state.gsm").stat().st_size
-    spent = sum(step["processor"] for step in steps)
-    results = {
-        "steps": steps,
-        "peak_GB": round(peak, 2),
-        "state_MB": round(size / 1e6, 1),
-        "processor": round(spent, 1),
-    }
-    for fit in args.fits:
-        for k in KS:
-            start = time.process_time()
-            gaussians = compactor.decode(k=k, fit=fit)
-            results[f"{fit} k{k}"] = _scored(gaussians, targets, time.process_time() - start, args.lpips)
-    return results
+def keep_all(plys: Sequence[Path]) -> list[Figures]:
+    """The naive way: all Gaussians so far stay in memory."""
+    kept, steps = list[Gaussians](), []
+    for ply in plys:
+        kept.append(read_scene(ply).gaussians)
+        steps.append({NAIVE: sum(map(len, kept)), "naive GB": peak_memory()})
+    return steps
 
 
-def whole(args: argparse.Namespace, fit: str) -> dict:
-    """All views at once; ``input``: as they are."""
-    source = views_of(args.scenes, args.views, args.cache)
-    scene, targets = gsmerge.read_scene(export(source, args.cache)), read_held_out(scene_folders(args.scenes)[0])
-    if fit == "input":
-        return _scored(scene.gaussians, targets, 0.0, args.lpips)
-    results: dict = {}
-    for k in KS:
+def merge_all(plys: Sequence[Path], settings: dict[str, Any], states: Path) -> list[Figures]:
+    """One batch after the other; the state after each is written into the folder ``states``."""
+    compactor, steps, num_views = Compactor(**settings), [], 0
+    for number, ply in enumerate(plys):
+        scene = read_scene(ply)
         start = time.process_time()
-        result = gsmerge.compact(scene, **{"fit": fit, "k": k} | settings_of(args))
-        seconds = time.process_time() - start
-        if k == 1:
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-            results = {"peak_GB": round(peak, 2), "processor": round(seconds, 1)}
-        results[f"{fit} k{k}"] = _scored(result.gaussians, targets, seconds, args.lpips)
-    return results
+        report = compactor.extend(scene)
+        spent, num_views = time.process_time() - start, num_views + report.num_views
+        path = states / f"{number:03d}.gsm"
+        steps.append({"views": num_views, "groups": report.num_groups, "GB": peak_memory(), "processor": spent})
+        compactor.save(path)
+        steps[-1]["MB"] = path.stat().st_size / 1e6
+    return steps
 
 
-def settings_of(args: argparse.Namespace) -> dict:
-    """Settings from the command line."""
-    return {name: setting(value) for name, value in (text.split("=") for text in args.set)}
+def in_own_process(run: Callable[..., Any], *given: Any) -> Any:
+    """What a function returns that runs in a new process, whose memory is its own."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(run, *given).result()
 
 
-def _scored(gaussians: gsmerge.Gaussians, targets: Targets, seconds: float, perceptual: bool) -> dict:
-    values = score(gaussians, targets, perceptual)
-    results = {name: round(value, 3) for name, value in zip(("psnr", "ssim", "lpips"), values, strict=False)}
-    return {"count": len(gaussians), **results, "processor": round(seconds, 1)}
+def measure(plys: Sequence[Path], targets: Targets, settings: dict[str, Any]) -> tuple[Growth, dict[str, Figures]]:
+    """Growth by views so far, and what each way ends with."""
+    ways = dict[str, Gaussians]()
+    with tempfile.TemporaryDirectory() as place:
+        naive = in_own_process(keep_all, plys)
+        merged = in_own_process(merge_all, plys, settings, Path(place))
+        growth = {int(step["views"]): step | other for step, other in zip(merged, naive, strict=True)}
+        for step, path in zip(growth.values(), sorted(Path(place).iterdir()), strict=True):
+            compactor = Compactor.load(path)
+            ways = {f"K = {k}": compactor.decode(k=k, fit="none") for k in KS}
+            step |= {way: len(gaussians) for way, gaussians in ways.items()}
+    ways = {NAIVE: Gaussians.concat([read_scene(ply).gaussians for ply in plys]), **ways}
+    costs = measure_costs(ways, targets.cameras, (1,), NEAR)
+    ends = {}
+    for way, gaussians in ways.items():
+        scores = (*score(gaussians, targets, lpips_available("vgg")), float("nan"))[:3]
+        shares = {"count": len(gaussians), "share": 100 * len(gaussians) / len(ways[NAIVE])}
+        frames = {"frames": 1 / costs[way]["speeds"][0]["seconds"], "overdraw": costs[way]["overdraw"]}
+        ends[way] = shares | dict(zip(QUALITY, scores, strict=True)) | frames
+    return growth, ends
 
 
-def print_table(rows: list[tuple[str, str, dict]]) -> None:
-    """Print a row for each scene and way: what is decoded without a fit, and what it takes."""
-    print("| scene | views at a time | K = 1 | K = 2 | K = 4 | Gaussians | state MB | peak GB | processor seconds |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    for scene, way, results in rows:
-        if "none k1" not in results:
-            continue
-        cells = [f"{results[f'none k{k}']['psnr']:.2f}" for k in KS]
-        cells += [f"{results['none k1']['count']:,}", str(results.get("state_MB", "")), str(results["peak_GB"])]
-        print("|", " | ".join([scene, way, *cells, str(results["processor"])]), "|")
+def mean_of(rows: Sequence[Figures]) -> Figures:
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
-def main() -> None:
+def growth_table(growth: Growth) -> str:
+    head = ["views", NAIVE, "groups", *(f"K = {k}" for k in KS), "naive, memory", "memory", "state", "processor"]
+    rows = []
+    for views, step in growth.items():
+        counts = [f"{step[name]:,.0f}" for name in (NAIVE, "groups", *(f"K = {k}" for k in KS))]
+        memory = [f"{step['naive GB']:.2f} GB", f"{step['GB']:.2f} GB", f"{step['MB']:.1f} MB"]
+        rows.append([str(views), *counts, *memory, f"{step['processor']:.1f} s"])
+    return make_table(head, rows)
+
+
+def end_table(ends: dict[str, dict[str, Figures]]) -> str:
+    rows = []
+    for scene, ways in ends.items():
+        for way, end in ways.items():
+            quality = [f"{end[name]:.{digits}f}" for name, digits in zip(QUALITY, (2, 3, 3), strict=True)]
+            counts = [f"{end['count']:,.0f}", f"{end['share']:.1f} %"]
+            rows.append([scene, way, *counts, *quality, f"{end['frames']:.3g}", f"{end['overdraw']:.1f}"])
+    return make_table(["scene", "way", "Gaussians", "share", *QUALITY, "frames a second", "overdraw"], rows)
+
+
+def draw(growth: Growth, path: Path) -> None:
+    """Gaussians and memory over the views so far, in the paper's colours."""
+    from matplotlib.figure import Figure  # here, so that it is in no way's memory
+
+    figure = Figure((9, 3.2), layout="constrained")
+    counts, memory = figure.subplots(1, 2)
+    for way, color in WAYS.items():
+        counts.plot(list(growth), [step[way] / 1e6 for step in growth.values()], "o-", color=color, label=way)
+    for name, color, label in (("naive GB", WAYS[NAIVE], NAIVE), ("GB", WAYS["K = 1"], "merged")):
+        memory.plot(list(growth), [step[name] for step in growth.values()], "o-", color=color, label=label)
+    for axes, words in ((counts, "Gaussians (M)"), (memory, "memory (GB)")):
+        axes.set(xlabel="views so far", ylabel=words, ylim=(0, None), xticks=list(growth))
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.savefig(path)
+
+
+def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
-    parser.add_argument("--views", type=int, default=84)
-    parser.add_argument("--size", type=int, nargs="+", default=[12], help="views of a batch")
-    parser.add_argument("--order", choices=("trajectory", "cycle"), default="trajectory")
-    parser.add_argument("--replay", type=int, default=96)
-    parser.add_argument("--whole", nargs="*", default=[], choices=("input", "none", "full"), help="also in one go")
-    parser.add_argument("--fits", nargs="*", default=["none", "full"], choices=("none", "full"), help="at decoding")
-    parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
-    parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, see benchmarks/quality.py")
+    parser.add_argument("--views", type=int, default=84, help="of each scene; 0: its own")
+    parser.add_argument("--size", type=int, default=12, help="views of a batch")
+    parser.add_argument("--set", nargs="*", default=["recipe=paper"], help="settings, as name=value")
+    parser.add_argument("--out", type=Path, default=Path("online.svg"), help="the picture")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
-    parser.add_argument("--run", help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.run:
-        print(json.dumps(online(args) if args.run == "online" else whole(args, args.run)))
-        return
-    rows = []
+    args = parser.parse_args(words)
+    if not lpips_available("vgg"):
+        print(f"LPIPS is left out: {INSTALL}", flush=True)
+    settings = {name: setting(value) for name, value in (text.split("=", 1) for text in args.set)}
+    runs = {}
     for folder in scene_folders(args.scenes):
-        runs = [*((run, args.size[0]) for run in args.whole), *(("online", size) for size in args.size)]
-        for size in args.size:  # exported here, so that no run's memory has it
-            batches(folder.name, args.views, size, args.order, args.cache)
-        if args.whole:
-            export(views_of(folder.name, args.views, args.cache), args.cache)
-        for run, size in runs:
-            options = [f"--{name}={getattr(args, name)}" for name in ("views", "order", "replay", "cache")]
-            options += [f"--size={size}", "--fits", *args.fits, "--set", *args.set, *["--lpips"] * args.lpips]
-            command = [sys.executable, __file__, folder.name, *options, "--run", run]
-            text = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout.strip()
-            way = f"{size}" if run == "online" else "all"
-            print(folder.name, run, way, text, flush=True)
-            rows.append((folder.name, way, json.loads(text)))
-    print_table(rows)
+        plys = make_batches(folder, args.views, args.size, args.cache)
+        runs[folder.name] = measure(plys, read_held_out(folder), settings)
+        print(json.dumps({folder.name: runs[folder.name]}), flush=True)
+    report(runs, args.out)
+
+
+def report(runs: dict[str, tuple[Growth, dict[str, Figures]]], out: Path) -> None:
+    """Print both tables and draw; growth is the mean where all scenes have so many views."""
+    growths = [growth for growth, _ in runs.values()]
+    growth = {v: mean_of([g[v] for g in growths]) for v in growths[0] if all(v in g for g in growths)}
+    ends = {scene: ends for scene, (_, ends) in runs.items()}
+    if len(runs) > 1:
+        ends["mean"] = {way: mean_of([ways[way] for ways in ends.values()]) for way in WAYS}
+    print(growth_table(growth), end_table(ends), sep="\n\n")
+    draw(growth, out)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,8 @@ class Part:
 
 GRID = ("--segmentations", "grid")
 SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
-VIEWS = ("--views", "3,6,9,12", "--k", "1,2,4", *NO_PROXIES)
+BY_K = (NO_PROXIES, ("--k", "2,4", *NO_PROXIES), ("--methods", "moment-matching", *NO_PROXIES))
+VIEWS = tuple(("--views", "3,6,9,12", *call) for call in BY_K)
 PARTS = (
     Part(
         "sizes",
@@ -68,12 +69,13 @@ PARTS = (
         ),
         ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
     ),
-    Part("views", "plain", (("--methods", "gsmerge,moment-matching", *VIEWS),), ("quality-views", "count-views")),
+    Part("views", "plain", VIEWS, ("quality-views", "count-views")),
     Part(
         "ablation",
         "plain",
         (
-            ("--matches", "overlap,none", *NO_PROXIES),
+            NO_PROXIES,
+            ("--matches", "none", *NO_PROXIES),
             ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
             ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
             ("--superpixels", "2%,8.7%", *NO_PROXIES),
@@ -82,10 +84,7 @@ PARTS = (
             ("--budgets", "auto", *NO_PROXIES),
         ),
     ),
-    *(
-        Part(style, style, (("--methods", "gsmerge,moment-matching", "--k", "1,2,4", *NO_PROXIES),))
-        for style in ("da3", "depthsplat", "anysplat")
-    ),
+    *(Part(style, style, BY_K) for style in ("da3", "depthsplat", "anysplat")),
 )
 
 

@@ -42,18 +42,18 @@ def test_a_command_loads_no_other() -> None:
 
 
 @sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join)
-def test_compacting_loads_and_needs_neither_torch_nor_scipy(
+def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(
     settings: list[str], small_scene: Path, tmp_path: Path
 ) -> None:
     """Which take longer to load than a small scene takes to merge; without them the result is the same bytes."""
     outputs, loaded = [tmp_path / "with.ply", tmp_path / "without.ply"], []
-    for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage")), strict=True):
+    for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage", "matplotlib")), strict=True):
         hide = f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n"
         arguments = ["compact", str(small_scene), "-o", str(output), *settings]
         code = f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0\n"
         loaded.append(set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split()))
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
-    assert loaded[0].isdisjoint({"torch", "skimage", *(f"scipy.{name}" for name in heavy)})
+    assert loaded[0].isdisjoint({"torch", "skimage", "matplotlib", *(f"scipy.{name}" for name in heavy)})
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 

@@ -243,14 +243,3 @@ def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run
     outcome = run("chart", copied / "room", "--output", copied / "out", *CHART_TARGETS, *options, code=0)
     assert {settings.segment.superpixels for settings in merges} == {"2%"}
     assert json.loads(outcome.out)["num_done"] == 1
-
-
-def test_missing_matplotlib_is_one_line_before_anything_is_run(
-    copied: Path, merges: list[CompactOptions], run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gsmerge.research.charts.find_spec", lambda name: None)
-    outcome = again(run, copied, "--rerun")
-    assert (outcome.code, merges) == (1, [])
-    assert outcome.err == (
-        'gsmerge: error: charts need matplotlib, which is not installed: pip install "matplotlib>=3.8,<4"\n'
-    )

@@ -23,48 +23,50 @@ from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, Ru
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import find_scene_files
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import Settings, setting, settings_of
 
 ALL = "all"  # word for all views
-NEEDED: dict[str, Any] = {"filled": True, "unique": True}
 OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
 FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
 NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers
 # Settings whose lists are multiplied, and the lists' names:
 SETTINGS = {"k": "k", "segmentation": "segmentations", "fit": "fit", "effort": "efforts", "match": "matches"}
+SIZES = {"budget": "budgets", "superpixels": "superpixels"}  # whose lists stand next to each other
 MAX_NAME = 100  # characters of a run in names of files
 
 
 @dataclass(frozen=True)
 class Grid(Settings):
-    """Lists of values for settings; every combination is run."""
+    """Lists of values for settings; every combination is run. What has no list is as usual, or as a recipe says."""
 
-    methods: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", **NEEDED)
-    k: tuple[int, ...] = setting((1,), "Gaussians per superpixel: 1 to 8.", **NEEDED)
+    methods: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
+    k: tuple[int, ...] = setting((), "Gaussians per superpixel: 1 to 8.", unique=True)
     budgets: tuple[int | str, ...] = setting((), "Gaussians in the result, such as 0.5%,2%,40000,auto.", unique=True)
     superpixels: tuple[int | str, ...] = setting((), "Superpixels per view, such as 3000,4.4%, next to the budgets.",
         unique=True)  # fmt: skip
-    segmentations: tuple[str, ...] = setting(("rdseg",), "Superpixel methods.", **NEEDED)
-    fit: tuple[str, ...] = setting(("full",), "What is fitted: full, none.", **NEEDED)
-    efforts: tuple[str, ...] = setting(("default",), "Amount of work: draft, fast, default, best.", **NEEDED)
-    matches: tuple[str, ...] = setting(("overlap",), "Merging across views: overlap, aabb, none.", **NEEDED)
+    segmentations: tuple[str, ...] = setting((), "Superpixel methods.", unique=True)
+    fit: tuple[str, ...] = setting((), "What is fitted: full, none.", unique=True)
+    efforts: tuple[str, ...] = setting((), "Amount of work: draft, fast, default, best.", unique=True)
+    matches: tuple[str, ...] = setting((), "Merging across views: overlap, aabb, none.", unique=True)
     views: tuple[int | Literal["all"], ...] = setting((ALL,), "Numbers of input views, evenly spread; all for all.",
-        least=1, **NEEDED)  # fmt: skip
-    fixed: tuple[str, ...] = setting((), "Any other setting of compact for all runs of gsmerge, each NAME=VALUE.",
-        unique=True)  # fmt: skip
+        least=1, filled=True, unique=True)  # fmt: skip
+    fixed: tuple[str, ...] = setting((), "Any other setting of compact for all runs of gsmerge, each NAME=VALUE.")
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that all runs share, by name; UsageError if one is not "name=value" or cannot be fixed."""
-        settings: dict[str, Any] = {}
+        """Settings that all runs share, by name; UsageError if one is not "name=value" or is decided elsewhere."""
+        settings, lists = dict[str, Any](), SETTINGS | SIZES
+        decided = OWN_OPTIONS | {name: f"--{lists[name]}" for name in lists if getattr(self, lists[name])}
         for text in self.fixed:
             name, sign, value = str(text).partition("=")
             if not (name and sign):
                 raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
-            if name in OWN_OPTIONS:
-                raise UsageError(f"fixed: expected another setting, got {name}; use {OWN_OPTIONS[name]}")
+            if name in decided:
+                raise UsageError(f"fixed: expected another setting, got {name}; use {decided[name]}")
+            if name in settings:
+                raise UsageError(f"fixed: expected every setting once, got {name} twice")
             try:
                 settings[name] = json.loads(value)
             except ValueError:  # a word
@@ -80,6 +82,8 @@ def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Gri
     for name, text in lists.items():
         if text is not None:
             parts = [part.strip() for part in text.split(",") if part.strip()]
+            if not parts:
+                raise UsageError(f"{name}: expected at least one value, got none")
             values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
     try:
         return replace(base or Grid(), **values)
@@ -108,20 +112,21 @@ def read_grid(path: Path) -> Grid:
 def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """List (method, settings) of every run on one scene, the unmerged input first; also notes on combinations left out.
 
-    Only settings that differ from the defaults are set. Baselines do not have most settings and run once per size, or
-    once where they keep all Gaussians.
+    Only settings that differ from the defaults are set; for ours these are a fixed recipe's, and the lists go before.
+    Baselines do not have most settings and run once per size, or once where they keep all Gaussians.
     """
-    sizes: list[dict[str, Any]] = [{"budget": b} for b in grid.budgets] + [{"superpixels": s} for s in grid.superpixels]
+    sizes: list[dict[str, Any]] = [{name: size} for name, sizes in SIZES.items() for size in getattr(grid, sizes)]
+    lists, fixed = [getattr(grid, name) or (None,) for name in SETTINGS.values()], grid.settings
+    defaults = CompactOptions().to_dict()
+    ours = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
     runs = {describe(INPUT, {}, None): (INPUT, dict[str, Any]())}
     repeated = 0
-    for method, *values, size in product(
-        grid.methods, *(getattr(grid, name) for name in SETTINGS.values()), sizes or [{}]
-    ):
-        names = SETTINGS if method == OURS else FITTED.get(method, ())
-        chosen = dict(zip(SETTINGS, values, strict=True))
+    for method, *values, size in product(grid.methods, *lists, sizes or [{}]):
+        names, usual = (SETTINGS, ours) if method == OURS else (FITTED.get(method, ()), defaults)
         settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
-        settings |= {name: chosen[name] for name in names if chosen[name] != getattr(Grid, SETTINGS[name])[0]}
-        settings |= grid.settings if method == OURS else {}
+        chosen = zip(SETTINGS, values, strict=True)
+        settings |= {name: value for name, value in chosen if name in names and value not in (None, usual[name])}
+        settings |= fixed if method == OURS else {}
         label = describe(method, settings, None)
         repeated += label in runs
         runs.setdefault(label, (method, settings))
@@ -224,10 +229,11 @@ def make_jobs(
     jobs: list[Job] = []
     for source in sources:
         most = source.num_views or math.inf
-        runs = [choice for choice in chosen if choice[0] == SUPERPIXELS or (choice[2] or 0) <= most]
+        limit = most - 1 if None in counts else most  # as many as there are: the run of all
+        runs = [choice for choice in chosen if choice[0] == SUPERPIXELS or (choice[2] or 0) <= limit]
         if len(runs) < len(chosen):
             few = len(chosen) - len(runs)
-            notes.append(f"{source.name} has fewer views than asked for: {few} run(s) left out")
+            notes.append(f"{source.name} has fewer views than asked for, or as many as all: {few} run(s) left out")
         num_gaussians, num_rest = estimate_counts(scene_plys(source.path))
         for method, settings, views, options in runs:
             label = describe(method, settings, views)

@@ -76,10 +76,6 @@ def chart(args: opt.Args) -> None:
         raise UsageError("--dry-run: expected something to run, got --draw-only")
     if os.path.lexists(out) and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
-    if not args.dry_run:
-        from gsmerge.research.charts import require_matplotlib
-
-        require_matplotlib()
     if args.draw_only:
         _draw(args, [], 0)
         return

@@ -11,7 +11,6 @@ from experiments import make_grid, make_proxies, make_record
 from matplotlib.axes import Axes
 from sweeps import sweep
 
-from gsmerge.research.charts import require_matplotlib
 from gsmerge.research.charts.figures import (
     MAX_LINES,
     RC,
@@ -171,11 +170,3 @@ def test_names_are_no_formulas_in_drawings(name: str, tmp_path: Path) -> None:
     records = [replace(r, settings={**r.settings, "checkpoint": name}) for r in make_grid() if r.method != "input"]
     records += [replace(r, settings=dict(r.settings)) for r in make_grid() if r.method == "gsmerge"]
     assert draw_figures(figures_of(records), tmp_path)
-
-
-def test_missing_matplotlib_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsmerge.errors import GsmergeError
-
-    monkeypatch.setattr("gsmerge.research.charts.find_spec", lambda name: None)
-    with pytest.raises(GsmergeError, match=r'not installed: pip install "matplotlib>=3.8,<4"'):
-        require_matplotlib()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from gsmerge.research.charts.grid import (
     scene_names,
 )
 from gsmerge.scene.exporters import ReadHints
+from gsmerge.settings.compact import CompactOptions
 
 
 def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:
@@ -32,8 +34,25 @@ def test_the_product() -> None:
     assert len(made) == 1 + 2 * 3 * 2
     assert len({(method, *sorted(settings.items())) for method, settings in made}) == len(made)
     assert notes == []
-    assert made[1] == ("gsmerge", {"budget": "0.5%"})
+    assert made[1] == ("gsmerge", {"budget": "0.5%", "k": 1})
     assert ("gsmerge", {"budget": 4000, "k": 2, "fit": "none"}) in made
+
+
+@pytest.mark.parametrize("fixed", [(), ("recipe=paper",), ("effort=draft",)])
+def test_every_label_is_a_result_of_its_own(fixed: tuple[str, ...]) -> None:
+    """A recipe, or an effort, decides what no list decides, and nothing else: four labels are four results."""
+    made, notes = list_settings(replace(parse_grid({"fit": "full,none", "matches": "overlap,aabb"}), fixed=fixed))
+    options = [CompactOptions().with_settings(settings) for method, settings in made if method == "gsmerge"]
+    asked = {(one.fit.fit, one.match.match) for one in options}
+    assert asked == {("full", "overlap"), ("full", "aabb"), ("none", "overlap"), ("none", "aabb")}
+    assert notes == []
+    (_, (_, alone)), _ = list_settings(Grid(fixed=fixed))
+    assert CompactOptions().with_settings(alone) == CompactOptions().with_settings(Grid(fixed=fixed).settings)
+
+
+def test_a_list_goes_before_the_recipe_as_with_compact() -> None:
+    (_, (_, settings)), _ = list_settings(parse_grid({"fit": "full", "matches": "aabb"}, Grid(fixed=("recipe=paper",))))
+    assert settings == {"fit": "full", "recipe": "paper"}
 
 
 def test_baselines_run_once_per_size() -> None:
@@ -62,7 +81,13 @@ def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
 
 @pytest.mark.parametrize(
     ("name", "text", "found"),
-    [("k", "1,1", "1,1"), ("k", " , ", "none"), ("views", "0", 0), ("views", "some", "'some'")],
+    [
+        ("k", "1,1", "1,1"),
+        ("k", " , ", "none"),
+        ("budgets", "", "none"),
+        ("views", "0", 0),
+        ("views", "some", "'some'"),
+    ],
 )
 def test_lists_that_cannot_be(name: str, text: str, found: object) -> None:
     with refuses(UsageError, name, found):
@@ -132,6 +157,17 @@ def test_fixed_settings_are_names_and_values(text: str) -> None:
 def test_what_cannot_be_fixed(text: str, found: object) -> None:
     with refuses(UsageError, "fixed", text.partition("=")[0], found):
         list_settings(Grid(fixed=(text,)))
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "option"),
+    [("match", "none,aabb", "--matches"), ("k", "1", "--k"), ("budget", "2%", "--budgets")],
+)
+def test_what_is_decided_twice(name: str, values: str, option: str) -> None:
+    with refuses(UsageError, "fixed", name, option):
+        list_settings(parse_grid({option.removeprefix("--"): values}, Grid(fixed=(f"{name}=3",))))
+    with refuses(UsageError, "fixed", name, "twice"):
+        list_settings(Grid(fixed=(f"{name}=3", f"{name}=3")))
 
 
 def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,10 +248,10 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 
 def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -> None:
     fixed = ("checkpoint=a/b.safetensors", "min_opacity=0.1")
-    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), views=(2, 9, "all"), fixed=fixed)
+    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), views=(2, 5, 9, "all"), fixed=fixed)
     jobs, notes = make_jobs(sources(made_scene), grid, EvaluateOptions(()), proxy_views=1)
     assert len({job.output for job in jobs}) == len(jobs) == 2 * 3 + 1
-    assert noted(notes, made_scene.name, "3 run(s)")
+    assert noted(notes, made_scene.name, "6 run(s)")  # of nine views, and of five, which are all
     assert all(job.output.startswith(f"{made_scene.name}/") and job.output.count("/") == 1 for job in jobs)
     assert jobs[1].num_gaussians == pytest.approx(0.4 * jobs[-2].num_gaussians)
     assert len({job.call.key(job.find_files()) for job in jobs}) == len(jobs)
