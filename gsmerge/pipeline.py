@@ -40,6 +40,6 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
     pooled = encode(scene, members, segmentation.groups)
     features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)
-    merged = refine(merge(features, match(features, plan.match, networks), networks), networks)
+    merged = refine(merge(features, match(features, plan.match), networks), networks)
     choose(groups=len(features), clusters=len(merged), **plan.network_facts)
     return MergedViews(merged, members, segmentation, len(features), networks)

@@ -66,20 +66,13 @@ class NetworkContext(Corrector):
         if self.options.geometry != "carried":
             return encoded
         # scales and rotations alone: the mean stays the encoder's (paper section 4.2)
-        return replace(encoded, covars=self.decode_one(encoded)[1])
+        return replace(encoded, covars=self.decode_covars(encoded))
 
-    def prepare_matching(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Replace means and covariances by those of the K = 1 head, if they serve matching alone."""
-        if self.options.geometry != "matched":
-            return features
-        means, covars = self.decode_one(features)
-        return replace(features, means=means, covars=covars)
-
-    def decode_one(self, features: FeatureGaussians) -> tuple[Array, Array]:
-        """Run the head for K = 1; return the means ``[g,3]`` and covariances ``[g,3,3]`` of its Gaussians."""
+    def decode_covars(self, features: FeatureGaussians) -> Array:
+        """Run the head for K = 1; return the covariances ``[g,3,3]`` of its Gaussians."""
         described = self.describe(features)
         decoded = decode_with_group_features(described.base, np.arange(len(features)), described, self)
-        return decoded.means, covariances(decoded.quats, decoded.scales)
+        return covariances(decoded.quats, decoded.scales)
 
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray

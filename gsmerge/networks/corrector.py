@@ -20,10 +20,6 @@ class Corrector:
         """Correct pooled Feature Gaussians and add their latents."""
         return features
 
-    def prepare_matching(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Return Feature Gaussians with the geometry that is compared across views."""
-        return features
-
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:

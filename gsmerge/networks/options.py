@@ -13,7 +13,7 @@ from gsmerge.settings.setting import Settings, setting
 SLOTS = (1, 2, 4)  # numbers of children that have a decoder head
 OUTPUTS = ("residual", "absolute")
 STARTS = ("pooled", "first")
-GEOMETRIES = ("analytic", "matched", "carried")
+GEOMETRIES = ("analytic", "carried")
 PART = 13  # columns of a Gaussian relative to another one: position, log scales, opacity, colour, normal
 MEMBER = PART + 6  # and its position in footprints and its colour
 GROUP = 19 + NUM_STATS  # columns of a whole group
@@ -60,8 +60,8 @@ class NetworkOptions(Settings):
     merger_start: str = setting("pooled", "What the merger corrects: `pooled`: the moments of the whole cluster.",
         "`first`, as in the paper: its 0th Feature Gaussian.", choices=STARTS)  # fmt: skip
     geometry: str = setting("analytic", "Whose scales and rotations Feature Gaussians have.",
-        "`analytic`: those of the moments. `matched`: those of the K = 1 head, with its means, in matching alone. "
-        "`carried`: those of the K = 1 head from the encoder on, as in the paper.", choices=GEOMETRIES)  # fmt: skip
+        "`analytic`: those of the moments. `carried`: those of the K = 1 head from the encoder on, as in the paper.",
+        choices=GEOMETRIES)  # fmt: skip
     refiner: bool = setting(True, "Whether there is one.")
     group_numbers: bool = setting(True, "Whether the heads read all numbers that describe a group, which are ours.",
         "Without them a head reads latent, base colour and mass, as in the paper.")  # fmt: skip

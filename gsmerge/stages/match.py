@@ -6,7 +6,6 @@ import numpy as np
 
 from gsmerge.geometry import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
-from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
@@ -14,14 +13,12 @@ from gsmerge.types import SH_C0, FeatureGaussians, Matches, as_array
 
 
 @stage("match")
-def match(features: FeatureGaussians, options: MatchOptions, networks: Corrector = ANALYTIC) -> Matches:
+def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     """Cluster Feature Gaussians of different views that show the same piece of surface.
 
     The result does not depend on the order of the Feature Gaussians: leaders are taken by weight, in ties by position.
     Fully transparent Feature Gaussians form clusters of one.
     """
-    if options.match != "none":
-        features = networks.prepare_matching(features)
     count = len(features)
     clusters = np.full(count, -1, np.int64)
     num_clusters = 0

@@ -170,7 +170,7 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     """Match, merge and refine the Feature Gaussians of a first batch, as for a scene of its views."""
     context = new.context
     assert isinstance(context, NetworkContext)
-    merged = merge(new.features, match(new.features, batch.plan.match, context), context)
+    merged = merge(new.features, match(new.features, batch.plan.match), context)
     refined = refine(merged, context)
     with stage("decode"):
         described = context.describe(refined)
@@ -246,8 +246,8 @@ def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, c
     that each group is compared with its nearest groups there.
     """
     rows = np.arange(len(parts))
-    across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options, context).clusters
-    within = match(take(parts, rows[num_old:]), options, context).clusters
+    across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
+    within = match(take(parts, rows[num_old:]), options).clusters
     within = np.concatenate([rows[:num_old] + len(rows), within])
     leaders = [np.unique(clusters, return_index=True, return_inverse=True)[1:] for clusters in (across, within)]
     neighbors = np.stack([first[places] for first, places in leaders], 1)

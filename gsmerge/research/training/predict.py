@@ -38,7 +38,6 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
 from gsmerge.stages.decode import divide
-from gsmerge.stages.encode import make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take
 from gsmerge.types import SH_C0, Array, FeatureGaussians, Gaussians, Matches, as_array, as_tensor
@@ -248,11 +247,11 @@ class TrainingContext(NetworkContext):
         """Apply corrections ``[g,14]`` to Feature Gaussians of tensors."""
         return move_feature_tensors(group_features, residuals)
 
-    def decode_one(self, features: FeatureGaussians) -> tuple[Array, Array]:
-        """Run the head for K = 1, whose geometry is carried on; return means and covariances as tensors."""
+    def decode_covars(self, features: FeatureGaussians) -> Array:
+        """Run the head for K = 1; return the covariances of its Gaussians as tensors, with gradients."""
         g, _ = self.correct_children(None, np.arange(len(features)), self.describe(features))
         half = quat_to_rotmat(g.quats) * g.scales[:, None]
-        return g.means, half @ half.transpose(1, 2)
+        return half @ half.transpose(1, 2)
 
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
@@ -295,7 +294,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     context = TrainingContext(networks, example.members, example.cameras, seed)
     encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))
-    matches = match_crop(crop, features_to_arrays(encoded), options, networks, seed)
+    matches = match_crop(crop, features_to_arrays(encoded), options)
     refined = refine_features(_merge(encoded, matches, context), context)
     return RefinedCrop(context, context.describe(refined), matches)
 
@@ -347,18 +346,13 @@ def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
     return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
 
 
-def match_crop(
-    crop: Crop, parts: FeatureGaussians, options: TrainOptions, networks: Networks | None = None, seed: int = 0
-) -> Matches:
+def match_crop(crop: Crop, parts: FeatureGaussians, options: TrainOptions) -> Matches:
     """Match the Feature Gaussians ``parts`` of a crop, or return the clusters with which its example was fitted."""
     matches = crop.example.matches
-    if matches is not None:
-        ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
-        return Matches(local, len(ids))
-    example = crop.example
-    corrector = make_corrector(networks, example.members, example.cameras, seed)
-    with torch.no_grad():
-        return match(parts, options.match_options(), corrector)
+    if matches is None:
+        return match(parts, options.match_options())
+    ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
+    return Matches(local, len(ids))
 
 
 def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
