@@ -267,7 +267,7 @@ PAPER_SHIPPED: Mapping[str, Any] = {
     "most": 4000,
     "teacher_steps": 500,
     "diversity_steps": 1_000,
-    "save_every": 100,
+    "save_every": 200,
     "validation_examples": 6,
     "validation_windows": 4,
 }
