@@ -21,9 +21,10 @@ import time
 from pathlib import Path
 
 import numpy as np
+from exports import export as write_export
 from many_views import many_views
 from quality import score, setting
-from shared_scenes import Targets, export, exporter, read_held_out, scene_folders
+from shared_scenes import Targets, export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge import Compactor
@@ -51,7 +52,7 @@ def batches(name: str, views: int, size: int, order: str, cache: Path) -> list[P
                     (folder / part).symlink_to((source / part).resolve())
             frames = [context[i] for i in ids[first : first + size]]
             (folder / "transforms.json").write_text(json.dumps(document | {"frames": frames}))
-            ply = Path(exporter().export(folder, folder / "plain", "plain"))
+            write_export(folder, folder / "plain")
             (folder / "done").touch()
         results.append(ply)
     return results

@@ -20,8 +20,9 @@ from pathlib import Path
 
 from defaults import NAME as DEFAULTS
 from defaults import read_defaults
+from exports import export as write_export
 from result_tables import SHARE, page_of
-from shared_scenes import exporter, scene_folders, shared_folder
+from shared_scenes import scene_folders, shared_folder
 
 from gsmerge.cli import main as gsmerge
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
@@ -95,7 +96,7 @@ def exports(style: str, split: str, cache: Path) -> list[Path]:
     for folder in scene_folders(split):
         place = cache / style / folder.name
         if not (place / "done").exists():
-            exporter().export(folder, place, style)
+            write_export(folder, place, style)
             (place / "done").touch()
         out.append(place)
     return out
