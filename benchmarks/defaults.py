@@ -1,10 +1,10 @@
-"""The default fit seed by seed, enlarged, and with compensation, for docs/results.md.
+"""The defaults seed by seed, of held-out views and from outside: two tables of docs/results.md.
 
-python benchmarks/defaults.py                  # the evaluation scenes, five seeds; what is done is not repeated
-python benchmarks/defaults.py --split train --seeds 2
+python benchmarks/defaults.py                  # the evaluation captures, five seeds; what is done is not repeated
+python benchmarks/defaults.py all --seeds 2    # all fifteen
 
-Held-out views, visible pixels, plain exports, and fog and holes from outside. Every seed is scored at the photos'
-size; the first one also at other sizes, and with compensation as some viewers have it.
+Plain exports, visible pixels, LPIPS of two views; intervals are 95 % t intervals over the seeds, which decide the order
+of the views, the backgrounds and the held-out patches.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from result_cells import make_table
+from page_tables import make_table
 from shared_scenes import export, scene_folders
 
 import gsmerge
@@ -26,128 +26,72 @@ from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.measure.fog import ALL
 from gsmerge.measure.scores import OUTSIDE
 from gsmerge.research.charts.lines import mean_interval
-from gsmerge.scene.held_out import read_held_out as read_views
+from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Views
 
-NAME = "defaults.jsonl"
-ZOOMS = (0.5, 1.0, 2.0, 4.0)
 LPIPS_VIEWS = 2
-SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 3)}  # heading and digits
+QUALITY = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 3)}  # heading and digits
+SIDES = {name: (heading, 3) for name, heading in OUTSIDE.items()}
+Columns = Mapping[str, tuple[str, int]]
 
 
 def measure(folder: Path, seed: int, cache: Path) -> dict[str, Any]:
-    """Scores of the input and of the default result on the held-out views of a scene."""
+    """Scores of the default result on the held-out views of a capture, and from outside."""
     load = load_scene(export(folder, cache))
-    held_out = read_views(load, folder / "transforms.json")
+    held_out = read_held_out(load, folder / "transforms.json")
     views = Views(held_out.cameras, held_out.images, held_out.names)
     results = {"gsmerge": gsmerge.compact(load.scene, seed=seed).gaussians}
     record: dict[str, Any] = {"scene": folder.name, "seed": seed}
-    more = {"zoom": ZOOMS} if seed == 0 else {}
-    options = EvaluateOptions(lpips=("vgg",), lpips_views=LPIPS_VIEWS, context=False, own=seed == 0, **more)
-    for result in evaluate(load.scene, results, views, options).results:
-        mean = result.mean("target")[1]
-        fog = asdict(result.fog[ALL]) if result.fog else {}
-        record[result.name] = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips_vgg} | fog
-        if seed == 0:
-            record[result.name]["zooms"] = {z: result.mean("target", zoom=z)[1].psnr for z in ZOOMS}
-    if seed == 0:
-        other = EvaluateOptions(lpips=(), context=False, antialiased=True, fog=False)
-        for result in evaluate(load.scene, results, views, other).results:
-            record[result.name]["compensated"] = result.mean("target")[1].psnr
-    return record
+    options = EvaluateOptions(lpips=("vgg",), lpips_views=LPIPS_VIEWS, context=False, own=False)
+    (result,) = evaluate(load.scene, results, views, options).results
+    mean = result.mean("target")[1]
+    record |= {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips_vgg}
+    return record | (asdict(result.fog[ALL]) if result.fog else {})
 
 
-def read_defaults(path: Path) -> list[dict[str, Any]]:
-    """What was measured so far."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def make_section(records: Sequence[Mapping[str, Any]]) -> str:
-    """The part of docs/results.md; empty without records."""
-    if not records:
-        return ""
-    columns = seed_columns(records)
-    seeds = make_table(("scene", "seeds", *(heading for heading, _ in columns.values())), seed_rows(records))
-    outside = "\n[Fog and holes](guide/evaluate.md#fog-and-holes) are seen from outside." if "holes" in columns else ""
-    views = make_table(
-        ("scene", "result", *(f"{zoom:g} x" for zoom in ZOOMS), "compensated"),
-        view_rows(records),
-    )
-    return f"""## The defaults, seed by seed
-
-Made by `python benchmarks/defaults.py`. Held-out views; intervals are 95 % t intervals over the seeds, which decide the
-order of the views, the backgrounds and the held-out patches.{outside}
-
-{seeds}
-
-### As viewers show it
-
-PSNR (dB) of the first seed: the photos resized to so many times their size; and at their size with the opacity of
-small Gaussians lowered by what the low-pass adds (`--antialiased`).
-
-{views}"""
-
-
-def seed_columns(records: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, int]]:
-    """Heading and digits of each score of :func:`seed_rows`, by name; fog and holes where a record has them."""
-    measured = any("holes" in record["gsmerge"] for record in records)
-    return SCORES | ({name: (heading, 3) for name, heading in OUTSIDE.items()} if measured else {})
-
-
-def seed_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Scene, number of seeds, and the interval of each score over the seeds; the last row is of all scenes."""
-    by_scene: dict[str, list[Mapping[str, Any]]] = {}
-    for record in records:
-        by_scene.setdefault(record["scene"], []).append(record["gsmerge"])
-    columns, rows = seed_columns(records), []
-    means: dict[str, list[float]] = {name: [] for name in columns}
-    for scene, some in sorted(by_scene.items()):
-        cells = []
-        for name, (_, digits) in columns.items():
-            values = [value for one in some if (value := one.get(name)) is not None]
-            if not values:
-                cells.append("-")
-                continue
-            interval = mean_interval(values)
-            means[name].append(interval.mean)
-            cells.append(f"{interval.mean:.{digits}f} ± {interval.high - interval.mean:.{digits}f}")
-        rows.append((scene, str(len(some)), *cells))
-    last = [f"{np.mean(means[name]):.{digits}f}" if means[name] else "-" for name, (_, digits) in columns.items()]
-    return [*rows, ("mean", "", *last)] if rows else []
-
-
-def view_rows(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Scene, result, and PSNR at each size and with compensation; last the means."""
-    table: dict[str, list[tuple[str, list[float]]]] = {}
-    for record in sorted(records, key=lambda r: r["scene"]):
-        for name in ("input", "gsmerge") if record["seed"] == 0 else ():
-            one = record[name]
-            values = [*one["zooms"].values(), one["compensated"]]
-            table.setdefault(name, []).append((record["scene"], values))
-    rows = [(scene, name, *(f"{v:.2f}" for v in values)) for name, some in table.items() for scene, values in some]
-    for name, some in table.items():
-        rows.append(("mean", name, *(f"{v:.2f}" for v in np.mean([values for _, values in some], 0))))
+def make_rows(records: Sequence[Mapping[str, Any]], columns: Columns) -> list[tuple[str, ...]]:
+    """Capture, and the interval of each score over the seeds."""
+    rows = []
+    for scene in sorted({record["scene"] for record in records}):
+        some = [record for record in records if record["scene"] == scene]
+        cells = [interval([record.get(name) for record in some], d) for name, (_, d) in columns.items()]
+        rows.append((scene, *cells))
     return rows
+
+
+def interval(values: Sequence[float | None], digits: int) -> str:
+    """Mean and half of the interval; the mean alone of one value."""
+    known = [value for value in values if value is not None]
+    if len(known) < 2:
+        return f"{np.mean(known):.{digits}f}" if known else "-"
+    both = mean_interval(known)
+    return f"{both.mean:.{digits}f} ± {both.high - both.mean:.{digits}f}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--split", default="eval", help="train, eval, or names with commas between")
+    parser.add_argument("scenes", nargs="?", default="eval", help="all, train, eval, or names with commas between")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
-    parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results" / "runs")
     args = parser.parse_args()
-    args.runs.mkdir(parents=True, exist_ok=True)
-    path = args.runs / NAME
-    done = {(record["scene"], record["seed"]) for record in read_defaults(path)}
-    for folder in scene_folders(args.split):
+    args.cache.mkdir(parents=True, exist_ok=True)
+    path = args.cache / f"defaults-{gsmerge.__version__}.jsonl"
+    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    done = {(record["scene"], record["seed"]) for record in records}
+    splits = ("eval", "train") if args.scenes == "all" else (args.scenes,)
+    folders = [folder for split in splits for folder in scene_folders(split)]
+    for folder in folders:
         for seed in range(args.seeds):
             if (folder.name, seed) not in done:
-                record = measure(folder, seed, args.cache)
+                records.append(measure(folder, seed, args.cache))
                 with path.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
-                print(json.dumps(record), flush=True)
+                    file.write(json.dumps(records[-1]) + "\n")
+                print(json.dumps(records[-1]), flush=True)
+    chosen = [r for r in records if r["scene"] in {folder.name for folder in folders} and r["seed"] < args.seeds]
+    for columns in (QUALITY, SIDES):
+        head = ("capture", *(heading for heading, _ in columns.values()))
+        print(f"\n{make_table(head, make_rows(chosen, columns))}")
 
 
 if __name__ == "__main__":

@@ -19,8 +19,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from exports import ply_header, ply_rows, read_scene, view_gaussians, write_views
 from many_views import many_views
-from shared_scenes import exporter, scene_folders
+from shared_scenes import scene_folders
 
 import gsmerge
 
@@ -43,34 +44,14 @@ def scene_of(name: str, views: int, degree: int, cache: Path) -> Path:
 
 def write_export(source: Path, out: Path, degree: int) -> None:
     """What the exporter's style ``plain`` writes, view by view, as all at once would not fit; and harmonics."""
-    tool = exporter()
-    views = tool.read_scene(source)
-    tool.write_images(out / "images", views)
-    tool.write_transforms(out / "transforms.json", views)
-    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity"]
-    names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    count = sum(view["depth"].size for view in views)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
+    views, num = read_scene(source), 3 * ((degree + 1) ** 2 - 1)
+    write_views(out, views)
     rng, noise = np.random.default_rng(0), np.random.default_rng(1)
     with (out / "scene.ply").open("wb") as file:
-        file.write("\n".join(header).encode())
+        file.write(ply_header(sum(view["depth"].size for view in views), num))
         for view in views:
-            g = tool.view_gaussians(view, rng)
-            opacities = g["opacities"][:, None]
-            harmonics = noise.normal(0, HARMONIC, (len(opacities), len(rest)))
-            logits = np.log(opacities / (1 - opacities))
-            columns = [
-                g["means"],
-                np.zeros_like(g["means"]),
-                g["sh0"],
-                harmonics,
-                logits,
-                np.log(g["scales"]),
-                g["quats"],
-            ]
-            file.write(np.concatenate(columns, 1).astype("<f4").tobytes())
+            harmonics = noise.normal(0, HARMONIC, (view["depth"].size, num))
+            file.write(ply_rows(view_gaussians(view, rng), harmonics))
 
 
 def measure(scene: Path, settings: str, out: Path) -> tuple[dict, float]:

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from shared_scenes import exporter, scene_folders
+from exports import read_scene
+from shared_scenes import scene_folders
 
 TURN = 0.2  # degrees
 SHIFT = 0.002  # of the median depth
@@ -46,7 +47,7 @@ def many_views(scene: Path, out: Path, num_views: int, seed: int = 0) -> Path:
     context = [f for f in frames if f["role"] == "context"]
     if num_views < len(context):
         raise ValueError(f"expected at least the {len(context)} context views of {scene}, got {num_views}")
-    shift = SHIFT * float(np.median([np.median(view["depth"]) for view in exporter().read_scene(scene)]))
+    shift = SHIFT * float(np.median([np.median(view["depth"]) for view in read_scene(scene)]))
     targets = [f for f in frames if f["role"] != "context"]
     for frame in targets:
         _copy(scene / frame["file_path"], out / frame["file_path"])

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 from many_views import many_views
+from page_tables import make_table
 from quality import score, setting
-from result_cells import QUALITY, make_table
 from shared_scenes import Targets, export, read_held_out, scene_folders
 
 from gsmerge import Compactor, Gaussians, read_scene
@@ -36,6 +36,7 @@ from gsmerge.measure.speed import measure_costs
 KS = (1, 2, 4)  # Gaussians of each group
 NAIVE = "naive"
 WAYS = {NAIVE: "#D62728", **dict(zip((f"K = {k}" for k in KS), ("#1F77B4", "#2CA02C", "#9467BD"), strict=True))}
+QUALITY = ("PSNR", "SSIM", "LPIPS")
 NEAR = 0.01  # world units, that of gsmerge.render
 Figures = dict[str, float]  # by name
 Growth = dict[int, Figures]  # by number of views so far

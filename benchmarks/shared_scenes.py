@@ -1,26 +1,28 @@
-"""Real scenes next to the repository (``GSMERGE_SHARED`` or ``../shared``): exports, target views, visibility."""
+"""Captures of docs/guide/captures.md: their folders, exports, target views and visibility.
+
+They are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below ``../shared``.
+"""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import cv2
 import numpy as np
+from exports import FLIP, read_scene
+from exports import export as write_export
 
 from gsmerge.types import Cameras
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 LEFT_OUT = ("terrace", "mamechun")  # failure cases: depth mostly wrong, targets mostly unseen
 
 
 def shared_folder() -> Path | None:
-    """The folder with ``scenes/`` and ``tools/``, None where there is none."""
-    folder = Path(os.environ.get("GSMERGE_SHARED", Path(__file__).parents[2] / "shared"))
+    """The folder with ``scenes/``, None where there is none."""
+    folder = Path(os.environ.get("GSMERGE_DATA", Path(__file__).parents[2] / "shared"))
     return folder if (folder / "scenes").is_dir() else None
 
 
@@ -28,23 +30,13 @@ def scene_folders(split: str) -> list[Path]:
     """``train`` or ``eval``: the scenes of that split; otherwise a comma-separated list of names."""
     root = shared_folder()
     if root is None:
-        raise SystemExit("needs the scenes next to the repository: set GSMERGE_SHARED")
+        raise SystemExit(
+            "expected captures below GSMERGE_DATA, found none: docs/guide/captures.md says how to make them"
+        )
     known = {p.name: p for p in sorted(root.glob("scenes/*/*")) if p.is_dir()}
     if split in ("train", "eval"):
         return [p for p in known.values() if p.parent.name == split]
     return [known[name] for name in split.split(",")]
-
-
-def exporter() -> ModuleType:
-    """The tool that writes a scene as a backbone would."""
-    root = shared_folder()
-    assert root is not None
-    spec = importlib.util.spec_from_file_location("ff_export", root / "tools" / "ff_export.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def export(scene: Path, cache: Path, style: str = "plain") -> Path:
@@ -53,7 +45,7 @@ def export(scene: Path, cache: Path, style: str = "plain") -> Path:
     files = sorted(out.rglob("*.ply")) if (out / "done").exists() else []
     if files:
         return files[0]
-    path = Path(exporter().export(scene, out, style))
+    path = write_export(scene, out, style)
     (out / "done").touch()
     return path
 
@@ -70,7 +62,7 @@ class Targets:
 def read_held_out(scene: Path) -> Targets:
     """The target views of a scene; a pixel is visible if a context depth sample falls on it or on a neighbour."""
     frames = [f for f in json.loads((scene / "transforms.json").read_text())["frames"] if f["role"] == "target"]
-    views = exporter().read_scene(scene)
+    views = read_scene(scene)
     images = [cv2.imread(str(scene / f["file_path"]))[..., ::-1].astype(np.float32) / 255 for f in frames]
     viewmats = np.stack([np.linalg.inv(np.array(f["transform_matrix"]) @ FLIP) for f in frames])
     Ks = np.array([[[f["fl_x"], 0, f["cx"]], [0, f["fl_y"], f["cy"]], [0, 0, 1]] for f in frames])

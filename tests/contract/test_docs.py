@@ -116,6 +116,19 @@ def test_guides_are_read_in_five_minutes(page: str) -> None:
     assert len(read(page).split()) < 1000
 
 
+def test_results_are_short() -> None:
+    assert len(read("docs/results.md").split()) <= 3500
+
+
+@pytest.mark.parametrize("page", [page for page in WRITTEN if "python benchmarks/" in read(page)])
+def test_benchmarks_in_pages_are_there(page: str) -> None:
+    """Their scripts, and their options."""
+    text = re.sub(r"`[^`]*`", lambda code: code[0].replace("\n", " "), read(page))
+    for name, words in re.findall(r"python (benchmarks/\w+\.py)([^`\n]*)", text):
+        source = (ROOT / name).read_text()
+        assert [option for option in re.findall(r"--[a-z-]+", words) if f'"{option}"' not in source] == [], name
+
+
 def test_questions_are_answered_in_five_lines_with_a_command() -> None:
     answers = re.findall(
         r"^\*\*(.+?\?)\*\* (.+?)\n(?:\n|\Z)", read("docs/guide/faq.md") + "\n", re.MULTILINE | re.DOTALL

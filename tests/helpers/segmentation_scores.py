@@ -1,6 +1,6 @@
 """Photos that come with scikit-image and scikit-learn, and what superpixels of them are worth.
 
-Shared by the tests and ``benchmarks/segmentation.py``.
+Shared by the tests and ``benchmarks/adaptive_superpixels.py``.
 """
 
 from __future__ import annotations

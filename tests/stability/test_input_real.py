@@ -12,20 +12,20 @@ from scripts import load_script
 from gsmerge.scene.read import load_scene
 
 
-def shared_folder(root: Path) -> Path:
-    return Path(os.environ.get("GSMERGE_SHARED", root.parent / "shared"))
+def capture(root: Path) -> Path:
+    place = Path(os.environ.get("GSMERGE_DATA", root.parent / "shared")) / "scenes" / "eval" / "lightfield"
+    if not place.is_dir():
+        pytest.skip("no captures (GSMERGE_DATA)")
+    return place
 
 
-@pytest.fixture
-def exporter(root: Path) -> ModuleType:
-    path = shared_folder(root) / "tools" / "ff_export.py"
-    if not path.is_file():
-        pytest.skip("no measuring data (GSMERGE_SHARED)")
-    return load_script(path)
+@pytest.fixture(scope="module")
+def exports(root: Path) -> ModuleType:
+    return load_script(root / "benchmarks" / "exports.py")
 
 
-def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
-    ply = exporter.export(shared_folder(root) / "scenes" / "eval" / "lightfield", tmp_path, "plain", max_views=2)
+def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path) -> None:
+    ply = exports.export(capture(root), tmp_path, "plain", max_views=2)
     loaded = load_scene(ply)
     assert len(loaded.scene) == 2
     assert loaded.alignment.ok
@@ -35,9 +35,8 @@ def test_a_plain_export_lines_up(exporter: ModuleType, root: Path, tmp_path: Pat
     assert loaded.notes == ()
 
 
-def test_a_pruned_export_is_put_back(exporter: ModuleType, root: Path, tmp_path: Path) -> None:
-    scene = shared_folder(root) / "scenes" / "eval" / "lightfield"
-    ply = exporter.export(scene, tmp_path, "da3", max_views=2, nested_scale=1.7)
+def test_a_pruned_export_is_put_back(exports: ModuleType, root: Path, tmp_path: Path) -> None:
+    ply = exports.export(capture(root), tmp_path, "da3", max_views=2, nested=1.7)
     loaded = load_scene(ply)
     assert loaded.alignment.share_within_1px > 0.999
     assert loaded.recovery.best.layout.kind == "box+depth"

@@ -1,6 +1,6 @@
 """The renderer against float64 renders made with gsplat's own projection; they are large and lie outside the project.
 
-Opt-in: the folder ``golden`` with ``scenes.py`` and the renders is looked for in ``$GSMERGE_SHARED`` and in
+Opt-in: the folder ``golden`` with ``scenes.py`` and the renders is looked for in ``$GSMERGE_DATA`` and in
 ``../shared`` beside the repository.
 """
 
@@ -19,7 +19,7 @@ from gsmerge import Cameras, Gaussians
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 
-SHARED = Path(os.environ.get("GSMERGE_SHARED", Path(__file__).resolve().parents[4] / "shared"))
+SHARED = Path(os.environ.get("GSMERGE_DATA", Path(__file__).resolve().parents[4] / "shared"))
 GOLDEN = SHARED / "golden"
 
 pytestmark = pytest.mark.skipif(not (GOLDEN / "scenes.py").exists(), reason="needs the golden renders")

@@ -1,0 +1,107 @@
+"""The scripts that make captures and their exports, on a made scene; a function stands in for the depth network."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scripts import load_script
+
+import gsmerge
+from gsmerge.io.cameras.read import read_cameras
+from gsmerge.scene.read import load_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def script() -> Iterator[Callable[[str], ModuleType]]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks"))
+        patch.setattr(load_script(ROOT / "benchmarks" / "make_capture.py"), "SIDE", 320)
+        yield lambda name: load_script(ROOT / "benchmarks" / f"{name}.py")
+
+
+@pytest.fixture(scope="module")
+def made(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scene(tmp_path_factory.mktemp("photos") / "made", num_views=5, width=480, height=320)
+
+
+@pytest.fixture(scope="module")
+def capture(script: Callable[[str], ModuleType], made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("capture") / "scenes" / "eval" / "made"
+    script("make_capture").make_capture(made, out, flat, 3)
+    return out
+
+
+@pytest.fixture
+def photos(made: Path, tmp_path: Path) -> Path:
+    """A copy that may be changed."""
+    return Path(shutil.copytree(made, tmp_path / "made"))
+
+
+def flat(views: list[Any], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """A wall in the middle of the range."""
+    shape = views[0].image.shape[:2]
+    return np.full(shape, (near * far) ** 0.5), np.full(shape, 0.75)
+
+
+def test_views_are_spread_and_held_out_ones_midway(script: Callable[[str], ModuleType]) -> None:
+    inputs, held_out = script("make_capture").pick_views(50, 12)
+    assert inputs == [0, 4, 9, 13, 18, 22, 27, 31, 36, 40, 45, 49]  # of the capture fox
+    assert held_out == [2, 6, 11, 15, 20, 24, 29, 33, 38, 42, 47]
+    with pytest.raises(SystemExit, match="expected at least 7 photos for 4 views, found 6"):
+        script("make_capture").pick_views(6, 4)
+
+
+def test_a_capture_is_read_by_its_export(
+    script: Callable[[str], ModuleType], made: Path, capture: Path, tmp_path: Path
+) -> None:
+    document = json.loads((capture / "transforms.json").read_text())
+    roles = [frame["role"] for frame in document["frames"]]
+    assert roles == ["context", "target", "context", "target", "context"]
+    assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(320, 192)}
+
+    views = script("exports").read_scene(capture)
+    assert [view["name"] for view in views] == ["00000.jpg", "00002.jpg", "00004.jpg"]
+    own = gsmerge.read_scene(made)
+    frames = [frame for frame in document["frames"] if frame["role"] == "context"]
+    for view, frame in zip(views, frames, strict=True):
+        w2c = np.linalg.inv(view["c2w"])
+        depths = own.gaussians.means @ w2c[2, :3] + w2c[2, 3]
+        low, high = np.percentile(depths, (10, 60))
+        assert frame["depth_near"] < low < high < frame["depth_far"]
+        assert view["depth"] == pytest.approx((frame["depth_near"] * frame["depth_far"]) ** 0.5, rel=1e-3)
+        assert view["conf"] == pytest.approx(0.75, abs=0.005)
+
+    loaded = load_scene(script("exports").export(capture, tmp_path / "plain"))
+    assert loaded.alignment.ok
+    assert loaded.scene.num_gaussians == 3 * 320 * 192
+
+
+def test_a_view_without_points_is_named(script: Callable[[str], ModuleType], photos: Path, tmp_path: Path) -> None:
+    first = min((photos / "images").iterdir())
+    cv2.imwrite(str(first), np.full((320, 480, 3), 128, np.uint8))
+    with pytest.raises(SystemExit, match="00000: expected 10 points in common with others, found 0"):
+        script("make_capture").make_capture(photos, tmp_path / "out", flat, 3)
+
+
+def test_a_frame_without_its_photo_is_left_out(script: Callable[[str], ModuleType], photos: Path) -> None:
+    first, *others = sorted((photos / "images").iterdir())
+    first.unlink()
+    cameras = read_cameras(photos / "transforms.json")
+    assert [path for _, path in script("make_capture").find_photos(photos, cameras)] == others
+
+
+@pytest.mark.parametrize("style", ["da3", "depthsplat", "anysplat"])
+def test_every_style_is_read(style: str, script: Callable[[str], ModuleType], capture: Path, tmp_path: Path) -> None:
+    loaded = load_scene(script("exports").export(capture, tmp_path / style, style))
+    assert len(loaded.scene.cameras) == 3
+    assert loaded.scene.aligned == (style != "anysplat")
