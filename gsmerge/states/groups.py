@@ -25,7 +25,11 @@ def without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def bake(
-    features: FeatureGaussians, members: Members, networks: Corrector, max_k: int, saliency: np.ndarray
+    features: FeatureGaussians,
+    members: Members,
+    networks: Corrector,
+    max_k: int,
+    saliency: np.ndarray | None = None,
 ) -> GroupSet:
     """Decode groups into pooled Gaussians and children, so that neither gains, latents nor heads are needed."""
     ones = feature_to_gaussians(features)

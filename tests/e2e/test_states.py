@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hostile.gsm_files import with_about
+from network_fixtures import SMALL as TINY
+from network_fixtures import noisy, written
 from sweeps import sweep
 
 import gsmerge
@@ -31,22 +34,46 @@ def state(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_it_is_compacted_as_its_scene_is(state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
-    """Byte for byte."""
+@pytest.mark.parametrize("recipe", [False, True])
+def test_it_is_compacted_as_its_scene_is(recipe: bool, state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Byte for byte, for every K."""
+    wish = PLAIN
+    if recipe:
+        checkpoint = written(tmp_path / "small.safetensors", noisy(replace(TINY, outputs="absolute"), 0.05))
+        wish, state = ("--recipe", "paper", "--checkpoint", checkpoint), tmp_path / "scene.gsm"
+        assert run("extend", state, made_scene, *SMALL, *wish).code == 0
+    sizes = set[int]()
+    for k in (1, 2, 4, "mixed"):
+        one, other = tmp_path / f"one{k}.ply", tmp_path / f"other{k}.ply"
+        assert run("compact", state, *PLAIN, "--k", k, "-o", one).code == 0
+        assert run("compact", made_scene, *SMALL, *wish, "--k", k, "-o", other).code == 0
+        assert one.read_bytes() == other.read_bytes(), k
+        sizes.add(one.stat().st_size)
+    assert len(sizes) == 4
+
+
+def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
     one, other = tmp_path / "one.ply", tmp_path / "other.ply"
-    assert run("compact", state, *PLAIN, "--k", 2, "-o", one).code == 0
-    assert run("compact", made_scene, *PLAIN, *SMALL, "--k", 2, "-o", other).code == 0
+    wish = ("--k", "mixed", "--set", "k_low=20", "--set", "k_rule=distortion")
+    assert run("compact", state, *PLAIN, *wish, "-o", one).code == 0
+    assert run("compact", made_scene, *PLAIN, *SMALL, *wish, "-o", other).code == 0
     assert one.read_bytes() == other.read_bytes()
 
 
 @sweep(
     "wish",
-    [("--budget", "700", "--k", "2"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
+    [
+        ("--budget", "700", "--k", "2"),
+    [("--budget", 700, "--k", 2), ("--k", "mixed"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
+        ("--budget", "auto"),
+        ("--recipe", "paper"),
+        ("--budget", "3%"),
+    ],
     ids=str,
     often=3,
 )
 def test_what_the_batch_was_asked_for_is_the_default(
-    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
+    wish: tuple[str | int, ...], made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
     kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
     assert run("extend", kept, made_scene, *SMALL, *wish).code == 0
