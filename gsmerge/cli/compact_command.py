@@ -130,12 +130,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
-    for name, value in vars(args).items():
-        if value and name not in OF_STATES and value != opt.OPTIONS[name].default:
-            flag = f"--{name.replace('_', '-')}"
-            raise UsageError(
-                f"{flag}: expected a scene with it, {path} is a state, which gsmerge extend makes of scenes"
-            )
+    args.require_scene(OF_STATES, path)
     out = args.output or default_output(path)
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions

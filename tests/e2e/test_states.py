@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hostile.gsm_files import with_about
 from network_fixtures import SMALL as TINY
@@ -16,7 +17,7 @@ from sweeps import sweep
 
 import gsmerge
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 SMALL = ("--superpixels", 120)
 
@@ -62,13 +63,7 @@ def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, 
 
 @sweep(
     "wish",
-    [
-        ("--budget", "700", "--k", "2"),
     [("--budget", 700, "--k", 2), ("--k", "mixed"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
-        ("--budget", "auto"),
-        ("--recipe", "paper"),
-        ("--budget", "3%"),
-    ],
     ids=str,
     often=3,
 )
@@ -80,6 +75,36 @@ def test_what_the_batch_was_asked_for_is_the_default(
     assert run("compact", kept, *PLAIN, "-o", one).code == 0
     assert run("compact", made_scene, *PLAIN, *SMALL, *wish, "-o", other).code == 0
     assert one.read_bytes() == other.read_bytes()
+
+
+def test_feature_gaussians_as_arrays(state: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "features.npz"
+    document = json.loads(run("convert", state, out, "--json", code=0).out)
+    with np.load(out) as arrays:
+        count = len(arrays["means"])
+        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
+    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
+    assert_refused(run("convert", state, out), 2, "features.npz", "--overwrite")
+    assert f"{count:,} Feature Gaussians" in run("convert", state, out, "--overwrite", code=0).out
+    assert run("convert", state, out, "--overwrite", "--quiet", code=0).out == ""
+
+
+@pytest.mark.parametrize(
+    ("more", "name", "found"),
+    [((), "a.ply", "a.ply"), (("--up", "z"), "a.npz", "--up"), (("--cameras", "a.json"), "a.npz", "--cameras")],
+)
+def test_a_state_is_converted_as_it_is(
+    more: tuple[str, ...], name: str, found: str, state: Path, tmp_path: Path, run: Run
+) -> None:
+    assert_refused(run("convert", state, tmp_path / name, *more), 2, found, "state")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_state_is_converted_alone(state: Path, tmp_path: Path, run: Run) -> None:
+    assert_refused(run("convert", state, state, tmp_path / "a.npz"), 2, state, "alone", 2)
+    damaged = tmp_path / "a.gsm"
+    damaged.write_bytes(state.read_bytes()[:1000])
+    assert_refused(run("convert", damaged, tmp_path / "a.npz"), 3, "a.gsm")
 
 
 def test_no_files_of_the_scene_are_needed(scene_copy: Path, tmp_path: Path, run: Run) -> None:
