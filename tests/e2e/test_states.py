@@ -40,7 +40,8 @@ def test_it_is_compacted_as_its_scene_is(recipe: bool, state: Path, made_scene: 
     """Byte for byte, for every K."""
     wish = PLAIN
     if recipe:
-        checkpoint = written(tmp_path / "small.safetensors", noisy(replace(TINY, outputs="absolute"), 0.05))
+        options = replace(TINY, outputs="absolute", geometry="carried", merger_start="first", group_numbers=False)
+        checkpoint = written(tmp_path / "small.safetensors", noisy(options, 0.05))
         wish, state = ("--recipe", "paper", "--checkpoint", checkpoint), tmp_path / "scene.gsm"
         assert run("extend", state, made_scene, *SMALL, *wish).code == 0
     sizes = set[int]()

@@ -21,7 +21,7 @@ from hostile.gsm_files import (
 from messages import noted, refuses
 from network_fixtures import SMALL, Made, made, noisy, scaled, written
 from safetensors.numpy import load_file
-from unaligned_scenes import without_order
+from unaligned_scenes import voxels, without_order
 from view_batches import FAST, decoded, fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Scene, compact
@@ -93,6 +93,20 @@ def test_one_batch_is_a_scene(k: int | str, outputs: str, scene: Scene, checkpoi
     actual = fed([scene], **settings).decode(k=k, fit="none")
     expected = compact(scene, fit="none", poses="fixed", exposure="fixed", k=k, **settings).gaussians
     assert scenes.identical(actual, expected)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, "mixed"])
+def test_one_batch_in_no_order_is_a_scene(k: int | str, scene: Scene, tmp_path: Path) -> None:
+    """Bit for bit, where the recipe gives each Gaussian to the superpixel that shows most of it."""
+    options = replace(SMALL, outputs="absolute", geometry="carried", merger_start="first", group_numbers=False)
+    checkpoint = str(written(tmp_path / "networks.safetensors", noisy(options, 0.05)))
+    settings = {"recipe": "paper", "superpixels": "10%", "checkpoint": checkpoint}
+    unaligned = voxels(scene, 0.05)
+    compactor = fed([unaligned], **settings)
+    assert state_of(compactor).settings.num_slots is None
+    actual = compactor.decode(k=k, fit="none")
+    assert scenes.identical(actual, compact(unaligned, k=k, **settings).gaussians)
+    assert isinstance(k, str) or 0.9 * k * len(compactor) < len(actual) <= k * len(compactor)
 
 
 def test_some_pixels_of_the_views_say_about_the_same(
