@@ -267,7 +267,7 @@ def test_parts_tell_what_members_tell(some: Made) -> None:
     networks = noisy()
     plain, context = some.networks(networks), context_of(some, networks)
     features = encode_features(some.features, plain)
-    merged = merge(features, match(features, MatchOptions(match="aabb", iou=0.05), plain))
+    merged = merge(features, match(features, MatchOptions(match="aabb", iou=0.05)))
     assert len(merged) < len(features)
     for each in (features, merged):
         expected = compute_group_features(each, some.members, some.scene.cameras)
