@@ -130,20 +130,19 @@ def _compact_state(args: opt.Args, start: float) -> None:
     path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
-    for name, value in vars(args).items():
-        if value and name not in OF_STATES and value != opt.OPTIONS[name].default:
-            flag = f"--{name.replace('_', '-')}"
-            raise UsageError(
-                f"{flag}: expected a scene with it, {path} is a state, which gsmerge extend makes of scenes"
-            )
+    args.require_scene(OF_STATES, path)
     out = args.output or default_output(path)
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
     from gsmerge.settings.compact import CompactOptions
+    from gsmerge.settings.stages import DecodeOptions
+    from gsmerge.states.decode import OF_MIXED
     from gsmerge.states.files import compact_file, compact_line
 
-    left = {"viewer_cameras": False, "columns": "needed"}  # a state has no names of views
-    wanted, writing = args.make(FitOptions, FileOptions, **left)
+    kinds = FitOptions, FileOptions, DecodeOptions
+    left = {"viewer_cameras": False, "columns": "needed", "k": "auto", "min_opacity": 0.0}  # which a state has or lacks
+    wanted, writing, _ = args.make(*kinds, **left)
+    mixed = {name: value for name, value in args.values(*kinds, but=left).items() if name in OF_MIXED}
     check_format(out, writing)
     run = args.given(("effort", "seed", "threads"))
     with opt.usage_errors():
@@ -151,7 +150,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     before = {"import": perf_counter() - start}
     with stage_progress(quiet=args.silent) as progress:
         document = compact_file(
-            path, out, settings, k=args.k, budget=args.budget, always_fit=args.fit is not None,
+            path, out, settings, k=args.k, budget=args.budget, mixed=mixed, always_fit=args.fit is not None,
             normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
             dry_run=args.dry_run, progress=progress, seconds_before=before,
         )  # fmt: skip

@@ -8,13 +8,14 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, model_files, output_file
 from gsmerge.errors import UsageError
+from gsmerge.settings.extend import SUFFIX
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb or lod-meta.json; several of one "
                  "world are joined. The last is written, as its name says: one of these, .usdc, .usda, .usdz, or a "
-                 "folder named colmap."),
+                 "folder named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it."),
     opt.changed("images", help="Photos of the cameras, which --drop sky needs, and whose names a COLMAP model has."),
@@ -30,6 +31,9 @@ def convert(args: opt.Args) -> None:
     *inputs, output = args.paths
     if not inputs:
         raise UsageError(f"expected files to read and one to write, got {output} alone")
+    if any(path.suffix.lower() == SUFFIX for path in inputs):
+        _convert_state(args, inputs, output)
+        return
     writing, cleaning, placement = args.make(FileOptions, CleanOptions, PlacementOptions)
     output = output_file(output)
     check_outputs((output, *model_files(output)), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
@@ -45,4 +49,19 @@ def convert(args: opt.Args) -> None:
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)
     say_notes(document["notes"], quiet=args.silent)
+    print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)
+
+
+def _convert_state(args: opt.Args, inputs: list[Path], output: Path) -> None:
+    """Write the Feature Gaussians of a state as arrays."""
+    path = next(path for path in inputs if path.suffix.lower() == SUFFIX)
+    if len(inputs) > 1:
+        raise UsageError(f"{path}: expected a state alone, got {len(inputs)} inputs")
+    args.require_scene(("paths", "overwrite", "json", "quiet"), path)
+    from gsmerge.states.arrays import ENDING, conversion_line, convert_state
+
+    if output.suffix.lower() != ENDING:
+        raise UsageError(f"{output}: expected a name that ends in {ENDING}; of a state gsmerge compact makes Gaussians")
+    check_outputs((output,), (path,), overwrite=args.overwrite)
+    document = convert_state(path, output, overwrite=args.overwrite)
     print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)

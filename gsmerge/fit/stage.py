@@ -14,7 +14,7 @@ from gsmerge.fit.outside import outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
-from gsmerge.fit.survey import photo_error, survey_photos
+from gsmerge.fit.survey import photo_error, survey_photos, visible_mask
 from gsmerge.raster import prepare
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
@@ -66,12 +66,13 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
 
 def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Run :func:`fit` on a job with its views from outside."""
-    options, run = job.options, prepare_fit(job)
+    options = job.options
+    if options.fit == "none":  # as a state does, which has no photos
+        return gaussians[visible_mask(gaussians, job.photos[1], options.min_contribution)], None
+    run = prepare_fit(job)
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
-    if options.fit == "none":
-        return kept, None
     fixed = None if job.fixed is None else job.fixed[rows]
     fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
     if report.accepted:

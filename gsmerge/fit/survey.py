@@ -40,7 +40,7 @@ class Survey:
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     """Draw Gaussians into the half-size photos of a fit, and collect what they show of each.
 
-    The other sizes, full size first, tell the size of the finest pixel. Without a fit the score is NaN.
+    The other sizes, full size first, tell the size of the finest pixel.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -87,7 +87,7 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of renders on the held-out patches of the half-size photos; NaN if nothing is held out."""
     options = plan.job.options
-    if options.fit == "none" or not options.judged:
+    if not options.judged:
         return float("nan")
     return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
 

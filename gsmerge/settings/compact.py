@@ -11,7 +11,6 @@ from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of
 from gsmerge.settings.stages import (
-    MIXED,
     BlockOptions,
     CleanOptions,
     DecodeOptions,
@@ -112,8 +111,8 @@ class CompactOptions(Settings):
     @property
     def compact_only(self) -> list[str]:
         """Names of the settings in use that ``extend`` cannot honour."""
-        asked = {"k mixed": self.decode.k == MIXED, f"blocks {self.blocks.blocks}": isinstance(self.blocks.blocks, int)}
-        return [*self.whole_only, *(name for name, wanted in asked.items() if wanted)]
+        asked = self.blocks.blocks
+        return [*self.whole_only, *([f"blocks {asked}"] if isinstance(asked, int) else [])]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings by their flat names, as plain values."""

@@ -116,14 +116,23 @@ def mixed_counts(
     features: FeatureGaussians, members: Members, saliency: np.ndarray, options: DecodeOptions
 ) -> np.ndarray:
     """Choose K = 1, 2 or 4 for every group by its rank in ``saliency`` (paper supplement, per-superpixel K)."""
-    starts, ids = features.starts, features.members
-    pixels = members.pixels_of(ids)
-    values = np.where(pixels >= 0, saliency[pixels], 0.0)
-    means = np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
-    low, high = np.percentile(means, (options.k_low, options.k_high)) if len(means) else (0.0, 0.0)
-    counts = 1 + (means > low) + 2 * (means > high)
+    counts = counts_by_saliency(group_saliency(features, members, saliency), options)
     if options.k_rule == "distortion":
         return split_counts(features, members, int((counts - 1).sum()), MIXED_COUNTS[-1])
+    return counts
+
+
+def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
+    """Average the saliency of all views' pixels over each group's members, ``[g]``; without a pixel it is 0."""
+    starts, pixels = features.starts, members.pixels_of(features.members)
+    values = np.where(pixels >= 0, saliency[pixels], 0.0)
+    return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
+
+
+def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarray:
+    """Return K = 1, 2 or 4 for every group by the rank of its saliency ``[g]``."""
+    low, high = np.percentile(saliency, (options.k_low, options.k_high)) if len(saliency) else (0.0, 0.0)
+    counts: np.ndarray = 1 + (saliency > low) + 2 * (saliency > high)
     return counts
 
 

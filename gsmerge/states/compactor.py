@@ -10,7 +10,7 @@ from gsmerge.plan import resolve_fit
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import merge_settings
-from gsmerge.states.decode import decode_state
+from gsmerge.states.decode import OF_MIXED, decode_state
 from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.state import State
 from gsmerge.states.state_file import load_state, save_state
@@ -80,26 +80,33 @@ class Compactor:
         return report
 
     def decode(
-        self, *, k: int | None = None, budget: int | str | None = None, progress: Progress | None = None, **fit: Any
+        self,
+        *,
+        k: int | str | None = None,
+        budget: int | str | None = None,
+        progress: Progress | None = None,
+        **fit: Any,
     ) -> Gaussians:
         """Decode the current state into Gaussians; see :func:`gsmerge.states.decode.decode_state`.
 
         Args:
-            k: Gaussians of each group, 1 to ``max_k``; None: that of the settings.
+            k: Gaussians of each group, 1 to ``max_k``, or ``"mixed"``; None: that of the settings.
             budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size
                 as "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most.
             progress: See :func:`gsmerge.compact`.
-            **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``.
+            **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``, and
+                ``k_low``, ``k_high`` and ``k_rule`` of mixed K.
 
         Raises:
             ValueError: If there was no batch yet, or K or the budget is out of range.
         """
         if self._state is None:
             raise ValueError("expected at least one batch of views before decoding, got none")
+        mixed = {name: fit.pop(name) for name in OF_MIXED if name in fit}
         options = resolve_fit(CompactOptions().with_settings(fit)) if fit else None
         seed, threads = self._options.seed, self._options.threads
         return decode_state(
-            self._state, k=k, budget=budget, options=options, seed=seed, threads=threads, progress=progress
+            self._state, k=k, budget=budget, mixed=mixed, options=options, seed=seed, threads=threads, progress=progress
         ).gaussians
 
     def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +15,14 @@ from gsmerge.raster.photos import blank_photos, photos_of
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO, BudgetOptions
-from gsmerge.settings.stages import MAX_CHILDREN
-from gsmerge.stages.decode import deal_visible
+from gsmerge.settings.extend import merge_settings
+from gsmerge.settings.stages import MAX_CHILDREN, MIXED, MIXED_COUNTS
+from gsmerge.stages.decode import counts_by_saliency, deal_visible
 from gsmerge.states.groups import children_of, divide_groups, share
-from gsmerge.states.state import DividedGroups, State
+from gsmerge.states.state import DividedGroups, GroupSet, State
 from gsmerge.types import Gaussians
+
+OF_MIXED = ("k_low", "k_high", "k_rule")  # settings that say what mixed K is
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +36,12 @@ class DecodeCounts:
 
 
 def count_children(
-    state: State, groups: DividedGroups, *, k: int | None = None, budget: int | str | None = None
+    state: State,
+    groups: DividedGroups,
+    *,
+    k: int | str | None = None,
+    budget: int | str | None = None,
+    mixed: Mapping[str, Any] | None = None,
 ) -> DecodeCounts:
     """Count the Gaussians that each group of a state becomes; see :func:`decode_state`."""
     s = state.settings
@@ -50,13 +60,39 @@ def count_children(
     if budget is not None:
         return _distribute(state, groups, _group_budget(state, groups, budget))
     number = s.k if k is None else k
+    if number == MIXED:
+        return DecodeCounts(_mix(state, groups, mixed or {}), s.min_contribution)
     if not isinstance(number, int) or not 1 <= number <= s.max_k:
         more = "" if s.max_k == MAX_CHILDREN else ", as its first batch set (more with a larger max k)"
-        raise UsageError(f"k: expected 1 to {s.max_k}{more}, got {number!r}")
+        raise UsageError(f"k: expected mixed or 1 to {s.max_k}{more}, got {number!r}")
     if s.num_slots is not None:
         counts = _distribute(state, groups, s.num_slots * number)
         return replace(counts, min_contribution=s.min_contribution, total=None)
     return DecodeCounts(np.full(len(groups), number), s.min_contribution)
+
+
+def _mix(state: State, groups: DividedGroups, changes: Mapping[str, Any]) -> np.ndarray:
+    """Return K = 1, 2 or 4 of every group by its saliency, or as many Gaussians by distortion where they lower it.
+
+    ``changes``: of ``k_low``, ``k_high`` and ``k_rule`` as of the last batch.
+    """
+    most, max_k = MIXED_COUNTS[-1], state.settings.max_k
+    if groups.saliency is None:
+        raise UsageError("k mixed: expected a state that knows the saliency of its groups, found one of 0.1")
+    if max_k < most:
+        raise UsageError(f"k mixed: expected a state begun with a max_k of at least {most}, found {max_k}")
+    try:
+        options = replace(merge_settings({}, state.about["options"])[0].decode, **changes)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    counts = counts_by_saliency(groups.saliency, options)
+    if options.k_rule != "distortion":
+        return counts
+    if max_k > most:  # the order of the further Gaussians looks ahead to more
+        raise UsageError(f"k_rule distortion: expected a state begun with max_k {most}, found {max_k}")
+    if groups.division.by_heads and isinstance(state.groups, GroupSet):
+        raise UsageError("k_rule distortion: expected a state of one batch, found several, whose members are not kept")
+    return _distribute(state, groups, int(counts.sum())).per_group
 
 
 def _group_budget(state: State, groups: DividedGroups, budget: int | str) -> int:
@@ -119,8 +155,9 @@ def check_fit(state: State, options: FitOptions) -> None:
 def decode_state(
     state: State,
     *,
-    k: int | None = None,
+    k: int | str | None = None,
     budget: int | str | None = None,
+    mixed: Mapping[str, Any] | None = None,
     options: FitOptions | None = None,
     seed: int = 0,
     threads: int | None = None,
@@ -135,10 +172,11 @@ def decode_state(
 
     Args:
         state: From :func:`gsmerge.states.extend.extend` or :func:`gsmerge.states.state_file.load_state`.
-        k: Gaussians of each group, 1 to the largest number stored. None: the state's own.
+        k: Gaussians of each group, 1 to the largest number stored, or ``"mixed"``. None: the state's own.
         budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size as
             "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most. A full fit begins
             with fewer and grows to the number.
+        mixed: ``k_low``, ``k_high`` and ``k_rule`` of mixed K, where they are other than those of the last batch.
         options: The fit. None: the full one at its defaults where there are photos, otherwise none.
         seed: Seed of the fit.
         threads: Threads to use; None: all processors. The result does not depend on it.
@@ -150,7 +188,7 @@ def decode_state(
     options = options or FitOptions(fit="full" if len(state.replay) else "none")
     check_fit(state, options)
     groups = divide_groups(state, fitted_colors=options.fit == "none")
-    counts = count_children(state, groups, k=k, budget=budget)
+    counts = count_children(state, groups, k=k, budget=budget, mixed=mixed)
     if options.fit == "none":
         with use_threads(threads):
             return DecodeResult(state.frame.leave(decode_counts(state, groups, counts)), None, counts.notes)
@@ -171,5 +209,5 @@ def decode_state(
         if report is not None and not report.accepted:  # then the colours that were fitted batch by batch are better
             note = "the fit was not accepted: held-out patches of the photos did not get better"
             groups, notes = divide_groups(share(state)), (*notes, note)
-            gaussians = decode_counts(state, groups, count_children(state, groups, k=k, budget=budget))
+            gaussians = decode_counts(state, groups, count_children(state, groups, k=k, budget=budget, mixed=mixed))
     return DecodeResult(state.frame.leave(gaussians), report, notes)

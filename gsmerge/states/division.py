@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsmerge.kernels.gaussians.bisect import gather_groups
+from gsmerge.networks.corrector import Corrector
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.stages.decode import deal_order, halve, pool_children
 from gsmerge.types import FeatureGaussians, Gaussians
@@ -78,21 +79,29 @@ def divide_all(features: FeatureGaussians, members: Members, max_k: int) -> Divi
     )
 
 
-def divide_by_heads(features: FeatureGaussians, num_members: np.ndarray, max_k: int) -> Division:
-    """Divide every group into up to ``max_k`` children, at most one per member, for heads with absolute outputs.
+def make_division(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> Division:
+    """Divide every group into up to ``max_k`` children, as :func:`gsmerge.stages.decode.decode` does."""
+    if networks.makes_children:
+        return divide_by_heads(features, max_k, deal_order(features, members, max_k))
+    return divide_all(features, members, max_k)
 
-    Further children are added where a child represents the most pixels, weighted by the opacity of the group's members.
+
+def divide_by_heads(features: FeatureGaussians, max_k: int, growth_order: np.ndarray | None = None) -> Division:
+    """Divide every group into up to ``max_k`` children, for heads that make them of nothing.
+
+    ``growth_order``: by default further children are added where a child represents the most pixels, weighted by the
+    opacity of the group's members.
     """
-    splits = np.minimum(num_members, max_k) - 1
-    steps = np.arange(1, max_k)
-    shares = np.where(steps <= splits[:, None], features.weights[:, None] / steps, -np.inf)
-    order = np.argsort(-shares.reshape(-1), kind="stable")[: int(splits.sum())]
+    count = len(features)
+    if growth_order is None:
+        shares = features.weights[:, None] / np.arange(1, max_k)
+        growth_order = np.argsort(-shares.reshape(-1), kind="stable") // max(1, max_k - 1)
     return Division(
-        splits=splits.astype(np.uint8),
+        splits=np.full(count, max_k - 1, np.uint8),
         slots=np.zeros(0, np.uint8),
         uniform=np.zeros(0, np.int64),
         children=feature_to_gaussians(features)[:0],
-        growth_order=order // max(1, max_k - 1),
+        growth_order=growth_order,
     )
 
 

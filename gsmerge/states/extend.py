@@ -18,7 +18,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.stages import MAX_CHILDREN, USUAL_K
+from gsmerge.settings.stages import MAX_CHILDREN, MIXED, USUAL_K
 from gsmerge.stages.decode import keep_all, merged_count
 from gsmerge.stages.merge import MergedViews, take
 from gsmerge.stages.segment import knee_count
@@ -121,16 +121,17 @@ def _begin(new: BatchFeatures, batch: Batch, kind: StateKind) -> State:
     prepared, plan, cameras = batch.prepared, batch.plan, batch.photos.cameras
     max_k = _most_children(new, batch)
     groups = kind.divide(new, batch, max_k)
-    merged = MergedViews(groups.features, new.members, new.segmentation, len(new.features))
-    count, exact = merged_count(merged, plan.decode, grows=False), new.segmentation.exact
+    merged = MergedViews(groups.features, new.members, new.segmentation, len(new.features), new.context)
+    decode = replace(plan.decode, k=USUAL_K) if plan.decode.k == MIXED else plan.decode  # slots are those of any number
+    count, exact = merged_count(merged, decode, grows=False), new.segmentation.exact
     settings = StoredSettings(
         num_input=prepared.input_scene.num_gaussians,
-        k=AUTO if plan.auto_count else min(plan.decode.max_k, max_k),
+        k=AUTO if plan.auto_count else plan.decode.k if plan.decode.k == MIXED else min(plan.decode.max_k, max_k),
         max_k=max_k,
         min_opacity=plan.decode.min_opacity,
         min_contribution=plan.fit.min_contribution,
         target_count=count if exact else None,
-        num_slots=None if exact or count is None else count // plan.decode.max_k,
+        num_slots=None if exact or count is None else count // decode.max_k,
         knee_count=knee_count(prepared.scene, plan.superpixels),
     )
     return State(
@@ -205,7 +206,7 @@ def _check(state: State | None, scene: Scene, options: CompactOptions, max_k: in
             "fit full: goes with all photos together; expected none, and the full fit when the state is compacted"
         )
     if max_k is not None and options.decode.max_k > max_k:
-        raise UsageError(f"max_k: expected at least {options.decode.k}, which is k, got {max_k}")
+        raise UsageError(f"max_k: expected at least {options.decode.max_k} for k {options.decode.k}, got {max_k}")
     degree = scene.gaussians.sh_degree
     if state is not None and degree != state.sh_degree:
         expected = state.sh_degree

@@ -15,18 +15,19 @@ from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
-from gsmerge.states.division import divide_all
+from gsmerge.states.division import make_division
 from gsmerge.states.groups import (
     bake,
     concat_groups,
     limit_children,
+    merge_saliency,
     replace_groups,
     select_groups,
     with_fitted_colors,
     without_members,
 )
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, Heads, State
-from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind, batch_saliency
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
 
 if TYPE_CHECKING:
@@ -46,7 +47,9 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
     if isinstance(context, NetworkContext):
         described = context.describe(new.features)
         heads = Heads(cast("NetworkWeights", context.networks), described.views, described.group)
-    return DividedGroups(without_members(new.features), divide_all(new.features, new.members, max_k), heads)
+    division = make_division(new.features, new.members, context, max_k)
+    saliency = batch_saliency(new.features, new.members, batch)
+    return DividedGroups(without_members(new.features), division, heads, saliency=saliency)
 
 
 def _decode(groups: GroupSet, new: BatchFeatures) -> tuple[Gaussians, Gaussians]:
@@ -59,7 +62,8 @@ def _join(
 ) -> tuple[GroupSet, dict[str, int]]:
     """Merge a batch into the state's ``rows`` in view, and add groups that the state does not show yet."""
     with stage("decode"):
-        fresh = bake(new.features, new.members, new.context, max_k)
+        saliency = batch_saliency(new.features, new.members, batch)
+        fresh = bake(new.features, new.members, new.context, max_k, saliency)
     with stage("join"):
         partners = find_partners(take(groups.features, rows), fresh.features, batch.plan.match)
         has_partner = partners >= 0
@@ -108,5 +112,6 @@ def merge_into(groups: GroupSet, new: GroupSet, rows: np.ndarray, max_k: int) ->
     children = both.children[features.members]
     precision = old.colors.precision
     colors = Colors(np.where((precision > 0)[:, None, None], old.colors.sh0, features.sh0), precision)
-    merged = GroupSet(replace(features, members=np.arange(len(children))), children, colors)
+    saliency = merge_saliency(both.saliency, both.features.weights, pairs, len(rows))
+    merged = GroupSet(replace(features, members=np.arange(len(children))), children, colors, saliency=saliency)
     return replace_groups(groups, rows, limit_children(merged, max_k))

@@ -29,8 +29,15 @@ from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine, take
 from gsmerge.stages.segment import segment_scene
-from gsmerge.states.division import divide_all
-from gsmerge.states.groups import concat_groups, limit_children, make_groups, select_groups, without_members
+from gsmerge.states.division import make_division
+from gsmerge.states.groups import (
+    concat_groups,
+    limit_children,
+    make_groups,
+    merge_saliency,
+    select_groups,
+    without_members,
+)
 from gsmerge.states.state import (
     DividedGroups,
     GroupSet,
@@ -40,7 +47,7 @@ from gsmerge.states.state import (
     StateNetworks,
     ViewSamples,
 )
-from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind
+from gsmerge.states.view_batch import REACH, Batch, BatchFeatures, StateKind, batch_saliency
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
 
 WIDE = 3 * REACH  # standard deviations about what a view sees, in which the refiner finds the neighbours of its border
@@ -140,7 +147,7 @@ def _encode(state: State | None, batch: Batch, count: int | None) -> BatchFeatur
     weights = plan.networks
     assert weights is not None
     segmentation = segment_scene(batch.scene, plan.superpixels, count)
-    members = assign(batch.scene, segmentation.groups, draws=False)
+    members = assign(batch.scene, segmentation.groups, draws=plan.draws)
     pooled = encode(batch.scene, members, segmentation.groups)
     context = NetworkContext(weights, members, cameras, plan.seed)
     if state is None:
@@ -176,15 +183,16 @@ def _divide(new: BatchFeatures, batch: Batch, max_k: int) -> DividedGroups:
         described = context.describe(refined)
         return DividedGroups(
             without_members(merged),
-            divide_all(refined, new.members, max_k),
+            make_division(refined, new.members, context, max_k),
             Heads(cast("NetworkWeights", context.networks), described.views, described.group),
             learned=Learned(without_members(refined), described.views, np.diff(refined.starts)),
+            saliency=batch_saliency(refined, new.members, batch),
         )
 
 
 def _children(features: FeatureGaussians, context: NetworkContext, max_k: int) -> tuple[Gaussians, np.ndarray]:
     """Return the analytic children of every group, and the rising group of each; empty if heads need none."""
-    if context.options.outputs == "absolute":
+    if context.makes_children:
         return feature_to_gaussians(features)[:0], np.zeros(0, np.int64)
     return divide(features, context.members, np.full(len(features), max_k))
 
@@ -225,7 +233,10 @@ def _join(
     sizes = np.diff(both.features.starts)[merged.members]
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
     children = both.children[take(both.features, merged.members).members]
-    joined = make_groups(merged, children, owners.repeat(sizes), context.learn(refined))
+    weights = both.learned.num_members[merged.members]
+    saliency = None if both.saliency is None else both.saliency[merged.members]
+    saliency = merge_saliency(saliency, weights, owners, len(merged))
+    joined = make_groups(merged, children, owners.repeat(sizes), saliency, context.learn(refined))
     has_old = np.bincount(owners, merged.members < num_old, len(merged)) > 0
     num_joined = int((has_old[owners] & (merged.members >= num_old)).sum())
     return concat_groups([far, limit_children(joined, max_k)]), {"num_joined": num_joined}
@@ -236,7 +247,8 @@ def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch, ma
     views = batch.view_ids[features.views]
     parts = replace(features, views=views)
     learned = Learned(parts, views, np.diff(features.starts))
-    return make_groups(parts, *_children(features, context, max_k), learned)
+    children, parents = _children(features, context, max_k)
+    return make_groups(parts, children, parents, batch_saliency(features, context.members, batch), learned)
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, context: StateContext) -> Matches:

@@ -124,8 +124,9 @@ def compact_file(
     out: Path,
     settings: CompactOptions,
     *,
-    k: int | None = None,
+    k: int | str | None = None,
     budget: int | str | None = None,
+    mixed: Mapping[str, Any] | None = None,
     always_fit: bool = False,
     normals: bool = True,
     spz_version: int = 3,
@@ -157,13 +158,13 @@ def compact_file(
         "budget": budget,
     }  # fmt: skip
     if dry_run:
-        counts = count_children(state, divide_groups(state), k=k, budget=count)
+        counts = count_children(state, divide_groups(state), k=k, budget=count, mixed=mixed)
         most = int(counts.per_group.sum()) + len(state.kept)
         output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
         return document | output | {"notes": [*counts.notes, *notes]}
     with atomic_output(out, overwrite=overwrite) as temporary:
         decoded = decode_state(
-            state, k=k, budget=count, options=fit_options, seed=settings.seed, threads=settings.threads,
+            state, k=k, budget=count, mixed=mixed, options=fit_options, seed=settings.seed, threads=settings.threads,
             progress=progress,
         )  # fmt: skip
         gaussians, done = decoded.gaussians, perf_counter()

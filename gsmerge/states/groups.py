@@ -24,25 +24,36 @@ def without_members(features: FeatureGaussians) -> FeatureGaussians:
     return replace(features, starts=np.zeros(len(features) + 1, np.int64), members=np.zeros(0, np.int64))
 
 
-def bake(features: FeatureGaussians, members: Members, networks: Corrector, max_k: int) -> GroupSet:
+def bake(
+    features: FeatureGaussians,
+    members: Members,
+    networks: Corrector,
+    max_k: int,
+    saliency: np.ndarray | None = None,
+) -> GroupSet:
     """Decode groups into pooled Gaussians and children, so that neither gains, latents nor heads are needed."""
     ones = feature_to_gaussians(features)
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
-        children, parents = divide(features, members, np.full(len(features), max_k))
+        counts = np.full(len(features), max_k)
+        children, parents = _repeat(features, counts) if networks.makes_children else divide(features, members, counts)
     ones = networks.decode(ones, np.arange(len(features)), features)
     children = networks.decode(children, parents, features)
-    return make_groups(decoding_to(ones, features), children, parents)
+    return make_groups(decoding_to(ones, features), children, parents, saliency)
 
 
 def make_groups(
-    features: FeatureGaussians, children: Gaussians, parents: np.ndarray, learned: Learned | None = None
+    features: FeatureGaussians,
+    children: Gaussians,
+    parents: np.ndarray,
+    saliency: np.ndarray | None,
+    learned: Learned | None = None,
 ) -> GroupSet:
     """Make groups without fitted colours; ``parents``: rising group of each child."""
     if learned is not None:
         learned = replace(learned, refined=without_members(learned.refined))
     colors = Colors(features.sh0, np.zeros(len(features), np.float32))
-    return GroupSet(with_child_rows(features, parents), children, colors, learned)
+    return GroupSet(with_child_rows(features, parents), children, colors, learned, saliency)
 
 
 def decoding_to(ones: Gaussians, features: FeatureGaussians) -> FeatureGaussians:
@@ -83,7 +94,8 @@ def select_groups(groups: GroupSet, rows: np.ndarray) -> GroupSet:
     children = groups.children[features.members]
     members = np.arange(len(children))
     learned = None if groups.learned is None else groups.learned[rows]
-    return GroupSet(replace(features, members=members), children, groups.colors[rows], learned)
+    saliency = None if groups.saliency is None else groups.saliency[rows]
+    return GroupSet(replace(features, members=members), children, groups.colors[rows], learned, saliency)
 
 
 def concat_groups(sets: list[GroupSet]) -> GroupSet:
@@ -91,12 +103,25 @@ def concat_groups(sets: list[GroupSet]) -> GroupSet:
     features = FeatureGaussians.concat([groups.features for groups in sets])
     children = Gaussians.concat([groups.children for groups in sets])
     learned = [groups.learned for groups in sets if groups.learned is not None]
+    saliency = [groups.saliency for groups in sets if groups.saliency is not None]
     return GroupSet(
         replace(features, members=np.arange(len(children))),
         children,
         Colors.concat([groups.colors for groups in sets]),
         Learned.concat(learned) if learned else None,
+        np.concatenate(saliency) if len(saliency) == len(sets) else None,
     )
+
+
+def merge_saliency(
+    saliency: np.ndarray | None, weights: np.ndarray, clusters: np.ndarray, count: int
+) -> np.ndarray | None:
+    """Average the saliency ``[n]`` of parts, by their weights ``[n]``, over ``count`` clusters, one of each part."""
+    if saliency is None:
+        return None
+    weights = np.maximum(weights, 1e-12)
+    sums = (np.bincount(clusters, values, count) for values in (weights * saliency, weights))
+    return np.divide(*sums)
 
 
 def limit_children(groups: GroupSet, max_k: int) -> GroupSet:
@@ -143,13 +168,17 @@ def children_of(groups: DividedGroups, counts: np.ndarray, cameras: Cameras) -> 
 
 def _undecoded_children(groups: DividedGroups, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return the children of groups before heads correct them, and the group of each."""
-    division, ones = groups.division, feature_to_gaussians(groups.refined)
+    division = groups.division
     if division.by_heads:
-        sizes = np.minimum(counts, division.splits.astype(np.int64) + 1)
-        parents = np.repeat(np.arange(len(groups)), sizes)
-        return ones[parents], parents
+        return _repeat(groups.refined, np.minimum(counts, division.splits.astype(np.int64) + 1))
     rows, parents = pick_children(division, counts)
-    return Gaussians.concat([ones, division.children])[rows], parents
+    return Gaussians.concat([feature_to_gaussians(groups.refined), division.children])[rows], parents
+
+
+def _repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Return every Feature Gaussian as ``counts [g]`` equal Gaussians for heads to replace, and the group of each."""
+    parents = np.repeat(np.arange(len(features)), counts)
+    return feature_to_gaussians(features)[parents], parents
 
 
 def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSet:
@@ -157,12 +186,13 @@ def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSe
     most = np.full(len(groups), max_k)
     if groups.learned is not None and groups.heads is not None:
         children, parents = _undecoded_children(groups, most)
-        if groups.heads.networks.options.outputs == "absolute":  # heads make the children of nothing
+        if groups.heads.networks.options.makes_children:
             children, parents = children[:0], parents[:0]
-        shared = make_groups(groups.features, children, parents, groups.learned)
+        shared = make_groups(groups.features, children, parents, groups.saliency, groups.learned)
     else:
         ones, _ = children_of(groups, np.ones(len(groups), np.int64), cameras)
-        shared = make_groups(decoding_to(ones, groups.features), *children_of(groups, most, cameras))
+        children, parents = children_of(groups, most, cameras)
+        shared = make_groups(decoding_to(ones, groups.features), children, parents, groups.saliency)
     return shared if groups.colors is None else replace(shared, colors=groups.colors)
 
 
@@ -188,13 +218,14 @@ def divide_groups(state: State, *, fitted_colors: bool = True) -> DividedGroups:
         groups = with_fitted_colors(groups)
     features, members = groups.features, child_members(groups)
     if networks is None or groups.learned is None:
-        return DividedGroups(without_members(features), divide_all(features, members, max_k), None)
+        division = divide_all(features, members, max_k)
+        return DividedGroups(without_members(features), division, None, saliency=groups.saliency)
     learned = groups.learned
     described = networks.samples.describe(learned, state.cameras)
-    if networks.weights.options.outputs == "absolute":
-        division = divide_by_heads(learned.refined, learned.num_members, max_k)
+    if networks.weights.options.makes_children:
+        division = divide_by_heads(learned.refined, max_k)
     else:
         rows = replace(learned.refined, starts=features.starts, members=features.members)
         division = divide_all(rows, members, max_k)
     heads = Heads(networks.weights, learned.views, described.group)
-    return DividedGroups(without_members(learned.refined), division, heads)
+    return DividedGroups(without_members(learned.refined), division, heads, saliency=groups.saliency)

@@ -26,8 +26,9 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
+from gsmerge.settings.budget import AUTO
 from gsmerge.settings.extend import SUFFIX
-from gsmerge.settings.stages import MAX_CHILDREN
+from gsmerge.settings.stages import MAX_CHILDREN, MIXED
 from gsmerge.states.state import StoredSettings
 from gsmerge.types import Array, Cameras, FeatureGaussians, Gaussians, as_array
 
@@ -209,7 +210,7 @@ class GsmFile:
             value, is_share = self.header["settings"].get(f.name), f.name in ("min_opacity", "min_contribution")
             low, high = (1, MAX_CHILDREN) if f.name in ("k", "max_k") else (0, 1 if is_share else MAX_COUNT)
             absent = value is None and f.name in {"target_count", "num_slots"} & self.header["settings"].keys()
-            if not absent and not (f.name == "k" and value == "auto"):
+            if not absent and not (f.name == "k" and value in (AUTO, MIXED)):
                 number = isinstance(value, int | float if is_share else int) and not isinstance(value, bool)
                 if not number or not low <= value <= high:
                     raise self.error(f"{f.name}: expected a number from {low} to {high}, found {value!r:.40}")

@@ -25,7 +25,8 @@ class StoredSettings:
     """Settings of the batches on which decoding depends."""
 
     num_input: int  # Gaussians of all views
-    k: int | str  # Gaussians of each group by default, or `"auto"` where the budget was: `target_count` in all
+    # Gaussians of each group by default, or `"mixed"`, or `"auto"` where the budget was: `target_count` in all
+    k: int | str
     max_k: int  # Most children of a group that are stored
     min_opacity: float  # Gaussians below this opacity are left out
     # Gaussians that add less than this to every pixel of every view that they lie in are left out, where no number is
@@ -149,6 +150,7 @@ class DividedGroups:
     heads: Heads | None  # Networks that correct the children; None without any
     colors: Colors | None = None  # None without photos, and where heads set the colours
     learned: Learned | None = None  # Where groups keep their latents for later batches
+    saliency: np.ndarray | None = None  # As of `GroupSet`
 
     def __len__(self) -> int:
         return len(self.features)
@@ -176,6 +178,8 @@ class GroupSet:
     children: Gaussians
     colors: Colors
     learned: Learned | None = None  # Of states with networks
+    # [g] float64 mean corner response of the pixels of each group's members, by which K is mixed; None in files of 0.1
+    saliency: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.features)

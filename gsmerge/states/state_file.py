@@ -60,6 +60,8 @@ def save_state(path: str | PathLike[str], state: State, *, overwrite: bool = Fal
         if heads is not None:
             weights = heads.networks
             arrays |= {"heads.views": heads.views.astype(np.int32), "heads.group": float32(heads.group)}
+    if groups.saliency is not None:
+        arrays["features.saliency"] = groups.saliency
     if groups.colors is not None:
         arrays |= dict(zip(COLORS, (groups.colors.sh0, groups.colors.precision), strict=True))
     arrays |= _gaussians("kept", state.kept)
@@ -100,13 +102,15 @@ def load_state(path: str | PathLike[str]) -> State:
     if weights is not None and (keeps_latents or not divided):
         learned = _read_learned(file, features, weights, len(cameras))
         networks = StateNetworks(weights, _read_samples(file, len(cameras)))
+    saliency = file.array("features.saliency", np.float64, len(features)) if file.has("features.saliency") else None
     groups: DividedGroups | GroupSet
     if divided:
         heads = None if weights is None else _read_heads(file, weights, len(features), len(cameras))
         colors = _read_colors(file, len(features)) if file.has(*COLORS) else None
-        groups = DividedGroups(features, _read_division(file, features), heads, colors, learned)
+        groups = DividedGroups(features, _read_division(file, features, heads), heads, colors, learned, saliency)
     else:
-        groups = replace(_read_groups(file, features, settings.max_k, weights), learned=learned)
+        groups = _read_groups(file, features, settings.max_k, weights)
+        groups = replace(groups, learned=learned, saliency=saliency)
     return State(
         groups=groups,
         replay=_read_replay(file, cameras) if file.has("replay.") else no_photos(cameras),
@@ -135,15 +139,17 @@ def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) 
     return about
 
 
-def _read_division(file: GsmFile, features: FeatureGaussians) -> Division:
-    """Read the children for every K, and check that every index is in range."""
+def _read_division(file: GsmFile, features: FeatureGaussians, heads: Heads | None) -> Division:
+    """Read the children for every K, and check that every index is in range; heads may make them of nothing."""
     g = len(features)
     splits, slots = file.array("division.splits", np.uint8, g), file.array("division.slots", np.uint8, None)
     uniform = file.array("division.uniform", np.int32, None)
     order = file.array("division.growth_order", np.int32, None)
     counts = splits.astype(np.int64)
-    ok = counts.max(initial=0) < MAX_CHILDREN and counts.sum() == len(slots)
-    if ok:
+    of_nothing = heads is not None and heads.networks.options.makes_children and len(slots) == 0
+    complete = len(uniform) == 0 if of_nothing else counts.sum() == len(slots)
+    ok = complete and bool(counts.max(initial=0) < MAX_CHILDREN)
+    if ok and not of_nothing:
         steps = np.arange(len(slots)) - np.repeat(np.cumsum(counts) - counts, counts)
         in_order = len(uniform) == 0 or bool(uniform[0] >= 0 and uniform[-1] < g and (np.diff(uniform) > 0).all())
         ok = bool((slots <= steps).all()) and in_order and not counts[uniform].any()
@@ -176,7 +182,7 @@ def _read_groups(file: GsmFile, features: FeatureGaussians, max_k: int, weights:
     g, num_latents = len(features), features.latents.shape[1]
     if weights is None and num_latents:
         raise file.error(f"features.latents: expected 0 numbers in a state without networks, found {num_latents}")
-    least, most = (0, 0) if weights is not None and weights.options.outputs == "absolute" else (1, max_k)
+    least, most = (0, 0) if weights is not None and weights.options.makes_children else (1, max_k)
     counts = file.array("children.counts", np.uint8, g).astype(np.int64)
     if g and not least <= int(counts.min()) <= int(counts.max()) <= most:
         raise file.error(f"children.counts: expected {least} to {most}, found others")

@@ -22,6 +22,8 @@ from gsmerge.raster.weights import apply_transposed
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions
+from gsmerge.stages.decode import group_saliency
+from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.groups import replace_groups, select_groups
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, Replay, State, StateNetworks
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, PicturedScene, Segmentation
@@ -112,6 +114,11 @@ class StateKind:
     # Merge a batch with the groups at some rows, those in reach, up to `max_k` each; return all groups, and counts by
     # key of the report
     join: Callable[[GroupSet, np.ndarray, BatchFeatures, Batch, int], tuple[GroupSet, dict[str, int]]]
+
+
+def batch_saliency(features: FeatureGaussians, members: Members, batch: Batch) -> np.ndarray:
+    """Return the mean corner response ``[g]`` of the pixels of a batch's Feature Gaussians."""
+    return group_saliency(features, members, scene_saliency(batch.scene.images))
 
 
 def view_ids(known_cameras: Cameras, cameras: Cameras) -> np.ndarray:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hostile.gsm_files import with_about
+from network_fixtures import SMALL as TINY
+from network_fixtures import noisy, written
 from sweeps import sweep
 
 import gsmerge
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 SMALL = ("--superpixels", 120)
 
@@ -31,28 +35,77 @@ def state(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_it_is_compacted_as_its_scene_is(state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
-    """Byte for byte."""
+@pytest.mark.parametrize("recipe", [False, True])
+def test_it_is_compacted_as_its_scene_is(recipe: bool, state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Byte for byte, for every K."""
+    wish = PLAIN
+    if recipe:
+        options = replace(TINY, outputs="absolute", geometry="carried", merger_start="first", group_numbers=False)
+        checkpoint = written(tmp_path / "small.safetensors", noisy(options, 0.05))
+        wish, state = ("--recipe", "paper", "--checkpoint", checkpoint), tmp_path / "scene.gsm"
+        assert run("extend", state, made_scene, *SMALL, *wish).code == 0
+    sizes = set[int]()
+    for k in (1, 2, 4, "mixed"):
+        one, other = tmp_path / f"one{k}.ply", tmp_path / f"other{k}.ply"
+        assert run("compact", state, *PLAIN, "--k", k, "-o", one).code == 0
+        assert run("compact", made_scene, *SMALL, *wish, "--k", k, "-o", other).code == 0
+        assert one.read_bytes() == other.read_bytes(), k
+        sizes.add(one.stat().st_size)
+    assert len(sizes) == 4
+
+
+def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
     one, other = tmp_path / "one.ply", tmp_path / "other.ply"
-    assert run("compact", state, *PLAIN, "--k", 2, "-o", one).code == 0
-    assert run("compact", made_scene, *PLAIN, *SMALL, "--k", 2, "-o", other).code == 0
+    wish = ("--k", "mixed", "--set", "k_low=20", "--set", "k_rule=distortion")
+    assert run("compact", state, *PLAIN, *wish, "-o", one).code == 0
+    assert run("compact", made_scene, *PLAIN, *SMALL, *wish, "-o", other).code == 0
     assert one.read_bytes() == other.read_bytes()
 
 
 @sweep(
     "wish",
-    [("--budget", "700", "--k", "2"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
+    [("--budget", 700, "--k", 2), ("--k", "mixed"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
     ids=str,
     often=3,
 )
 def test_what_the_batch_was_asked_for_is_the_default(
-    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
+    wish: tuple[str | int, ...], made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
     kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
     assert run("extend", kept, made_scene, *SMALL, *wish).code == 0
     assert run("compact", kept, *PLAIN, "-o", one).code == 0
     assert run("compact", made_scene, *PLAIN, *SMALL, *wish, "-o", other).code == 0
     assert one.read_bytes() == other.read_bytes()
+
+
+def test_feature_gaussians_as_arrays(state: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "features.npz"
+    document = json.loads(run("convert", state, out, "--json", code=0).out)
+    with np.load(out) as arrays:
+        count = len(arrays["means"])
+        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
+    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
+    assert_refused(run("convert", state, out), 2, "features.npz", "--overwrite")
+    assert f"{count:,} Feature Gaussians" in run("convert", state, out, "--overwrite", code=0).out
+    assert run("convert", state, out, "--overwrite", "--quiet", code=0).out == ""
+
+
+@pytest.mark.parametrize(
+    ("more", "name", "found"),
+    [((), "a.ply", "a.ply"), (("--up", "z"), "a.npz", "--up"), (("--cameras", "a.json"), "a.npz", "--cameras")],
+)
+def test_a_state_is_converted_as_it_is(
+    more: tuple[str, ...], name: str, found: str, state: Path, tmp_path: Path, run: Run
+) -> None:
+    assert_refused(run("convert", state, tmp_path / name, *more), 2, found, "state")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_state_is_converted_alone(state: Path, tmp_path: Path, run: Run) -> None:
+    assert_refused(run("convert", state, state, tmp_path / "a.npz"), 2, state, "alone", 2)
+    damaged = tmp_path / "a.gsm"
+    damaged.write_bytes(state.read_bytes()[:1000])
+    assert_refused(run("convert", damaged, tmp_path / "a.npz"), 3, "a.gsm")
 
 
 def test_no_files_of_the_scene_are_needed(scene_copy: Path, tmp_path: Path, run: Run) -> None:

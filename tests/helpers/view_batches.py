@@ -92,11 +92,20 @@ def same_divided(one: DividedGroups, other: DividedGroups) -> None:
         assert a.dtype == b.dtype, name
         np.testing.assert_array_equal(a, b, name)
     assert scenes.identical(one.division.children, other.division.children)
+    same_saliency(one.saliency, other.saliency)
     for part, names in {"heads": ("views", "group"), "colors": ("sh0", "precision")}.items():
         a, b = getattr(one, part), getattr(other, part)
         assert (a is None) == (b is None), part
         for name in names if a is not None else ():
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), f"{part}.{name}")
+
+
+def same_saliency(one: np.ndarray | None, other: np.ndarray | None) -> None:
+    """To the last bit; files of 0.1 have none."""
+    assert (one is None) == (other is None)
+    if one is not None and other is not None:
+        assert one.dtype == other.dtype == np.float64
+        np.testing.assert_array_equal(one, other)
 
 
 def same_learned(one: Learned | None, other: Learned | None) -> None:
@@ -112,6 +121,7 @@ def same_groups(one: GroupSet, other: GroupSet) -> None:
     """To the last bit, types included."""
     same_features(one.features, other.features)
     same_learned(one.learned, other.learned)
+    same_saliency(one.saliency, other.saliency)
     assert scenes.identical(one.children, other.children)
     np.testing.assert_array_equal(one.colors.sh0, other.colors.sh0)
     np.testing.assert_array_equal(one.colors.precision, other.colors.precision)

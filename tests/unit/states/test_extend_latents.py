@@ -21,7 +21,7 @@ from hostile.gsm_files import (
 from messages import noted, refuses
 from network_fixtures import SMALL, Made, made, noisy, scaled, written
 from safetensors.numpy import load_file
-from unaligned_scenes import without_order
+from unaligned_scenes import voxels, without_order
 from view_batches import FAST, decoded, fed, parts_of, room, same_state, state_of
 
 from gsmerge import Compactor, Scene, compact
@@ -85,14 +85,28 @@ def groups_of(state: State) -> GroupSet:
 
 
 @pytest.mark.parametrize("outputs", OUTPUTS)
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_one_batch_is_a_scene(k: int, outputs: str, scene: Scene, checkpoints: dict[str, str]) -> None:
+@pytest.mark.parametrize("k", [1, 2, 3, 4, "mixed"])
+def test_one_batch_is_a_scene(k: int | str, outputs: str, scene: Scene, checkpoints: dict[str, str]) -> None:
     """Bit for bit."""
     settings = PLAIN | {"checkpoint": checkpoints[outputs]}
     settings.pop("tolerance")
     actual = fed([scene], **settings).decode(k=k, fit="none")
     expected = compact(scene, fit="none", poses="fixed", exposure="fixed", k=k, **settings).gaussians
     assert scenes.identical(actual, expected)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, "mixed"])
+def test_one_batch_in_no_order_is_a_scene(k: int | str, scene: Scene, tmp_path: Path) -> None:
+    """Bit for bit, where the recipe gives each Gaussian to the superpixel that shows most of it."""
+    options = replace(SMALL, outputs="absolute", geometry="carried", merger_start="first", group_numbers=False)
+    checkpoint = str(written(tmp_path / "networks.safetensors", noisy(options, 0.05)))
+    settings = {"recipe": "paper", "superpixels": "10%", "checkpoint": checkpoint}
+    unaligned = voxels(scene, 0.05)
+    compactor = fed([unaligned], **settings)
+    assert state_of(compactor).settings.num_slots is None
+    actual = compactor.decode(k=k, fit="none")
+    assert scenes.identical(actual, compact(unaligned, k=k, **settings).gaussians)
+    assert isinstance(k, str) or 0.9 * k * len(compactor) < len(actual) <= k * len(compactor)
 
 
 def test_some_pixels_of_the_views_say_about_the_same(
@@ -112,18 +126,20 @@ def test_some_pixels_of_the_views_say_about_the_same(
     assert np.abs(actual.heads.group[:, 19:] - expected.heads.group[:, 19:]).mean() < 0.05
 
 
-def test_children_are_those_of_the_heads(scene: Scene, absolute: dict[str, Any]) -> None:
-    """Nothing is stored of them where others join, and no group gives more than its members."""
-    whole = fed([scene], **absolute, min_contribution=0.0)  # which is the state's to say
-    groups = groups_of(share(state_of(whole)))
-    assert len(groups.children) == 0
-    sizes = groups.learned.num_members
-    counts = [len(whole.decode(k=k, fit="none")) for k in (1, 2, 4)]
-    most = [int(np.minimum(sizes, k).sum()) for k in (1, 2, 4)]
-    assert all(0.5 * limit < count <= limit for count, limit in zip(counts, most, strict=True))
-    assert len(whole.decode(k=3, fit="none")) > counts[1]
+@pytest.mark.parametrize("size", [2, 4])
+def test_children_are_those_of_the_heads(size: int, scene: Scene, absolute: dict[str, Any]) -> None:
+    """Nothing is stored of them, and each group gives as many as are asked for, however few its members are."""
+    settings = {"superpixels": "60%", "min_contribution": 0.0, "min_opacity": 0.0}
+    whole = fed(parts_of(scene, size), **absolute | settings)
+    groups = state_of(whole).groups
+    assert len(groups.children if size == 2 else groups.division.children) == 0
+    assert int(groups.learned.num_members.min()) < 3
+    assert [len(whole.decode(k=k, fit="none")) for k in (1, 2, 3, 4)] == [k * len(whole) for k in (1, 2, 3, 4)]
     with refuses(UsageError, "k", "1 to 4", 5):
         whole.decode(k=5)
+    if size == 2:
+        with refuses(UsageError, "k_rule distortion", "one batch"):
+            whole.decode(k="mixed", k_rule="distortion", fit="none")
 
 
 def test_a_number_of_gaussians(whole: Compactor) -> None:
@@ -148,9 +164,14 @@ def test_reports_of_further_batches(pairs: Compactor) -> None:
     assert len(state_of(pairs).cameras) == len(state_of(pairs).networks.samples.means) == 4
 
 
-def test_members_add_up(pairs: Compactor, scene: Scene) -> None:
-    """Each Gaussian of every batch is in one group."""
-    assert int(state_of(pairs).groups.learned.num_members.sum()) == scene.num_gaussians
+def test_members_add_up(pairs: Compactor, whole: Compactor, scene: Scene) -> None:
+    """Each Gaussian of every batch is in one group, and so is the saliency of its pixel."""
+    groups = [state_of(compactor).groups for compactor in (pairs, whole)]
+    assert [int(one.learned.num_members.sum()) for one in groups] == [scene.num_gaussians] * 2
+    sums = [float(np.sum(one.saliency * one.learned.num_members)) for one in groups]
+    assert sums[0] == pytest.approx(sums[1], rel=1e-6)
+    counts = [len(pairs.decode(k=k, fit="none")) for k in (1, "mixed", 2)]
+    assert counts == sorted(set(counts))
 
 
 @pytest.mark.parametrize("size", [1, 2])
@@ -246,7 +267,7 @@ def test_parts_tell_what_members_tell(some: Made) -> None:
     networks = noisy()
     plain, context = some.networks(networks), context_of(some, networks)
     features = encode_features(some.features, plain)
-    merged = merge(features, match(features, MatchOptions(match="aabb", iou=0.05), plain))
+    merged = merge(features, match(features, MatchOptions(match="aabb", iou=0.05)))
     assert len(merged) < len(features)
     for each in (features, merged):
         expected = compute_group_features(each, some.members, some.scene.cameras)

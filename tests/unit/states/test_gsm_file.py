@@ -64,6 +64,8 @@ DAMAGED: dict[str, Spoil] = {
     "wholes beyond": with_array("division.uniform", lambda _: np.full(1, 10_000_000, np.int32)),
     "wholes that are split": with_array("division.uniform", lambda _: np.zeros(1, np.int32)),
     "views beyond": with_array("heads.views", filled(3)),
+    "saliency of others": with_array("features.saliency", lambda a: a[1:]),
+    "saliency of nothing": with_array("features.saliency", filled(np.nan)),
     **of_arrays(ARRAYS, ("division.means", "heads.group")),
 }
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import motions
+import numpy as np
 import pytest
 import scenes
 from messages import names, refuses
@@ -14,9 +15,12 @@ from network_fixtures import noisy, written
 from unaligned_scenes import far_behind, shuffled, voxels
 from view_batches import decoded, one_batch
 
-from gsmerge import Gaussians, Scene, compact
+from gsmerge import Compactor, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
+from gsmerge.fit import peak_weights
+from gsmerge.raster.photos import blank_photos
 from gsmerge.states.decode import DecodeCounts, count_children
+from gsmerge.states.groups import children_of
 from gsmerge.states.state import DividedGroups, State
 from gsmerge.states.state_file import load_state, save_state
 
@@ -76,13 +80,13 @@ def assert_equal_to_compact(scene: Scene, **settings: Any) -> Gaussians:
     return actual
 
 
-@pytest.mark.parametrize("k", [1, 2, 3, 4])
-def test_one_state_gives_every_k(k: int, pixels: Scene, state: State) -> None:
+@pytest.mark.parametrize("k", [1, 2, 3, 4, "mixed"])
+def test_one_state_gives_every_k(k: int | str, pixels: Scene, state: State) -> None:
     assert scenes.identical(decoded(state, k=k), unfitted(pixels, k=k))
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_one_state_gives_every_k_without_photos(k: int, bare: Scene, bare_state: State) -> None:
+@pytest.mark.parametrize("k", [1, 2, 4, "mixed"])
+def test_one_state_gives_every_k_without_photos(k: int | str, bare: Scene, bare_state: State) -> None:
     assert scenes.identical(decoded(bare_state, k=k), unfitted(bare, k=k))
 
 
@@ -102,6 +106,10 @@ def test_pruning_by_what_the_views_see_is_done_without_photos(pixels: Scene) -> 
         {"k": 5},
         {"k": 8},
         {"budget": 500, "k": 7},
+        {"k": "mixed"},
+        {"k": "mixed", "k_low": 10, "k_high": 40},
+        {"k": "mixed", "k_rule": "distortion"},
+        {"k": "mixed", "budget": 300},
         {"budget": "auto"},
         {"effort": "draft", "k": 2},
         {"match": "aabb", "k": 2},
@@ -130,10 +138,11 @@ def test_networks_are_kept_with_the_scene(settings: dict[str, Any], pixels: Scen
     assert scenes.identical(decoded(load_state(tmp_path / "scene.gsm")), actual)
 
 
-@pytest.mark.parametrize("k", [1, 2, 4])
-def test_scenes_in_no_order(k: int, pixels: Scene) -> None:
+@pytest.mark.parametrize("begun_with", ["auto", "mixed"])
+@pytest.mark.parametrize("k", [1, 2, 4, "mixed"])
+def test_scenes_in_no_order(k: int | str, begun_with: str, pixels: Scene) -> None:
     unaligned = voxels(pixels, 0.05)
-    actual = one_batch(unaligned, superpixels="20%")
+    actual = one_batch(unaligned, superpixels="20%", k=begun_with)
     assert actual.settings.num_slots is not None
     assert actual.settings.max_k == 8
     assert scenes.identical(decoded(actual, k=k), unfitted(unaligned, k=k, superpixels="20%"))
@@ -189,11 +198,47 @@ def test_the_result_does_not_depend_on_the_threads(pixels: Scene, state: State) 
 
 @pytest.mark.parametrize(
     ("name", "value", "found"),
-    [("k", 0, "1 to 4"), ("k", "many", "1 to 4"), ("budget", 10, "begin"), ("budget", "0%", "one Gaussian")],
+    [("k", 0, "mixed or 1 to 4"), ("k", "many", "1 to 4"), ("budget", 10, "begin"), ("budget", "0%", "one Gaussian")],
 )
 def test_wishes_that_cannot_be_met(name: str, value: Any, found: str, state: State) -> None:
     with refuses(UsageError, name, found, value):
         decoded(state, **{name: value})
+
+
+MIXINGS = [{"k_low": 10, "k_high": 40}, {"k_rule": "distortion"}]
+
+
+@pytest.mark.parametrize("mixed", MIXINGS, ids=str)
+def test_how_k_is_mixed_may_be_said_later(mixed: dict[str, Any], pixels: Scene, state: State) -> None:
+    actual = decoded(state, k="mixed", mixed=mixed)
+    assert scenes.identical(actual, unfitted(pixels, k="mixed", **mixed))
+    assert not scenes.identical(actual, decoded(state, k="mixed"))
+    compactor = Compactor(superpixels=SHARE)
+    compactor.extend(pixels)
+    assert scenes.identical(compactor.decode(k="mixed", fit="none", **mixed), actual)
+
+
+def test_mixtures_that_cannot_be_had(pixels: Scene, state: State) -> None:
+    with refuses(UsageError, "k mixed", "4", 2):
+        decoded(one_batch(pixels, superpixels=SHARE, max_k=2), k="mixed")
+    with refuses(UsageError, "max_k", 4, "mixed", 2):
+        one_batch(pixels, superpixels=SHARE, k="mixed", max_k=2)
+    with refuses(UsageError, "k_rule distortion", "max_k 4", 8):
+        decoded(one_batch(pixels, superpixels=SHARE, max_k=8), k="mixed", mixed={"k_rule": "distortion"})
+    with refuses(UsageError, "k_high", 90):
+        decoded(state, k="mixed", mixed={"k_low": 90})
+    old = replace(state, groups=replace(groups_of(state), saliency=None))
+    with refuses(UsageError, "k mixed", "saliency", "0.1"):
+        decoded(old, k="mixed")
+
+
+def test_gaussians_that_are_seen_just_enough(pixels: Scene, state: State) -> None:
+    """Rounding decides about these, so both ways have to weigh in the same way."""
+    ones, _ = children_of(groups_of(state), np.ones(len(state), int), state.cameras)
+    peaks, _ = peak_weights(ones, blank_photos(state.cameras, 2))
+    for least in map(float, np.sort(peaks)[:: len(peaks) // 8]):
+        actual = decoded(replace(state, settings=replace(state.settings, min_contribution=least)), k=1)
+        assert scenes.identical(actual, unfitted(pixels, k=1, min_contribution=least))
 
 
 def test_fewer_children_take_less_space(pixels: Scene, state: State) -> None:
