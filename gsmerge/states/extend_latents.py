@@ -228,7 +228,7 @@ def _join(
     )
     ids = np.arange(len(both))
     parts = replace(both.features, starts=np.arange(len(both) + 1), members=ids.astype(np.int32))
-    merged = merge(parts, _match_parts(parts, num_old, batch.plan.match, context), context)
+    merged = merge(parts, _match_parts(parts, num_old, batch.plan.match), context)
     refined = _refine_near(merged, near.learned.refined, context)
     sizes = np.diff(both.features.starts)[merged.members]
     owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
@@ -251,7 +251,7 @@ def _parts(features: FeatureGaussians, context: NetworkContext, batch: Batch, ma
     return make_groups(parts, children, parents, batch_saliency(features, context.members, batch), learned)
 
 
-def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions, context: StateContext) -> Matches:
+def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
     """Match groups of a batch with each other, as in a scene, and with groups of the state.
 
     Clusters are the union of both matchings. For the second the state counts as one view and the batch as another, so
