@@ -436,3 +436,20 @@ def test_damage_is_told_in_one_line(damage: str, pairs: Compactor, tmp_path: Pat
     pairs.save(path)
     DAMAGED[damage](path)
     assert_refused_in_one_line(load_state, path)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        with_array("division.uniform", lambda _: np.full(1, 10_000_000, np.int32)),
+        with_array("division.splits", lambda a: a + 8),
+        with_array("division.splits", lambda a: a[1:]),
+        with_array("division.growth_order", filled(10_000_000)),
+    ],
+)
+def test_damaged_numbers_of_children_that_heads_make(damage: Spoil, whole: Compactor, tmp_path: Path) -> None:
+    path = tmp_path / "state.gsm"
+    whole.save(path)
+    assert len(load_file(path)["division.means"]) == 0
+    damage(path)
+    assert_refused_in_one_line(load_state, path)
