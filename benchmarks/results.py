@@ -77,9 +77,11 @@ CALLS = {
 def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
     """Every run of a table that is not done."""
     scenes = [str(place_export(folder, cache)) for folder in folders]
-    (split,) = {folder.parent for folder in folders}
+    splits = {folder.parent for folder in folders}
+    if len(splits) > 1:
+        raise SystemExit("expected captures of train or of eval, found some of both")
     for call in CALLS[name]:
-        targets = ("--targets", f"{split}/{{stem}}/transforms.json", "--output", str(out))
+        targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
         start = time.perf_counter()
         code = gsmerge(["chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
