@@ -1,14 +1,9 @@
 """Make a capture of docs/guide/captures.md from public photos, their cameras and a checkout of IterMVS.
 
-git clone https://github.com/NVlabs/instant-ngp; git clone https://github.com/FangjinhuaWang/IterMVS
 python benchmarks/make_capture.py instant-ngp/data/nerf/fox captures/scenes/eval/fox --itermvs IterMVS
 GSMERGE_DATA=captures python benchmarks/quality.py fox
 
-Photos are ordered by name. Input views are evenly spread, held-out views lie midway between them; photos are
-undistorted, reduced to 480 pixels on the longer side and cropped to multiples of 32. The depth and confidence of an
-input view are what IterMVS (github.com/FangjinhuaWang/IterMVS, needs torch) predicts from it and the four input views
-that share most points with it; the range of depths is that of the points. The folder that it writes is read by
-``shared_scenes.py``.
+That page says what it does. IterMVS is github.com/FangjinhuaWang/IterMVS and needs torch.
 """
 
 from __future__ import annotations
@@ -36,14 +31,13 @@ SIDE, MULTIPLE = 480, 32  # pixels
 SOURCES = 4  # views that a depth is predicted from, besides its own
 CHECKPOINT = "checkpoints/blendedmvs/model_000015.ckpt"
 RATIO = 0.75  # Lowe's, of the best match to the second
-MOST_ERROR = 1.0  # pixels between a point and its keypoints
-LEAST_ANGLE = 1.0  # degrees between its rays
+MOST_ERROR, LEAST_ANGLE = 1.0, 1.0  # pixels between a point and its keypoints, degrees between its rays
 LEAST_POINTS = 10  # of a view
 SHARES, MARGIN = (2, 98), (0.6, 2.0)  # range of depths: these percentiles of the points, times these
 Predict = Callable[["list[View]", float, float], "tuple[np.ndarray, np.ndarray]"]
 
 
-@dataclass
+@dataclass(frozen=True)
 class View:
     """A photo ``[h,w,3]`` uint8 BGR with intrinsics ``K [3,3]`` at its size and pose ``w2c [4,4]``, OpenCV axes."""
 
@@ -100,12 +94,10 @@ def share_points(views: list[View]) -> np.ndarray:
     for i, j in combinations(range(len(views)), 2):
         pairs = matcher.knnMatch(found[i][1], found[j][1], k=2)
         best = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
-        places = [
-            np.array([found[i][0][m.queryIdx].pt for m in best]),
-            np.array([found[j][0][m.trainIdx].pt for m in best]),
-        ]
-        if len(best):
-            depths = triangulate(views[i], views[j], *(place + 0.5 for place in places))
+        if best:
+            ids = zip(*((m.queryIdx, m.trainIdx) for m in best), strict=True)
+            places = [np.array([found[v][0][k].pt for k in some]) + 0.5 for v, some in zip((i, j), ids, strict=True)]
+            depths = triangulate(views[i], views[j], *places)
             counts[i, j] = counts[j, i] = len(depths)
             for view, column in zip((views[i], views[j]), depths.T, strict=True):
                 view.depths.extend(column)
@@ -119,10 +111,10 @@ def triangulate(a: View, b: View, in_a: np.ndarray, in_b: np.ndarray) -> np.ndar
     points = (homogeneous[:3] / np.where(homogeneous[3] == 0, 1e-12, homogeneous[3])).T
     good, depths, rays = np.ones(len(points), bool), [], []
     for view, place in ((a, in_a), (b, in_b)):
-        seen, depth = project_points(points, view.w2c[None], view.K[None])
+        seen, depth = (values[0] for values in project_points(points, view.w2c[None], view.K[None]))
         rays.append(points + view.w2c[:3, :3].T @ view.w2c[:3, 3])
-        good &= (depth[0] > 0) & (np.linalg.norm(seen[0] - place, axis=-1) < MOST_ERROR)
-        depths.append(depth[0])
+        good &= (depth > 0) & (np.linalg.norm(seen - place, axis=-1) < MOST_ERROR)
+        depths.append(depth)
     cosines = (rays[0] * rays[1]).sum(1) / np.prod([np.linalg.norm(r, axis=1) for r in rays], 0)
     good &= cosines < math.cos(math.radians(LEAST_ANGLE))
     return np.stack(depths, 1)[good]
@@ -137,8 +129,7 @@ def load_network(checkout: Path, checkpoint: Path) -> Predict:
 
     network = Pipeline(iteration=4, test=True)
     weights = torch.load(checkpoint, map_location="cpu", weights_only=True)["model"]
-    network.load_state_dict({name.removeprefix("module."): value for name, value in weights.items()})
-    network.eval()
+    network.eval().load_state_dict({name.removeprefix("module."): value for name, value in weights.items()})
 
     def predict(views: list[View], near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
         photos = np.stack([view.image[..., ::-1] for view in views]).astype(np.float32) / 127.5 - 1
@@ -162,10 +153,10 @@ def write_depth(out: Path, view: View, sources: list[View], predict: Predict) ->
     near, far = np.percentile(view.depths, SHARES) * MARGIN
     depth, confidence = predict([view, *sources], near, far)
     steps = (1 / depth - 1 / far) / (1 / near - 1 / far)
-    names = f"depth/{view.name}.png", f"depth/{view.name}_conf.png"
-    cv2.imwrite(str(out / names[0]), np.rint(65535 * steps.clip(0, 1)).astype(np.uint16))
-    cv2.imwrite(str(out / names[1]), np.rint(255 * confidence.clip(0, 1)).astype(np.uint8))
-    return {"depth_path": names[0], "confidence_path": names[1], "depth_near": near, "depth_far": far}
+    paths = {"depth_path": f"depth/{view.name}.png", "confidence_path": f"depth/{view.name}_conf.png"}
+    cv2.imwrite(str(out / paths["depth_path"]), np.rint(65535 * steps.clip(0, 1)).astype(np.uint16))
+    cv2.imwrite(str(out / paths["confidence_path"]), np.rint(255 * confidence.clip(0, 1)).astype(np.uint8))
+    return {**paths, "depth_near": near, "depth_far": far}
 
 
 def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
@@ -190,14 +181,13 @@ def make_capture(folder: Path, out: Path, predict: Predict, views: int) -> None:
             frame |= {"role": "context", **write_depth(out, view, best, predict)}
         frames.append(frame)
         print(view.name, frame["role"], flush=True)
-    document = {"camera_model": "PINHOLE", "scene": out.name, "frames": frames}
-    (out / "transforms.json").write_text(json.dumps(document, indent=1))
+    (out / "transforms.json").write_text(json.dumps({"camera_model": "PINHOLE", "frames": frames}, indent=1))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="photos with their cameras: transforms.json or a COLMAP model")
-    parser.add_argument("out", type=Path, help="DATA/scenes/eval/NAME, or train")
+    parser.add_argument("out", type=Path, help="below GSMERGE_DATA: scenes/eval/NAME, or train")
     parser.add_argument("--itermvs", type=Path, required=True, help="checkout of IterMVS")
     parser.add_argument("--checkpoint", type=Path, help=f"its weights; {CHECKPOINT} in it if not given")
     parser.add_argument("--views", type=int, default=12, help="input views")
