@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from exports import ply_header, ply_rows, read_scene, view_gaussians, write_views
+from capture_exports import ply_header, ply_rows, read_scene, view_gaussians, write_views
 from many_views import many_views
 from shared_scenes import scene_folders
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from exports import read_scene
+from capture_exports import read_scene
 from shared_scenes import scene_folders
 
 TURN = 0.2  # degrees

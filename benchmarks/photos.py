@@ -22,7 +22,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from exports import export
+from capture_exports import export
 from shared_scenes import Targets, read_held_out, scene_folders
 
 import gsmerge

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from exports import FLIP, read_scene
-from exports import export as write_export
+from capture_exports import FLIP, read_scene
+from capture_exports import export as write_export
 
 from gsmerge.types import Cameras
 

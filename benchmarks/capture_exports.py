@@ -1,7 +1,7 @@
 """Write a capture as feed-forward backbones write their scenes: a Gaussian for each pixel of its context views.
 
-python benchmarks/exports.py SCENE OUT                    # plain: all pixels, view by view
-python benchmarks/exports.py SCENE OUT --style anysplat   # or da3, depthsplat
+python benchmarks/capture_exports.py SCENE OUT                    # plain: all pixels, view by view
+python benchmarks/capture_exports.py SCENE OUT --style anysplat   # or da3, depthsplat
 
 Depth, confidence and colour are the capture's (docs/guide/captures.md); scales, rotations, opacities and offsets, which
 its depth network does not predict, follow from them with jitter. A seed gives the same bytes every time.
