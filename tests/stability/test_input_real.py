@@ -21,7 +21,7 @@ def capture(root: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def exports(root: Path) -> ModuleType:
-    return load_script(root / "benchmarks" / "exports.py")
+    return load_script(root / "benchmarks" / "capture_exports.py")
 
 
 def test_a_plain_export_lines_up(exports: ModuleType, root: Path, tmp_path: Path) -> None:
