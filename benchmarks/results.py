@@ -80,8 +80,8 @@ def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
     splits = {folder.parent for folder in folders}
     if len(splits) > 1:
         raise SystemExit("expected captures of train or of eval, found some of both")
+    targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
     for call in CALLS[name]:
-        targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
         start = time.perf_counter()
         code = gsmerge(["chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
