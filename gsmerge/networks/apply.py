@@ -90,11 +90,6 @@ class NetworkContext(Corrector):
         """Whether the heads make children of nothing."""
         return self.options.makes_children
 
-    def expand(self, features: FeatureGaussians, counts: np.ndarray) -> Gaussians:
-        """Run heads that make ``counts [g]`` children of every Feature Gaussian."""
-        described, parents = self.describe(features), np.repeat(np.arange(len(features)), counts)
-        return decode_with_group_features(described.base[parents], parents, described, self)
-
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Run the heads, see :func:`decode_gaussians`."""
         return decode_gaussians(children, parents, features, self)

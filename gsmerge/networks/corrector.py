@@ -32,12 +32,8 @@ class Corrector:
 
     @property
     def makes_children(self) -> bool:
-        """Whether :meth:`expand` makes the children of groups, instead of halving their members."""
+        """Whether :meth:`decode` makes children of nothing, so that every group can have any number of them."""
         return False
-
-    def expand(self, features: FeatureGaussians, counts: np.ndarray) -> Gaussians:
-        """Make ``counts [g]`` children of every Feature Gaussian, those of one adjacent."""
-        raise NotImplementedError
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Correct the children of Feature Gaussians; ``parents [n]`` are rows of ``features``, ascending."""

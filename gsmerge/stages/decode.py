@@ -39,10 +39,7 @@ def decode(
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    if networks.makes_children:
-        gaussians = networks.expand(features, counts)
-    else:
-        gaussians = networks.decode(*divide(features, members, counts), features)
+    gaussians = networks.decode(*make_children(features, members, counts, networks), features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
@@ -154,6 +151,19 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     labels = groups.labels.reshape(-1)[seen] + (np.cumsum(sizes) - sizes)[seen // groups.labels[0].size]
     num_filled = int((np.bincount(labels, minlength=len(groups)) > 0).sum())
     return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
+
+
+def make_children(
+    features: FeatureGaussians, members: Members, counts: np.ndarray, networks: Corrector
+) -> tuple[Gaussians, np.ndarray]:
+    """Return ``counts [g]`` children of every group for networks to correct, and the group ``[n]`` of each."""
+    return repeat(features, counts) if networks.makes_children else divide(features, members, counts)
+
+
+def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Return every Feature Gaussian as ``counts [g]`` equal Gaussians for heads to replace, and the group of each."""
+    parents = np.repeat(np.arange(len(features)), counts)
+    return feature_to_gaussians(features)[parents], parents
 
 
 def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:

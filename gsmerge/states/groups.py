@@ -10,7 +10,7 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log1p
 from gsmerge.networks.corrector import Corrector
 from gsmerge.pooling import MAX_OPACITY, Members, feature_to_gaussians, gaussian_members
-from gsmerge.stages.decode import divide
+from gsmerge.stages.decode import divide, make_children, repeat
 from gsmerge.stages.merge import take
 from gsmerge.states.division import divide_all, divide_by_heads, pick_children
 from gsmerge.states.state import Colors, DividedGroups, GroupSet, Heads, Learned, State
@@ -36,7 +36,7 @@ def bake(
     children, parents = ones, np.arange(len(features))
     if max_k > 1:
         counts = np.full(len(features), max_k)
-        children, parents = _repeat(features, counts) if networks.makes_children else divide(features, members, counts)
+        children, parents = make_children(features, members, counts, networks)
     ones = networks.decode(ones, np.arange(len(features)), features)
     children = networks.decode(children, parents, features)
     return make_groups(decoding_to(ones, features), children, parents, saliency)
@@ -170,15 +170,9 @@ def _undecoded_children(groups: DividedGroups, counts: np.ndarray) -> tuple[Gaus
     """Return the children of groups before heads correct them, and the group of each."""
     division = groups.division
     if division.by_heads:
-        return _repeat(groups.refined, np.minimum(counts, division.splits.astype(np.int64) + 1))
+        return repeat(groups.refined, np.minimum(counts, division.splits.astype(np.int64) + 1))
     rows, parents = pick_children(division, counts)
     return Gaussians.concat([feature_to_gaussians(groups.refined), division.children])[rows], parents
-
-
-def _repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Return every Feature Gaussian as ``counts [g]`` equal Gaussians for heads to replace, and the group of each."""
-    parents = np.repeat(np.arange(len(features)), counts)
-    return feature_to_gaussians(features)[parents], parents
 
 
 def share_groups(groups: DividedGroups, cameras: Cameras, max_k: int) -> GroupSet:
