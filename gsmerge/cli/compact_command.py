@@ -72,7 +72,8 @@ def compact(args: opt.Args) -> None:
     settings = _with_engine(settings, args)
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = output_file(args.output or default_output(files.base))
+    beside = default_output(files.base)
+    out = output_file(args.output or beside, beside.name)
     streamed, model = is_index(out), model_files(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})

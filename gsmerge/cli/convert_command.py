@@ -35,7 +35,7 @@ def convert(args: opt.Args) -> None:
         _convert_state(args, inputs, output)
         return
     writing, cleaning, placement = args.make(FileOptions, CleanOptions, PlacementOptions)
-    output = output_file(output)
+    output = output_file(output, inputs[0].name)
     check_outputs((output, *model_files(output)), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
     check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
