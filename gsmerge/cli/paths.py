@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CHECKPOINTS
 from gsmerge.settings.setting import Settings, setting
 
@@ -76,7 +75,7 @@ def is_page(path: Path) -> bool:
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
-    """List the other files of an output that is a web site or a COLMAP model; SceneError if that is another program's."""
+    """List the other files of a web site, or of a COLMAP model, of which another program's is a SceneError."""
     from gsmerge.io.formats.table import POINTS, SITE
 
     if SITE.names(output):
@@ -110,16 +109,6 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
-
-
-def check_embedding(output: Path, budget: BudgetOptions) -> None:
-    """Raise UsageError if cameras cannot be embedded: no comments in the format, or a budget in bytes."""
-    if output.suffix.lower() != ".ply":
-        raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
-    if budget.in_bytes:
-        raise UsageError(
-            f"--embed-cameras: expected a --budget without cameras inside, got {budget.budget}; give a number"
-        )
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
