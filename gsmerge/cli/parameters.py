@@ -374,9 +374,7 @@ _TABLE = (
     ),
     panel(
         MEASURING,
-        setting_option("photo_side"),
-        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="both, where installed"),
-        setting_option("lpips_views"),
+        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="alex, where installed"),
     ),
     panel(
         OUTPUT,
@@ -384,7 +382,6 @@ _TABLE = (
         setting_option("drop"),
         *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
         option("output", Path, "", "--output", "-o"),
-        setting_option("antialiased"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
                "than the input does, by more than .5 dB."),
