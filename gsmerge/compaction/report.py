@@ -49,7 +49,7 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
-        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours"; None
+        psnr_reference: What PSNR of the input views is measured against: "photos", or "the model's own pixels"; None
             where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
