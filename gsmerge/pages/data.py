@@ -42,7 +42,7 @@ MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
 LOSSLESS = 101  # quality of a WebP
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
-OUTLINE_LEVELS = 6  # of each channel in their colours: with the transparent one they fit a byte
+OUTLINE_LEVELS = 5  # of each channel in their colours: with the transparent one they fit a byte
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
 

@@ -19,7 +19,7 @@ MANY = 300_000  # Gaussians that are as small as pixels, each of which may be le
 # Steps of the numbers of a .spz: opacity, colour, logarithm of the scale; and levels of half a turn's rotation. With
 # the coarse ones pictures are 50 dB from those of the exact scene
 EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
-PIXEL_PARTS, DEPTH_PARTS = 8, 512  # of a pixel, and of a depth: steps of what belongs to pixels
+PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # of a pixel, and of a depth: steps of what belongs to pixels
 
 
 def pack_splats(
@@ -57,7 +57,7 @@ def pack_splats(
         head.pop("cameras", None)
         places = np.pad(means.reshape(-1, 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
     opacity, color, scale = (
-        (values.astype(np.int64) + step // 2) // step
+        np.round(values / step).astype(np.int64)  # halves to even numbers: no bias
         for values, step in zip((opacities, colors, scales), steps, strict=True)
     )
     color[:, 0::2] -= color[:, 1:2]  # from green, which says most of the others
@@ -71,7 +71,7 @@ def pack_splats(
         planes.append(signed.view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes())
         sizes.append(size)
     line = json.dumps(head | {"steps": steps, "levels": levels, "sizes": sizes}).encode() + b"\n"
-    return gzip.compress(line + b"".join(planes), 6, mtime=0), degree
+    return gzip.compress(line + b"".join(planes), mtime=0), degree
 
 
 def _pixel_places(means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
