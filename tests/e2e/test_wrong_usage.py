@@ -27,7 +27,7 @@ USAGE = {
     "compact room --report a.json": "*--report*--json",
     "compact room --superpixels 3%": "*--superpixels*--set superpixels=VALUE",
     "inspect room --seed 1": "*--seed*GSMERGE_SEED",
-    "inspect room alone.ply --cameras room": "--cameras*one scene",
+    "inspect room alone.ply --cameras room": "--cameras and --images*one scene",
     "chart room": "*chart*gsmerge lab chart",
     "check room": "*check*gsmerge inspect",
     "compact room --set pose=free": "--set pose*unknown*poses*--set help",
@@ -44,7 +44,7 @@ USAGE = {
     "compact room --set photo_scale=0.5": "photo_scale*0.5",
     "compact room --set photo_scale=small": "--set photo_scale*'small'",
     "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
-    "compact room --set method=magic": "method*'magic'*'voxel'",
+    "compact room --set method=magic": "method*voxel*'magic'",
     "compact room --set method=voxel --budget auto": "method voxel*budget auto",
     "compact room --set method=voxel --levels 2": "method voxel*levels",
     "compact room --set method=voxel --quality 20dB": "method voxel*quality 20dB",
@@ -55,7 +55,7 @@ USAGE = {
     "compact room out.ply": "out.ply*-o",
     "compress room": "*'compress'*'compact'",
     "metrics room": "*'metrics'*'evaluate'",
-    "batch room -o out --fit none --quality 30": "quality*'30'",
+    "batch room -o out --set fit=none --quality 30": "quality*'30'",
     "batch room -o out --set method=voxel --budget auto": "method voxel*budget auto",
     "batch room -o out --set require_checkpoint=true --set checkpoint=none": 'require_checkpoint*"none"',
     "batch room -o out --jobs many": "--jobs*auto*'many'",
@@ -157,7 +157,7 @@ PLACES = {
     "extend /proc/self/state.gsm room": "/proc/self/state.gsm*No such file",
     "extend new.gsm gone": "gone*no such",
     "render room --as views -o alone.ply/pictures": "alone.ply/pictures*work/alone.ply*--output",
-    "render room --path room/scene.ply -o a.mp4": "room/scene.ply*compact --embed-cameras",
+    "render room --path room/scene.ply -o a.mp4": "room/scene.ply*cameras inside",
     "evaluate room --lpips none --targets nowhere.json": "nowhere.json*cameras*nothing",
     "evaluate room --lpips none --targets room/transforms.json": "room/transforms.json*views*none",
     "evaluate room alone.ply --lpips none --merge-seconds room/transforms.json": "room/transforms.json*(total_seconds)",
@@ -203,7 +203,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("wrong usage is refused before the work")
 
-    for name in ("compaction.files.compact", "view.data.evaluate") if words not in NEED_THE_SCENE else ():
+    for name in ("compaction.files.compact", "pages.data.evaluate") if words not in NEED_THE_SCENE else ():
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)
