@@ -9,18 +9,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import typer.main
 from api_page import api_page
-
-from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
-KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
+COMMON = ("json", "quiet")  # options of all commands
+HEAD = ["| option | default | what it does |", "|---|---|---|"]
 
 
 def main() -> int:
@@ -67,25 +66,38 @@ def make_pages() -> dict[str, str]:
 
 def _index(commands: dict[str, Any]) -> str:
     rows = [f"| [{name}]({name}.md) | {_cell(command.help)} |" for name, command in commands.items()]
-    return "\n".join([NOTICE, "", "# Commands", "", "| command | what it does |", "|---|---|", *rows, ""])
+    common = [_option_row(param) for param in commands["compact"].params if param.name in COMMON]
+    lines = [
+        NOTICE,
+        "",
+        "# Commands",
+        "",
+        "| command | what it does |",
+        "|---|---|",
+        *rows,
+        "",
+        "All of them have:",
+        "",
+    ]
+    return "\n".join([*lines, *HEAD, *common, ""])
 
 
 def command_page(name: str, command: Any) -> str:
-    """The page of one command: usage, arguments, and a table of options for each panel of its help."""
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    """The page of a command, or of a group of commands: usage, arguments, and a table of options."""
+    lines = [NOTICE, "", f"# gsmerge {name}", ""]
+    if hasattr(command, "commands"):
+        lines += [command.help, ""]
+        for part, one in command.commands.items():
+            lines += [f"## {part}", "", *_command_lines(f"{name} {part}", one)]
+        return "\n".join(lines)
+    return "\n".join([*lines, *_command_lines(name, command)])
+
+
+def _command_lines(name: str, command: Any) -> list[str]:
     usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-    lines = [NOTICE, "", f"# gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```"]
-    if arguments:
-        lines += ["", "| argument | what it is |", "|---|---|"]
-        lines += [f"| `{_cell(_metavar(p))}` | {_cell(p.help)} |" for p in arguments]
-    panels: dict[str, list[Any]] = {}
-    for param in command.params:
-        if param.param_type_name == "option" and param.name not in ("help", "help_all"):
-            panels.setdefault(param.rich_help_panel or "Options", []).append(param)
-    for panel, params in panels.items():
-        lines += ["", f"## {panel}", "", "| option | value | default | what it does |", "|---|---|---|---|"]
-        lines += [_option_row(param) for param in params]
-    return "\n".join([*lines, ""])
+    arguments = [f"| `{_cell(_metavar(p))}` | | {_cell(p.help)} |" for p in command.params if p.opts[0][0] != "-"]
+    options = [_option_row(p) for p in command.params if p.opts[0][0] == "-" and p.name not in (*COMMON, "help")]
+    return [" ".join(command.help.split()), "", "```console", usage, "```", "", *HEAD, *arguments, *options, ""]
 
 
 def _metavar(param: Any) -> str:
@@ -93,25 +105,14 @@ def _metavar(param: Any) -> str:
 
 
 def _option_row(param: Any) -> str:
-    names = ", ".join(f"`{name}`" for name in sorted((*param.opts, *param.secondary_opts), key=_long_first))
-    repeated = "; may be repeated" if param.multiple else ""
-    return f"| {names} | {_values(param)}{repeated} | {_cell(_default(param))} | {_cell(param.help)} |"
+    first, *others = sorted((*param.opts, *param.secondary_opts), key=_long_first)
+    value = "" if param.is_flag else f" {_cell(param.metavar)}"
+    names = ", ".join(f"`{name}`" for name in (first + value, *others))
+    return f"| {names} | {_cell(_default(param))} | {_cell(param.help)} |"
 
 
 def _long_first(name: str) -> tuple[bool, bool]:
     return not name.startswith("--"), name.startswith("--no-")
-
-
-def _values(param: Any) -> str:
-    """What an option takes: nothing, one of some words, a number, a path."""
-    if param.is_flag:
-        return ""
-    if param.metavar and param.metavar not in METAVARS.values():
-        return f"`{_cell(param.metavar)}`"
-    kind = param.type_descriptor.annotation
-    kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
-    bounds = [("from", param.min), ("to", param.max)]
-    return " ".join([KINDS.get(kind, "text"), *(f"{word} {bound:g}" for word, bound in bounds if bound is not None)])
 
 
 def _default(param: Any) -> str:
@@ -151,9 +152,12 @@ def _settings_page() -> str:
         "`gsmerge extend`": flat_settings(ExtendOptions).values(),
     }
     lines = [NOTICE, "", "# Settings", ""]
-    lines += ["`compact`, `batch`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
+    lines += ["`compact`, `batch`, `extend` and `lab` take them as `--set NAME=VALUE`, such as"]
     lines += ["`--set poses=fixed --set min_opacity=0.01`; `compact` of a state takes those of the fit and of files,"]
-    lines += ["`render` and `view` those of superpixels. In Python they are arguments of `gsmerge.compact`."]
+    lines += [
+        "`convert` those of files and frames; `gsmerge COMMAND --set help` lists them. In Python they are arguments of"
+    ]
+    lines += ["`gsmerge.compact`."]
     lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
     lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
     for title, settings in tables.items():
@@ -225,7 +229,10 @@ def _training_page() -> str:
     from gsmerge.settings.setting import settings_of
 
     lines = [NOTICE, "", "# Settings of a training run", ""]
-    lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", ""]
+    lines += [
+        "`gsmerge lab train` takes them as `--set NAME=VALUE`, or in a TOML or JSON file: `--set config=FILE`.",
+        "",
+    ]
     lines += [*_table(settings_of(TrainOptions).values()), ""]
     return "\n".join([*lines, "## The table `network`", "", *_table(settings_of(NetworkOptions).values()), ""])
 
