@@ -7,13 +7,13 @@ import re
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import scenes
 from page_policy import check_policy
 
 from gsmerge.cli.paths import is_page, output_file
-from gsmerge.geometry import project
 from gsmerge.io import read_gaussians
 from gsmerge.io.formats.table import SITE_SCENE
 from gsmerge.pages.site import MAX_VIEWS, NAMES, site_contents
@@ -69,17 +69,15 @@ def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
     np.testing.assert_allclose(data["views"][data["start"]]["viewmat"], scene.cameras.viewmats[1].reshape(-1))
 
 
-def test_without_cameras_the_page_looks_at_most_gaussians_from_any_side() -> None:
+def test_without_cameras_one_may_look_from_any_side() -> None:
     gaussians = scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
-    data = data_of(site_contents(gaussians, NONE, "a", ())["index.html"])
+    contents = site_contents(gaussians, NONE, "a", ())
+    data = data_of(contents["index.html"])
     assert data["free"] is True
-    (view,) = data["views"]
-    fx, fy, cx, cy = view["K"]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    camera = Cameras(np.reshape(view["viewmat"], (1, 4, 4)), K[None], view["width"], view["height"])
-    (pixels,), (depths,) = project(gaussians.means, camera)
-    inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
-    assert inside.mean() > 0.75
+    assert data["start"] == 0
+    poster = cv2.imdecode(np.frombuffer(contents["poster.webp"], np.uint8), cv2.IMREAD_COLOR)
+    assert poster is not None
+    assert (poster > 20).any(2).mean() > 0.3  # it shows the scene
 
 
 def test_which_folders_are_sites(tmp_path: Path, contents: dict[str, bytes]) -> None:
