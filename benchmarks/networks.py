@@ -1,6 +1,6 @@
 """What the trained networks gain on real scenes: learned against analytic at equal counts, and stage by stage.
 
-python benchmarks/networks.py eval                     # the tables of docs/laboratory/networks.md; what is done is kept
+python benchmarks/networks.py eval                     # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
 

@@ -196,7 +196,7 @@ def head_section(bench: Bench) -> str:
     differences that are paired by capture. `python benchmarks/paper_tables.py --page docs/results.md` writes this
     section."""
     data = f"""Captures: {names}, with the depth of a multi-view-stereo network, and
-    [networks](laboratory/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
+    [networks](internals/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
     of DL3DV-Bench, MipNeRF360 and Tanks and Temples together, with the backbone that is named, and networks trained for
     300,000 steps on DL3DV-10K. The two compare only in order and differences."""
     return "\n\n".join((TITLE, filled(how), filled(data)))

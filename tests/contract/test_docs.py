@@ -267,7 +267,7 @@ def test_architecture_names_every_module(root: Path) -> None:
 
 def stability_rows(root: Path) -> list[tuple[str, str]]:
     """Number and test column of every case."""
-    rows = [line.split("|") for line in (root / "docs" / "laboratory" / "stability.md").read_text().splitlines()]
+    rows = [line.split("|") for line in (root / "docs" / "internals" / "stability.md").read_text().splitlines()]
     return [(row[1].strip(), row[4]) for row in rows if len(row) > 5 and row[1].strip()[:1].isdigit()]
 
 
@@ -293,6 +293,6 @@ def test_generator_names_every_range_style_and_path(root: Path) -> None:
     from gsmerge.research.generate.objects import STYLES
     from gsmerge.research.generate.synthetic_scene import PATHS
 
-    text = (root / "docs" / "laboratory" / "generator.md").read_text()
+    text = (root / "docs" / "internals" / "lab.md").read_text()
     names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]
     assert [name for name in names if f"`{name}`" not in text] == []

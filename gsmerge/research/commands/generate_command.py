@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     *opt.panel(
         "Errors",
         opt.option("noise", float, "Factor on the simulated errors of the network.", default=1.0, min=0.0, max=10.0),
-        opt.option("ranges", Path, "TOML or JSON file with ranges of the errors, as in docs/laboratory/generator.md.",
+        opt.option("ranges", Path, "TOML or JSON file with ranges of the errors, as in docs/internals/lab.md.",
                    wording="the built-in ones"),
     ),
     opt.output("Folder for the scenes: scene_0000 and on.", default=opt.REQUIRED),
