@@ -203,7 +203,7 @@ def test_every_option_has_help(name: str) -> None:
 
 
 def test_every_method_is_described() -> None:
-    text = read("docs/guide/baselines.md")
+    text = read("docs/internals/baselines.md")
     assert [method for method in method_names() if f"| `{method}` |" not in text] == []
 
 
