@@ -212,7 +212,7 @@ def summary(runs: dict[str, dict[str, Any]]) -> str:
         for name in MEASURES
         if all(name in r for r in runs.values())
     }
-    return " / ".join(f"{value:.2f}" if name == "psnr" else f"{value:.3f}" for name, value in means.items())
+    return "/".join(f"{value:.2f}" if name == "psnr" else f"{value:.3f}" for name, value in means.items())
 
 
 def words(interval: Interval) -> str:

@@ -37,7 +37,7 @@ FIRST: tuple[Ask, ...] = (
     ("`gsmerge`", OURS, {}, "budget"),
     ("the same, `--effort draft`", OURS, DRAFT, "superpixels"),
     ("the same, `--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("the same, `--fit none --checkpoint none`", OURS, BARE, "budget"),
+    ("the same, `--fit none --set checkpoint=none`", OURS, BARE, "budget"),
     *((f"`{name}`", name, {}, "budget") for name in BASELINES),
 )
 SECOND: tuple[Ask, ...] = (
@@ -47,7 +47,7 @@ SECOND: tuple[Ask, ...] = (
     ("the defaults", OURS, {}, "budget"),
     ("`--effort best`", OURS, {"effort": "best"}, "budget"),
     ("`--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("`--fit none --checkpoint none`", OURS, BARE, "budget"),
+    ("`--fit none --set checkpoint=none`", OURS, BARE, "budget"),
     *((f"`{name}`", name, {}, "budget") for name in (*BASELINES[2:4], *SLOW)),
     (f"`{UNMERGED} --effort fast`, the input after the same fit", UNMERGED, {"effort": "fast"}, ""),
 )
@@ -108,7 +108,7 @@ def mean(records: Sequence[RunRecord], name: str, digits: int) -> str:
 
 
 def quality(records: Sequence[RunRecord]) -> str:
-    return f"{mean(records, 'psnr_target_visible', 2)} / {mean(records, 'lpips_vgg_target_visible', 3)}"
+    return f"{mean(records, 'psnr_target_visible', 2)}/{mean(records, 'lpips_vgg_target_visible', 3)}"
 
 
 def kept(records: Sequence[RunRecord], size: str) -> str:
@@ -134,7 +134,7 @@ def cost_table(records: Sequence[RunRecord]) -> str:
         if some:
             words = ask[0] + kept(some, size)
             rows.append((words, quality(some), mean(some, "seconds", 1), mean(some, "render_ms", 0)))
-    return make_table(("method", "PSNR / LPIPS", "seconds", "ms a frame"), rows)
+    return make_table(("method", "PSNR/LPIPS", "seconds", "ms a frame"), rows)
 
 
 TABLES = {"sizes": sizes_table, "cost": cost_table}
