@@ -1,4 +1,4 @@
-"""Makes gsmerge/view/vendor: Spark and three.js in one compressed script, their licences, and where they came from.
+"""Makes gsmerge/pages/vendor: Spark and three.js in one compressed script, their licences, and where they came from.
 
 python tools/vendor_viewer.py
 

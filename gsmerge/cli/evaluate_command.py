@@ -162,7 +162,7 @@ def _write(outputs: Sequence[Path], document: Mapping[str, Any], pair: BeforeAft
     if len(texts) < len(outputs):
         from gsmerge.measure.evaluate import near_plane
         from gsmerge.measure.preview import view_pictures
-        from gsmerge.view.page import report_page
+        from gsmerge.pages.page import report_page
 
         scene = pair.scene
         parts, near = [("before", scene.file_gaussians), *pair.gaussians.items()], near_plane(scene)

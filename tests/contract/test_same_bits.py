@@ -28,7 +28,7 @@ REFUSED = {
 }
 # What computes no result: pages and pictures for people, research.
 OTHERS = (
-    "view/",
+    "pages/",
     "research/",
     "measure/lpips.py",
     "measure/preview.py",

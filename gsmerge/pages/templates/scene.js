@@ -37,7 +37,7 @@ async function gunzip(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// The .spz of what view/data.py packs: sums down every column of bytes, in a gzip stream that is not compressed.
+// The .spz of what pages/data.py packs: sums down every column of bytes, in a gzip stream that is not compressed.
 async function unpackSplats(packed) {
   const bytes = await gunzip(packed);
   const numbers = new DataView(bytes.buffer);

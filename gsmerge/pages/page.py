@@ -19,8 +19,8 @@ from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.measure.preview import Picture
 from gsmerge.measure.scores import filled_tables, page_notes, page_title
+from gsmerge.pages.data import PageView, ViewData, encode_still
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.view.data import PageView, ViewData, encode_still
 
 if TYPE_CHECKING:
     import jinja2
@@ -53,7 +53,7 @@ def view_page(data: ViewData) -> str:
     first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
     opened[left] = opened[right] = None
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    engine = files("gsmerge.view").joinpath(ENGINE).read_bytes() if splats else None
+    engine = files("gsmerge.pages").joinpath(ENGINE).read_bytes() if splats else None
     places = range(min(len(data.sides) - 1, 1), len(data.sides))
     results = [(_unbroken(headline(data, place)), figures(data, place)) for place in places]
     return render_template(
@@ -256,7 +256,7 @@ def _hashes(page: str, kind: str) -> list[str]:
 def _environment() -> jinja2.Environment:
     import jinja2
 
-    loader = jinja2.PackageLoader("gsmerge.view")
+    loader = jinja2.PackageLoader("gsmerge.pages")
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

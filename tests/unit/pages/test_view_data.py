@@ -23,11 +23,11 @@ from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
+from gsmerge.pages import data
+from gsmerge.pages.data import ViewData, collect, encode_still, pack_splats, short_names
 from gsmerge.raster.metrics import psnr
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Views
-from gsmerge.view import data
-from gsmerge.view.data import ViewData, collect, encode_still, pack_splats, short_names
 
 
 @pytest.fixture(scope="module")

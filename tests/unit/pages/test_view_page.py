@@ -18,8 +18,8 @@ from gsmerge.measure.evaluate import EvaluateOptions, Quality, evaluate
 from gsmerge.measure.fog import Fog
 from gsmerge.measure.preview import view_pictures
 from gsmerge.measure.scores import evaluation_document
-from gsmerge.view.data import ViewData, collect
-from gsmerge.view.page import headline, report_page, results_table, view_page
+from gsmerge.pages.data import ViewData, collect
+from gsmerge.pages.page import headline, report_page, results_table, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 WEBP = "data:image/webp;base64,"
@@ -254,7 +254,7 @@ def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> N
 
 def test_what_is_grey_says_why() -> None:
     """Controls are disabled in one place, which gives the reason."""
-    script = files("gsmerge.view").joinpath("templates", "view.js").read_text()
+    script = files("gsmerge.pages").joinpath("templates", "view.js").read_text()
     assert script.count(".disabled") == 1
     assert re.search(r"control\.disabled = .*\n  control\.title = reason", script)
 
@@ -283,7 +283,7 @@ def test_headline(before: float | None, after: float | None, words: str, data: V
 
 def test_the_renderer_is_the_one_that_was_vendored() -> None:
     """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
-    vendor = files("gsmerge.view").joinpath("vendor")
+    vendor = files("gsmerge.pages").joinpath("vendor")
     sources = json.loads(vendor.joinpath("SOURCES.json").read_text())
     script = gzip.decompress(vendor.joinpath(sources["script"]["file"]).read_bytes())
     assert hashlib.sha256(script).hexdigest() == sources["script"]["sha256"]
