@@ -6,6 +6,7 @@ python docs/generate_reference.py --check  # name them, exit code 1 if there are
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -172,24 +173,31 @@ def _settings_page() -> str:
 
 
 def _exporters_page(page: str) -> str:
-    """Renew the tables of a page: what lies between the comments that name them and those that end them."""
+    """Renew the lists of a page: what lies between the comments that name them and those that end them."""
     from gsmerge.scene.exporters import EXPORTERS
     from gsmerge.scene.no_gaussians import POINTS_ONLY
 
     exporters = EXPORTERS.values()
-    rows = [
-        (f"`{e.name}`", ", ".join(model.title for model in e.models), e.order, ", ".join(e.kinds * (e.order != "none")),
-         e.opacity, e.quats, ", ".join(map(str, e.degrees)), _columns(e))
-        for e in exporters
-    ]  # fmt: skip
-    head = ("name", "models", "order", "pixels", "opacity", "rotations", "degrees", "columns besides")
-    page = _renew(page, "names", head, rows)
-    models = ((m.title, m.source, m.leaves, m.result) for e in exporters for m in e.models)
-    points = ((row.title, ", ".join(f"`{file}`" for file in row.files), row.remedy) for row in POINTS_ONLY)
-    page = _renew(page, "points", ("program", "what it leaves", "what to do"), points)
-    return _renew(
-        page, "models", ("model", "saving code that was read", "what it leaves", "what becomes of it"), models
-    )
+    page = _renew(page, "names", [f"- `{one.name}`: {'; '.join(_habits(one))}" for one in exporters])
+    results: dict[str, list[str]] = {}
+    for model in (model for one in exporters for model in one.models):
+        results.setdefault(model.result, []).append(f"{model.title} ({model.leaves})")
+    page = _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
+    files = ((row, ", ".join(f"`{file}`" for file in row.files)) for row in POINTS_ONLY)
+    return _renew(page, "points", [f"- {row.title} ({names}): {row.remedy}" for row, names in files])
+
+
+def _habits(exporter: Any) -> list[str]:
+    """What an exporter does, but for what most do: logits, rotations wxyz, degree 0, normals."""
+    order = "rows without pixels" if exporter.order == "none" else exporter.order
+    kinds = "" if exporter.order == "none" else ", ".join(exporter.kinds)
+    degrees = "" if exporter.degrees == (0,) else f"degree {', '.join(map(str, exporter.degrees))}"
+    quats = "" if exporter.quats == "wxyz" else f"rotations {exporter.quats}"
+    opacity = "" if exporter.opacity == "logit" else f"{exporter.opacity} opacities"
+    normals = "normals as bytes" if exporter.byte_columns else "" if exporter.normals else "no normals"
+    elements = ", ".join(f"`{name}`" for name in exporter.elements)
+    comment = exporter.comment and f"comment {exporter.comment}"
+    return [fact for fact in (order, kinds, opacity, quats, degrees, normals, elements, comment) if fact]
 
 
 def _formats_page(page: str) -> str:
@@ -204,26 +212,23 @@ def _formats_page(page: str) -> str:
         for row in ROWS
     ]  # fmt: skip
     head = ("ending or name", "read", "written harmonics, up to degree", "bytes each", "of degree 3", "what it is")
-    page = _renew(page, "formats", head, rows)
+    page = _renew(page, "formats", _rows(head, rows))
     cameras = ((row.files, " ".join(row.convention), row.intrinsics) for row in CAMERA_FORMATS)
-    return _renew(page, "cameras", ("file", "poses, axes", "intrinsics"), cameras)
+    return _renew(page, "cameras", _rows(("file", "poses, axes", "intrinsics"), cameras))
 
 
-def _columns(exporter: Any) -> str:
-    """What a file has besides the 14 columns of all."""
-    normals = "normals as bytes" if exporter.byte_columns else "normals" if exporter.normals else ""
-    marks = (normals, *(f"`{name}`" for name in exporter.elements), exporter.comment and f"comment {exporter.comment}")
-    return ", ".join(mark for mark in marks if mark)
-
-
-def _renew(page: str, name: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table."""
     lines = ["| " + " | ".join(map(_cell, row)) + " |" for row in (head, *rows)]
-    lines.insert(1, "|---" * len(head) + "|")
+    return [lines[0], "|---" * len(head) + "|", *lines[1:]]
+
+
+def _renew(page: str, name: str, lines: Sequence[str]) -> str:
     start, end = f"<!-- {name}: made by docs/generate_reference.py from the program -->\n", "\n<!-- end -->"
     before, _, rest = page.partition(start)
     _, found, after = rest.partition(end)
     if not found:
-        raise ValueError(f"expected a table {name!r} between {start.strip()} and {end.strip()}")
+        raise ValueError(f"expected {name!r} between {start.strip()} and {end.strip()}")
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
@@ -247,7 +252,8 @@ def _list(settings: Iterable[Any]) -> list[str]:
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
         values = _line(one.values(null=False))
-        facts = "; ".join(filter(None, (default, "" if values in BARE else values)))
+        says_more = values not in BARE and not re.search(r"1000000|1e\+06", values)  # limits that nobody meets
+        facts = "; ".join(filter(None, (default, values if says_more else "")))
         lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {_line(one.text)}")
     return lines
 
