@@ -207,14 +207,13 @@ def _formats_page(page: str) -> str:
 
     rows = [
         (f"`{row.ending}`", "no" if row.read is None else "yes",
-         str(row.max_degree) if row.max_degree >= 0 else "not written",
-         *(f"{row.each[i]:.0f}" if i < len(row.each) else "" for i in (0, 3)), row.about)
+         f"to degree {row.max_degree}" if row.max_degree >= 0 else "no",
+         " / ".join(f"{row.each[i]:.0f}" for i in (0, 3) if i < len(row.each)), row.about)
         for row in ROWS
     ]  # fmt: skip
-    head = ("ending or name", "read", "written harmonics, up to degree", "bytes each", "of degree 3", "what it is")
-    page = _renew(page, "formats", _rows(head, rows))
-    cameras = ((row.files, " ".join(row.convention), row.intrinsics) for row in CAMERA_FORMATS)
-    return _renew(page, "cameras", _rows(("file", "poses, axes", "intrinsics"), cameras))
+    page = _renew(page, "formats", _rows(("name", "read", "written", "bytes", "what it is"), rows))
+    cameras = (f"- {row.files}: {' '.join(row.convention)}; {row.intrinsics}" for row in CAMERA_FORMATS)
+    return _renew(page, "cameras", list(cameras))
 
 
 def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -272,8 +272,8 @@ _EXPORTERS = (
             ),
             Model(
                 "WorldMirror 2", "Tencent-Hunyuan/HY-World-2.0 05d3035; `inference_utils.py` 270f4b4",
-                "as WorldMirror 1, without masked pixels, at most 5,000,000 drawn at random; `camera_params.json`, COLMAP's"
-                " files on request; no photos", f"{_NO_PIXELS}; name the photos",
+                "as WorldMirror 1, without masked pixels, at most 5,000,000 drawn at random; `camera_params.json`,"
+                " COLMAP's files on request; no photos", f"{_NO_PIXELS}; name the photos",
             ),
         ),
         "raw", "none",
@@ -329,7 +329,7 @@ _EXPORTERS = (
     ),
     Exporter(
         "longlrm-sorted",
-        (Model("Long-LRM, sorted by opacity", "arthurhero/Long-LRM d92dd51", "as Long-LRM, where it prunes", _NO_PIXELS),),
+        (Model("Long-LRM, sorted", "arthurhero/Long-LRM d92dd51", "as Long-LRM, where it prunes", _NO_PIXELS),),
         "logit", "unordered", ("pruned",), ("same", "scaled"), degrees=(3,), byte_columns=_NORMALS,
     ),
     # Scenes that were optimised, or predicted without pixels.
