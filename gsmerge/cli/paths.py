@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CHECKPOINTS
 from gsmerge.settings.setting import Settings, setting
 
@@ -37,11 +36,16 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def output_file(output: Path) -> Path:
-    """Return the file that an output names; for a folder ``colmap``, that is the points of the COLMAP model."""
+def output_file(output: Path, name: str) -> Path:
+    """Return the file that an output names: ``name`` in a folder that exists, the points of a model for ``colmap``.
+
+    A page of gsmerge marks a folder as a web site, which is written as such.
+    """
     from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
 
-    return output / PLACE / POINTS if output.name == FOLDER else output
+    if output.name == FOLDER:
+        return output / PLACE / POINTS
+    return output / name if output.is_dir() and not (output / "index.html").exists() else output
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
@@ -75,16 +79,6 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
-
-
-def check_embedding(output: Path, budget: BudgetOptions) -> None:
-    """Raise UsageError if cameras cannot be embedded: no comments in the format, or a budget in bytes."""
-    if output.suffix.lower() != ".ply":
-        raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
-    if budget.in_bytes:
-        raise UsageError(
-            f"--embed-cameras: expected a --budget without cameras inside, got {budget.budget}; give a number"
-        )
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
