@@ -228,7 +228,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
     """Note that a cluster has no use for a scene that is compacted in one piece."""
-    if blocks == 1 and options.blocks.engine.name != "local":
+    if blocks == 1 and options.blocks.engine.engine != "local":
         problems = blocks_problems(scene, options)
         remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
         note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")

@@ -227,7 +227,7 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe which row is which pixel, and at which distance; or why that is unknown."""
     alignment, problem = scene["alignment"], scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
-        return [f"alignment  not measured: {problem}"]
+        return []  # the error says why
     if problem is not None:
         return [f"alignment  not one Gaussian per pixel: {problem.removeprefix('expected one Gaussian per pixel, ')}"]
     if alignment is None:

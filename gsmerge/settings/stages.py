@@ -218,15 +218,15 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 class Engine(Settings):
     """Place where the blocks of a scene are compacted; the result does not depend on it."""
 
-    name: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
-        "Ray cluster, gsmerge[ray].", name="engine", choices=("local", "ray"))  # fmt: skip
+    engine: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
+        "Ray cluster, gsmerge[ray].", choices=("local", "ray"))  # fmt: skip
     address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.",
         shown="one of this machine")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.address is not None and self.name != "ray":
-            raise ValueError(f"address: expected engine ray, got {self.name}")
+        if self.address is not None and self.engine != "ray":
+            raise ValueError(f"address: expected engine ray, got {self.engine}")
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def test_a_command_loads_no_other() -> None:
     }
 
 
-@sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--recipe", "paper"]], ids=" ".join)
+@sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--set", "recipe=paper"]], ids=" ".join)
 def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(
     settings: list[str], small_scene: Path, tmp_path: Path
 ) -> None:

@@ -152,7 +152,7 @@ def test_names_by_template_and_cameras_by_template(rooms: Path, tmp_path: Path, 
 
 
 def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:
-    arguments = ("--effort", "draft", "--quality", "90dB", "--superpixels", "1%", "--jobs", 1)
+    arguments = ("--effort", "draft", "--quality", "90dB", "--set", "superpixels=1%", "--jobs", 1)
     outcome = run("batch", rooms / "room0", "--output", tmp_path, *arguments, code=4)
     assert names(outcome.err, "1 of 1", "target")
     assert (tmp_path / "room0.ply").exists()

@@ -19,7 +19,7 @@ from gsmerge.cli import main
 from .conftest import Run, listing
 
 VIEWS, HEIGHT, WIDTH = 5, 64, 96
-SMALL = ("--superpixels", 200)
+SMALL = ("--set", "superpixels=200")
 QUICK = (*SMALL, "--fit", "none", "--effort", "draft")  # where the result does not matter
 
 

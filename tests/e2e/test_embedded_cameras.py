@@ -27,7 +27,7 @@ def alone(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("alone")
     call = ["compact", small_scene, "-o", folder / "small.ply", *FAST, "--embed-cameras", "--levels", 2]
-    assert main([str(word) for word in [*call, "--set", "viewer_cameras=false", "--superpixels", 200, "-q"]]) == 0
+    assert main([str(word) for word in [*call, "--set", "viewer_cameras=false", "--set", "superpixels=200", "-q"]]) == 0
     shutil.copytree(small_scene / "images", folder / "images")
     return folder
 
@@ -44,7 +44,7 @@ def test_the_cameras_are_those_of_the_scene(alone: Path, small_scene: Path) -> N
 
 def test_the_rows_are_the_same_with_and_without(alone: Path, small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "small.ply"
-    run("compact", small_scene, "-o", out, *FAST, "--levels", 2, "--superpixels", 200, code=0)
+    run("compact", small_scene, "-o", out, *FAST, "--levels", 2, "--set", "superpixels=200", code=0)
     one, other = ((path / "small.ply").read_bytes() for path in (tmp_path, alone))
     assert one.partition(b"end_header")[2] == other.partition(b"end_header")[2]
     assert b"gsmerge cameras" not in one
@@ -57,7 +57,7 @@ def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str)
         "compact": (small, "-o", tmp_path / "x.ply", *FAST, "--budget", 100),
         "evaluate": (small, alone / "small.level1.ply", "--lpips", "none"),
         "view": (small, alone / "small.level1.ply", "-o", tmp_path / "x.html", "--no-open"),
-        "extend": (state, small, "--effort", "draft", "--checkpoint", "none", "--threads", 1),
+        "extend": (state, small, "--effort", "draft", "--set", "checkpoint=none", "--threads", 1),
         "inspect": (small,),
         "render": (small, "-o", tmp_path / "x.png"),
     }

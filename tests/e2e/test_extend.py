@@ -31,7 +31,7 @@ from gsmerge.states.state_file import load_state
 
 from .conftest import Outcome, Run, assert_refused, listing
 
-SMALL = ("--superpixels", 60, "--checkpoint", "none")
+SMALL = ("--set", "superpixels=60", "--set", "checkpoint=none")
 PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
@@ -170,7 +170,9 @@ def test_a_dry_run_knows_the_most(states: list[Path], tmp_path: Path, run: Run) 
 def latents(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The state after two batches with the paper's networks. Read only."""
     path = tmp_path_factory.mktemp("latents") / "state.gsm"
-    assert main(["extend", str(path), str(walks[0]), "--recipe", "paper", "--superpixels", "60", "--quiet"]) == 0
+    assert (
+        main(["extend", str(path), str(walks[0]), "--set", "recipe=paper", "--set", "superpixels=60", "--quiet"]) == 0
+    )
     assert main(["extend", str(path), str(walks[1]), "--quiet"]) == 0
     return path
 
@@ -184,7 +186,7 @@ def test_the_heads_run_when_they_are_asked(latents: Path, tmp_path: Path, run: R
         assert json.loads(outcome.out)["fit"] is None  # no photos are stored
         counts.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
     assert counts[0] < counts[1] < counts[2] <= 4 * len(state)
-    assert run("check", latents, code=0).out.startswith("ok ")
+    assert run("inspect", latents, code=0).out.startswith("ok ")
 
 
 def test_the_papers_online_experiment(
@@ -219,7 +221,7 @@ def test_the_papers_online_experiment(
 
 def test_networks_of_another_state(latents: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = Path(shutil.copy(latents, tmp_path / "state.gsm"))
-    outcome = run("extend", state, walks[0], "--checkpoint", "shipped")
+    outcome = run("extend", state, walks[0], "--set", "checkpoint=shipped")
     assert_refused(outcome, 2, "checkpoint shipped", "(paper)", "state")
     assert state.read_bytes() == latents.read_bytes()
 

@@ -50,7 +50,7 @@ def test_harmonics_count(tmp_path: Path, made_scene: Path, run: Run) -> None:
 
 @sweep(("name", "size"), [("a.spz", 24_000), ("a.ply", 27_000), ("a.sog", 20_000)])
 def test_states_and_batch_meet_it(name: str, size: int, made_scene: Path, tmp_path: Path, run: Run) -> None:
-    few, bare = ("--superpixels", "2%", "--checkpoint", "none", "-q"), ("--fit", "none", "-q")
+    few, bare = ("--set", "superpixels=2%", "--set", "checkpoint=none", "-q"), ("--fit", "none", "-q")
     run("extend", tmp_path / "a.gsm", made_scene, *few, code=0)
     run("compact", tmp_path / "a.gsm", "-o", tmp_path / "out" / name, "--budget", f"{size}B", *bare, code=0)
     assert 0.97 * size <= file_bytes(tmp_path / "out") <= size

@@ -40,7 +40,7 @@ def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) 
 def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
     actual = json.loads(run("inspect", made / "scene_0001", "--json").out)
     assert (actual["exporter"], actual["num_views"], actual["num_missing"], actual["notes"]) == ("gsmerge", 3, 0, [])
-    run("compact", made / "scene_0001", "--superpixels", "5%", "--fit", "none", code=0)
+    run("compact", made / "scene_0001", "--set", "superpixels=5%", "--fit", "none", code=0)
     targets = made / "scene_0001" / "targets"
     run("evaluate", made / "scene_0001", "--targets", targets, "--lpips", "none", "--json", code=0)
 

@@ -27,7 +27,7 @@ from gsmerge.research.training.windows import whole_photo
 
 from .conftest import Run, listing
 
-FAST = ("--superpixels", 100, "--fit", "none")
+FAST = ("--set", "superpixels=100", "--fit", "none")
 TINY = {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}}
 CONFIG = {
     "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
@@ -58,7 +58,9 @@ def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
     again = json.loads(run(*call, "--validation", small_copy, "--json").out)
     assert (again["step"], again["resumed"], again["notes"], again["validation_loss"]) == (6, 6, [], None)
     small = small_copy / "small.ply"
-    learned = run("compact", small_copy, "-o", small, *FAST, "--checkpoint", out / "best.safetensors", "--json", code=0)
+    learned = run(
+        "compact", small_copy, "-o", small, *FAST, "--set", f"checkpoint={out / 'best.safetensors'}", "--json", code=0
+    )
     report = json.loads(learned.out)
     assert report["choices"]["networks"]["training"]["step"] in (3, 6)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
@@ -159,5 +161,5 @@ def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root:
 def test_a_checkpoint_is_not_replaced(small_copy: Path, run: Run) -> None:
     path = written(small_copy / "a.safetensors", noisy(SMALL))
     before = path.read_bytes()
-    assert run("compact", small_copy, *FAST, "--checkpoint", path, "-o", path, "--overwrite").code == 2
+    assert run("compact", small_copy, *FAST, "--set", f"checkpoint={path}", "-o", path, "--overwrite").code == 2
     assert path.read_bytes() == before

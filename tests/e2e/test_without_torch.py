@@ -21,10 +21,10 @@ from gsmerge.errors import TORCH_INSTALL
 from gsmerge.measure import lpips
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
-FEW = ("--superpixels", "60")
+FEW = ("--set", "superpixels=60")
 COMMANDS = {
     "compact": ("compact", "scene", *FEW, "-o", "new.ply"),
-    "compact with networks": ("compact", "scene", *FEW, "--recipe", "paper", "-o", "new.ply"),
+    "compact with networks": ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"),
     "compact to a curve": ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.ply"),
     "batch": ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
     "compact a state": ("compact", "scene.gsm", "-o", "new.ply"),

@@ -18,8 +18,8 @@ from .conftest import Run, assert_refused, listing
 # without photos: the place that the error line names, none for some, and values in it, with * between them
 USAGE = {
     "compact room --k 9": "k*9",
-    "compact room --superpixels 1537": "superpixels*1536*1537",
-    "compact room --superpixels 0%": "superpixels*'0%'",
+    "compact room --set superpixels=1537": "superpixels*1536*1537",
+    "compact room --set superpixels=0%": "superpixels*'0%'",
     "compact room --set segmentation=magic": "segmentation*rdseg*'magic'",
     "compact room --set match=magic": "--set match*overlap*'magic'",
     "compact room --magic": "*--magic",
@@ -36,12 +36,12 @@ USAGE = {
     "compact room -o a.sog --set spz_version=4": "spz_version 4*.spz*.sog",
     "compact room --set photo_scale=0.5": "photo_scale*0.5",
     "compact room --set photo_scale=small": "--set photo_scale*'small'",
-    "compact room --checkpoint none --set require_checkpoint=true": 'require_checkpoint*"none"',
-    "compact room --method magic": "--method*'magic'*'voxel'",
-    "compact room --method voxel --budget auto": "method voxel*budget auto",
-    "compact room --method voxel --levels 2": "method voxel*levels",
-    "compact room --method voxel --quality 20dB": "method voxel*quality 20dB",
-    "compact room --method blocks --hint order=none": "method blocks*unaligned*--method",
+    "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
+    "compact room --set method=magic": "--method*'magic'*'voxel'",
+    "compact room --set method=voxel --budget auto": "method voxel*budget auto",
+    "compact room --set method=voxel --levels 2": "method voxel*levels",
+    "compact room --set method=voxel --quality 20dB": "method voxel*quality 20dB",
+    "compact room --set method=blocks --hint order=none": "method blocks*unaligned*--method",
     "compact alone.ply --hint order=none --save-cameras a.json": "--save-cameras a.json*cameras*none",
     "compact room --budget 0.02": "budget*'0.02'*\"2%\"",
     "compact room --ratio 0.1": "*--ratio*--budget*--k",
@@ -79,7 +79,7 @@ USAGE = {
     "compact room.gsm room": "room.gsm*alone*2",
     "compact room room.gsm": "room.gsm*alone*2",
     "compact room.gsm --cameras room/transforms.json": "--cameras*room.gsm",
-    "compact room.gsm --superpixels 3%": "--superpixels*room.gsm",
+    "compact room.gsm --set superpixels=3%": "--superpixels*room.gsm",
     "compact room.gsm --set superpixels=3%": "--set superpixels*unknown",
     "compact room.gsm --save-cameras a.json": "--save-cameras*room.gsm",
     "compact room.gsm --strict": "--strict*room.gsm",
@@ -92,14 +92,14 @@ USAGE = {
     "extend state.gsm room --set tolerance=2": "tolerance*2",
     "extend state.gsm room --max-k 9": "--max-k*8",
     "extend state.gsm room --set replay=-1": "replay*-1",
-    "extend state.gsm room --superpixels 0%": "superpixels*'0%'",
+    "extend state.gsm room --set superpixels=0%": "superpixels*'0%'",
     "extend state.gsm room --budget many": "budget*'many'",
     "extend state.gsm room --hint exporter=nobody": "exporter*'nobody'",
     "extend room/scene.ply room": "room/scene.ply*input",
     "extend state.gsm room room --cameras a --images b": "--cameras and --images*several",
     "render room --as panel -o sheet.jpg": "sheet.jpg*.png",
     "render room alone.ply -o views": "--as views*2*.png",
-    "render room -o sheet.png --superpixels 100": "--superpixels and --set*--as superpixels",
+    "render room -o sheet.png --set superpixels=100": "--set superpixels=and --set*--as superpixels",
     "render room --as views -o occupied": "occupied*empty*--overwrite",
     "render room --path spiral -o a.mp4": "--path spiral*orbit*spline",
     "render room --path orbit:120 -o a.mp4": "path, orbit*'120'",
@@ -147,7 +147,7 @@ USAGE = {
     "train -o out": "*'--data'",
 }
 PLACES = {
-    "compact room --set require_checkpoint=true --checkpoint gone": "gone*checkpoint",
+    "compact room --set require_checkpoint=true --set checkpoint=gone": "gone*checkpoint",
     "batch gone -o out": "gone*no such",
     "batch room -o alone.ply/out --quiet": "alone.ply/out*Not a directory*--output",
     "extend alone.ply/state.gsm room": "alone.ply/state.gsm*Not a directory",
@@ -171,10 +171,10 @@ PLACES = {
 
 
 NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others before any work
-    "compact room --superpixels 1537",
+    "compact room --set superpixels=1537",
     "compact room --budget 5B",
-    "compact room --method blocks --hint order=none",
-    "compact room --set require_checkpoint=true --checkpoint gone",
+    "compact room --set method=blocks --hint order=none",
+    "compact room --set require_checkpoint=true --set checkpoint=gone",
 }
 
 
@@ -187,7 +187,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
-    small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+    small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
     bare = ["--set", "replay=0"]
     assert main(["extend", str(folder / "room.gsm"), str(small_scene), *small, *bare]) == 0
     assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0

@@ -41,7 +41,7 @@ def folder(tmp_path: Path, tiny: Tiny) -> Path:
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
 def test_results_of_commands_say_so(folder: Path, tmp_path: Path, ending: str) -> None:
     compact_files(find_scene_files(folder), PLAIN, Outputs(folder / f"x{ending}"))
-    assert main(["extend", str(tmp_path / "x.gsm"), str(folder), "--superpixels", "20%", "-q"]) == 0
+    assert main(["extend", str(tmp_path / "x.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     assert main(["compact", str(tmp_path / "x.gsm"), "--fit", "none", "-o", str(folder / f"y{ending}"), "-q"]) == 0
     results = [folder / f"x{ending}", folder / f"x.level1{ending}", folder / f"y{ending}"]
     assert sorted(folder.glob("*.ply")) == sorted([folder / "room.ply", *results])
