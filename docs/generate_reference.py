@@ -6,7 +6,6 @@ python docs/generate_reference.py --check  # name them, exit code 1 if there are
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -18,7 +17,7 @@ from api_page import api_page
 from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
-COMMANDS, SETTINGS, TRAINING, API = "commands.md", "settings.md", "training-settings.md", "api.md"
+COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 BARE = ("a whole number", "a number", "text", "true or false")  # values that the default or the text shows as well
@@ -53,7 +52,6 @@ def make_pages() -> dict[str, str]:
     return {
         COMMANDS: _commands_page(),
         SETTINGS: _settings_page(),
-        TRAINING: _training_page(),
         API: f"{NOTICE}\n\n{api_page()}",
         EXPORTERS: _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8")),
         FORMATS: _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8")),
@@ -231,28 +229,13 @@ def _renew(page: str, name: str, lines: Sequence[str]) -> str:
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
-def _training_page() -> str:
-    from gsmerge.networks.options import NetworkOptions
-    from gsmerge.research.training import TrainOptions
-    from gsmerge.settings.setting import settings_of
-
-    lines = [NOTICE, "", "# Settings of a training run", ""]
-    lines += [
-        "Of [`gsmerge lab train`](../internals/training.md#train). In brackets: default and possible values.",
-        "",
-    ]
-    lines += [*_list(settings_of(TrainOptions).values()), "", "## The table `network`", ""]
-    return "\n".join([*lines, *_list(settings_of(NetworkOptions).values()), ""])
-
-
 def _list(settings: Iterable[Any]) -> list[str]:
     """A line for each setting: name, default, values, and what it is."""
     lines = []
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
         values = _line(one.values(null=False))
-        says_more = values not in BARE and not re.search(r"1000000|1e\+06", values)  # limits that nobody meets
-        facts = "; ".join(filter(None, (default, values if says_more else "")))
+        facts = "; ".join(filter(None, (default, "" if values in BARE else values)))
         lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {_line(one.text)}")
     return lines
 
