@@ -277,7 +277,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
     If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
-    fit gains more by further steps (docs/laboratory/networks.md).
+    fit gains more by further steps (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -395,7 +395,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/laboratory/large-scenes.md.
+    docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
