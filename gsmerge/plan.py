@@ -306,7 +306,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
+            " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
     return checkpoint
