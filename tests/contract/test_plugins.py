@@ -1,4 +1,4 @@
-"""The worked example of docs/internals/plugins.md, laid out as an installer leaves it, adds its method and its command."""
+"""The example of docs/internals/plugins.md, laid out as an installer leaves it, adds its method and its command."""
 
 from __future__ import annotations
 
