@@ -117,7 +117,7 @@ def mean(records: Sequence[RunRecord], name: str, digits: int) -> str:
 
 
 def quality(records: Sequence[RunRecord]) -> str:
-    return f"{mean(records, 'psnr_target_visible', 2)} / {mean(records, 'lpips_vgg_target_visible', 3)}"
+    return f"{mean(records, 'psnr_target_visible', 2)}/{mean(records, 'lpips_vgg_target_visible', 3)}"
 
 
 def kept(records: Sequence[RunRecord], size: str) -> str:
@@ -143,7 +143,7 @@ def cost_table(records: Sequence[RunRecord]) -> str:
         if some:
             words = ask[0] + kept(some, size)
             rows.append((words, quality(some), mean(some, "seconds", 1), mean(some, "render_ms", 0)))
-    return make_table(("method", "PSNR / LPIPS", "seconds", "ms a frame"), rows)
+    return make_table(("method", "PSNR/LPIPS", "seconds", "ms a frame"), rows)
 
 
 TABLES = {"sizes": sizes_table, "cost": cost_table}

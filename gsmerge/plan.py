@@ -277,7 +277,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
     If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
-    fit gains more by further steps (docs/laboratory/networks.md).
+    fit gains more by further steps (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -306,7 +306,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
+            " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
     return checkpoint
@@ -395,7 +395,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/laboratory/large-scenes.md.
+    docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps

@@ -1,4 +1,4 @@
-"""The worked example of docs/guide/plugins.md, laid out as an installer leaves it, adds its method and its command."""
+"""The example of docs/internals/plugins.md, laid out as an installer leaves it, adds its method and its command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from gsmerge import read_ply
 
-PAGE = Path(__file__).parents[2] / "docs" / "guide" / "plugins.md"
+PAGE = Path(__file__).parents[2] / "docs" / "internals" / "plugins.md"
 
 
 @pytest.fixture
