@@ -76,9 +76,9 @@ def holds_scene(path: Path) -> bool:
     if os.path.isdir(path):
         return bool(list_plys(path))
     suffix = path.suffix.lower()
-    return suffix in SCENE_SUFFIXES and (
-        suffix not in SEVERAL_USES or (os.path.exists(path) and may_hold_gaussians(path))
-    )
+    if suffix in SEVERAL_USES:
+        return os.path.exists(path) and may_hold_gaussians(path)
+    return suffix in SCENE_SUFFIXES
 
 
 def damage(path: Path) -> list[str]:
