@@ -50,8 +50,8 @@ PARAMETERS = (
     f"{opt.READING} masks budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A folder named colmap: a COLMAP model. A folder that exists: into it.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream. A new folder: a web "
+               "site; colmap: a COLMAP model; a folder with files in it gets the result.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 

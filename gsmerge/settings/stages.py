@@ -124,8 +124,8 @@ class MatchOptions(Settings):
 class DecodeOptions(Settings):
     """Settings of decoding: how many Gaussians each Feature Gaussian becomes."""
 
-    k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by "
-        "its saliency; auto: 1, and 4 for one photo without a long fit.",
+    k: int | Literal["mixed", "auto"] = setting(AUTO, "More detail and a larger file: Gaussians for each superpixel; "
+        "mixed: 1, 2 or 4, most where there is most to see; auto: 1, and 4 for one photo.",
         "`mixed` is of the paper's supplement. `auto`: 4 where all views have one camera, nothing else says how many "
         "Gaussians there are to be, and no fit follows or one of at most 60 steps.", least=1, most=MAX_CHILDREN,
         metavar="1-8|mixed|auto")  # fmt: skip
