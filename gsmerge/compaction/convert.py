@@ -12,6 +12,7 @@ import numpy as np
 from gsmerge.compaction.placement import (
     NUM_FULL,
     add_colmap,
+    add_views,
     find_placement,
     name_photos,
     pad_harmonics,
@@ -30,7 +31,7 @@ from gsmerge.io import (
 )
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
-from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
@@ -178,7 +179,7 @@ def _write(
             written = [first]
         if len(cameras) and ending != COLMAP.ending:
             beside = viewer_cameras_path(out)
-            add(beside).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+            add_views(add, beside, cameras, names, overwrite=options.overwrite)
         num_bytes = sum(path.stat().st_size for path in written)
     if ending == INDEX:
         remove_unused_chunks(out)

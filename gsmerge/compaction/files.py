@@ -9,13 +9,14 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.placement import add_views, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.embedded import camera_comments
-from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
+from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
@@ -80,9 +81,9 @@ def compact_files(
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras
-        shared = cameras_path is not None and not outputs.overwrite and cameras_path.exists()
-        if cameras_path is not None and shared and list(read_cameras(cameras_path).names) != names:
-            raise _other_cameras(cameras_path)
+        shared = cameras_path if cameras_path is not None and cameras_path.exists() else None
+        if shared is not None and not outputs.overwrite and list(read_cameras(shared).names) != names:
+            raise other_cameras(shared)  # before the work
         cameras_path = cameras_path if len(load.scene) else None
         read = perf_counter()
         result = compact(load.scene, settings, progress=progress)
@@ -102,11 +103,7 @@ def compact_files(
         views_named = result.cameras[views], names, files.images
         written = _write_results(add, outputs, at[out], results, comments, views_named, parts)
         if cameras_path is not None:
-            text = viewer_cameras(result.cameras[views], names)
-            if not shared:
-                add(cameras_path).write_text(text, encoding="utf-8")
-            elif cameras_path.read_text(encoding="utf-8", errors="replace") != text:
-                raise _other_cameras(cameras_path)
+            add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         if outputs.saved_cameras is not None:
             write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
         notes = output_notes(out, result.gaussians.sh_degree, outputs.spz_version, files.images)
@@ -189,12 +186,6 @@ def _views_once(scene: Scene) -> list[int]:
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
-
-
-def _other_cameras(path: Path) -> UsageError:
-    """Make the error for an existing camera file for viewers that belongs to another result."""
-    remedy = "pass --overwrite to replace it, or name another with --output"
-    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.io.atomic import AddOutput
+from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.colmap_model import files_beside, model_files
+from gsmerge.io.cameras.json_files import viewer_cameras
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
@@ -21,6 +24,7 @@ from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
 
 NUM_FULL = 15  # harmonics above degree 0 up to degree 3
+SAME = 1e-5  # relative difference up to which cameras are the same; pixels by a hundred times as much
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
@@ -70,6 +74,35 @@ def place(
         return gaussians, cameras
     wide = replace(gaussians, means=gaussians.means.astype(np.float64))  # until they are written
     return frame.move_gaussians(wide), frame.move(cameras)
+
+
+def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
+    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has others.
+
+    A file with these cameras, to within rounding, is left as it is: results in several formats share it.
+    """
+    if overwrite or not path.exists():
+        add(path).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+    elif not _has_cameras(path, cameras, names):
+        raise other_cameras(path)
+
+
+def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
+    """Return whether a file holds these cameras under these names, to within rounding."""
+    with suppress(SceneError):
+        stored = read_cameras(path)
+        if list(stored.names) == list(names):
+            found, reach = to_cameras(stored), np.abs(cameras.viewmats[:, :3, 3]).max()
+            same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * max(reach, 1))
+            sizes = {(view.width, view.height) for view in (found, cameras)}
+            return same_place and len(sizes) == 1 and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
+    return False
+
+
+def other_cameras(path: Path) -> UsageError:
+    """Make the error for an existing file of cameras that belongs to another result."""
+    remedy = "name another output, or pass --overwrite to replace it"
+    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def add_colmap(

@@ -241,4 +241,4 @@ def _refuse(path: Path, overwrite: bool) -> None:
     if not os.path.isdir(path.parent):
         raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
     if os.path.lexists(path) and not overwrite:
-        raise SceneError(path, "exists already", "choose another name or allow overwriting")
+        raise SceneError(path, "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)")
