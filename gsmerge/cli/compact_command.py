@@ -11,7 +11,15 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, say_warning, separate_stdout, stage_progress
+from gsmerge.cli.console import (
+    print_document,
+    say,
+    say_notes,
+    say_warning,
+    separate_stdout,
+    stage_progress,
+    terminal_columns,
+)
 from gsmerge.cli.paths import (
     FileOptions,
     check_embedding,
@@ -114,8 +122,9 @@ def compact(args: opt.Args) -> None:
     lines = summary_lines(document)
     if sys.stdout.isatty():
         view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
-        lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet)
+        next_step = view if out.suffix.lower() == ".ply" else None
+        lines = result_table(document, next_step, columns=terminal_columns(sys.stdout))
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     if args.strict and document["psnr_input_views"]["before"] is None:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
@@ -212,4 +221,4 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
             out, saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras, overwrite=args.overwrite
         )
         document = plan_files(load, settings, outputs)
-    print_document(document, plan_lines(document), as_json=args.json, wrap=True)
+    print_document(document, plan_lines(document), as_json=args.json)

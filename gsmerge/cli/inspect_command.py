@@ -19,4 +19,4 @@ def inspect(args: opt.Args) -> None:
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         facts = inspect_scene(args.scene, **places, opacity=args.opacity, threads=args.threads, **vars(hints))
     document, lines = {**document_head(), **facts}, inspection_lines(facts)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet)
