@@ -109,7 +109,7 @@ def compact(args: opt.Args) -> None:
     outputs = Outputs(
         out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,
         embed_cameras=args.embed_cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version, full_columns=writing.columns == "full", placement=placement,
+        full_columns=writing.columns == "full", placement=placement,
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -160,7 +160,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     with stage_progress(quiet=args.silent) as progress:
         document = compact_file(
             path, out, settings, k=args.k, budget=args.budget, mixed=mixed, always_fit=args.fit is not None,
-            normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
+            normals=writing.normals, overwrite=args.overwrite,
             dry_run=args.dry_run, progress=progress, seconds_before=before,
         )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)

@@ -66,7 +66,6 @@ class ConvertOptions:
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     full_columns: bool = False  # pad its harmonics with zeros up to degree 3
-    spz_version: int = 3
     overwrite: bool = False
 
 
@@ -76,7 +75,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
     UsageError for an ending that cannot be written, or for dropping the sky without photos.
     """
-    ending = output_format(options.output, options.spz_version, levels=True, cameras=True).ending
+    ending = output_format(options.output, levels=True, cameras=True).ending
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -101,7 +100,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
-    notes += output_notes(options.output, gaussians.sh_degree, options.spz_version, options.images)
+    notes += output_notes(options.output, gaussians.sh_degree, options.images)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
@@ -174,7 +173,6 @@ def _write(
         else:
             write_gaussians(
                 first, gaussians, overwrite=True, comments=comments, ending=ending, normals=options.normals,
-                spz_version=options.spz_version,
             )  # fmt: skip
             written = [first]
         if len(cameras) and ending != COLMAP.ending:

@@ -48,7 +48,6 @@ class Outputs:
     embed_cameras: bool = False  # also write the cameras into the header of a ``.ply``
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
-    spz_version: int = 3
     full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
     placement: PlacementOptions = field(default_factory=PlacementOptions)  # frame of what is written
 
@@ -72,7 +71,7 @@ def compact_files(
     read or the result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
-    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    ending = output_format(out, levels=True, cameras=True).ending
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         at = {out: add(out)}
         at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
@@ -106,7 +105,7 @@ def compact_files(
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         if outputs.saved_cameras is not None:
             write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
-        notes = output_notes(out, result.gaussians.sh_degree, outputs.spz_version, files.images)
+        notes = output_notes(out, result.gaussians.sh_degree, files.images)
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
@@ -138,7 +137,7 @@ def _write_results(
     renamed.
     """
     out = outputs.result
-    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    ending = output_format(out, levels=True, cameras=True).ending
     if ending == COLMAP.ending:
         from gsmerge.compaction.placement import add_colmap, name_photos
 
@@ -153,14 +152,13 @@ def _write_results(
     for (file,), result, lines in zip(written.values(), results, comments, strict=True):
         write_gaussians(
             file, result.gaussians, overwrite=True, comments=lines, ending=ending, normals=outputs.normals,
-            spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
 
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Say in the settings whose bytes a budget counts."""
-    budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
+    budget = replace(settings.budget, output=outputs.result.name)
     return replace(settings, budget=budget)
 
 

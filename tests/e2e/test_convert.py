@@ -28,7 +28,7 @@ from gsmerge.types import Cameras, Gaussians
 
 from .conftest import Run, assert_refused
 
-FORMATS = ("out.sog", "lod-meta.json", "out.ply", "out.compressed.ply", "out.spz", "out.splat", "out.glb")
+FORMATS = ("out.sog", "lod-meta.json", "out.ply", "out.spz", "out.splat", "out.glb")
 
 
 @pytest.fixture(scope="module")
