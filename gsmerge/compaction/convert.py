@@ -37,7 +37,7 @@ from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, input_format
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
@@ -100,15 +100,16 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
-    notes += output_notes(options.output, gaussians.sh_degree, options.images)
+    names = () if stored is None else stored.names
+    photos = name_photos(_photo_folder(options, stored), names)
+    notes += output_notes(options.output, gaussians.sh_degree, photos)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
-    names = () if stored is None else stored.names
     if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
         comments += camera_comments(moved, names)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, beside = _write(options, ending, gaussians, moved, names, comments)
+    num_bytes, beside = _write(options, ending, gaussians, moved, photos, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
@@ -135,6 +136,11 @@ def _read_cameras(options: ConvertOptions) -> CameraFile | None:
     return None if path is None else read_cameras(path)
 
 
+def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:
+    """Return the folder of the cameras' photos: the given one, or ``images`` beside their file."""
+    return options.images if stored is None or options.images else Path(stored.path).parent / "images"
+
+
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[Gaussians, dict[str, int]]:
@@ -158,6 +164,7 @@ def _write(
     ending: str,
     gaussians: Gaussians,
     cameras: Cameras,
+    photos: Photos,
     names: Sequence[str],
     comments: Sequence[str],
 ) -> tuple[int, str | None]:
@@ -166,7 +173,7 @@ def _write(
     with atomic_outputs(overwrite=options.overwrite) as add:
         first = add(out)
         if ending == COLMAP.ending:
-            written = add_colmap(add, out, first, gaussians, cameras, name_photos(options.images, names))
+            written = add_colmap(add, out, first, gaussians, cameras, photos)
         elif ending == INDEX:
             ((_, files),) = add_levels(add, out, first, [gaussians], comments)
             written = [first, *files]

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.placement import add_views, other_cameras
+from gsmerge.compaction.placement import add_colmap, add_views, name_photos, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
@@ -21,7 +21,7 @@ from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.table import COLMAP, INDEX
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.report import to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
@@ -99,13 +99,13 @@ def compact_files(
         compacted, results = perf_counter(), (result, *result.coarser)
         embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
         comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        views_named = result.cameras[views], names, files.images
+        views_named = result.cameras[views], name_photos(files.images, names)
+        notes = output_notes(out, result.gaussians.sh_degree, views_named[1])
         written = _write_results(add, outputs, at[out], results, comments, views_named, parts)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         if outputs.saved_cameras is not None:
             write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
-        notes = output_notes(out, result.gaussians.sh_degree, files.images)
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
@@ -127,22 +127,19 @@ def _write_results(
     first: Path,
     results: Sequence[CompactResult],
     comments: Sequence[Sequence[str]],
-    views: tuple[Cameras, Sequence[str], Path | None],
+    views: tuple[Cameras, Photos],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
 
-    A COLMAP model has the ``views``, too: cameras, names, and the folder of their photos; ``parts`` are those of a
+    A COLMAP model has the ``views``, too: cameras, and names with their photos; ``parts`` are those of a
     ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
     renamed.
     """
     out = outputs.result
     ending = output_format(out, levels=True, cameras=True).ending
     if ending == COLMAP.ending:
-        from gsmerge.compaction.placement import add_colmap, name_photos
-
-        cameras, names, photos = views
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(photos, names))}
+        return {out: add_colmap(add, out, first, results[0].gaussians, *views)}
     if parts is not None:
         return parts.write(add, out, first, comments[0])
     written = {out: [first]}

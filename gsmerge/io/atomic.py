@@ -117,6 +117,17 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
         _written.difference_update(made)
 
 
+def link_file(source: Path, target: Path) -> None:
+    """Make an empty file a link to another file, hard or symbolic, or a copy where neither can be."""
+    os.unlink(target)
+    real = os.path.realpath(source)
+    for make in (os.link, os.symlink):
+        with suppress(OSError, NotImplementedError):
+            make(real, target)
+            return
+    shutil.copyfile(real, target)
+
+
 def _make_folder(folder: Path) -> Iterator[Path]:
     """Make a folder and its parents, and yield each that was missing."""
     if os.path.lexists(folder):

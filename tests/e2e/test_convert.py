@@ -88,7 +88,24 @@ def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, made_sce
     cameras, count = read_model(model)
     assert (count, len(cameras)) == (200, len(before))
     assert sorted(path.name for path in model.iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
-    assert all((made_scene / "images" / name).is_file() for name in cameras.names)
+    linked = tmp_path / "colmap" / "images"
+    assert sorted(path.name for path in linked.iterdir()) == sorted(cameras.names)
+    assert all((made_scene / "images" / name).samefile(linked / name) for name in cameras.names)
+
+
+def test_photos_that_are_there_stay_as_they_are(result: Path, tmp_path: Path, made_scene: Path, run: Run) -> None:
+    """A conversion finds photos beside the cameras; a folder for them that exists is nobody else's to change."""
+    shutil.copytree(made_scene / "images", tmp_path / "images")
+    linked = tmp_path / "colmap" / "images"
+    run("convert", result, tmp_path / "colmap", code=0)
+    first, *others = sorted(linked.iterdir())
+    assert first.samefile(tmp_path / "images" / first.name)
+    first.unlink()
+    first.write_text("mine")
+    others[0].unlink()
+    done = run("convert", result, tmp_path / "colmap", "--overwrite", code=0)
+    assert noted([done.err], linked, "copy or link the 1")
+    assert (first.read_text(), sorted(linked.iterdir())) == ("mine", [first, *others[1:]])
 
 
 def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(

@@ -10,6 +10,8 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
+Photos = Sequence[tuple[str, Path | None]]  # names of views below a model's folder of photos, and their files if known
+
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
     """Describe the harmonics that a format leaves out; None if it keeps all. UsageError for an unknown ending."""
@@ -23,13 +25,19 @@ def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
 
 
-def output_notes(out: Path, sh_degree: int, photos: Path | None) -> list[str]:
-    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
-    lost = lost_harmonics(out, sh_degree)
-    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
-    if COLMAP.names(out) and not place.is_dir():
-        files = "the photos" if photos is None or not photos.is_dir() else photos
-        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
+def photo_folder(points: Path) -> Path:
+    """Return the folder in which trainers look for the photos of a COLMAP model, given the path of its points."""
+    return points.parent.parent.parent / "images"
+
+
+def output_notes(out: Path, sh_degree: int, photos: Photos) -> list[str]:
+    """Describe what an output lacks: harmonics that are not written, and the ``photos`` of a COLMAP model."""
+    lost, place = lost_harmonics(out, sh_degree), photo_folder(out)
+    notes = [lost] if lost else []
+    if COLMAP.names(out) and (place.exists() or any(photo is None for _, photo in photos)):
+        absent = len({name for name, _ in photos if not (place / name).is_file()})
+        more = f"trainers look for photos in {place}: copy or link the {absent:,} that it lacks there"
+        notes += [more] if absent else []
     return notes
 
 
