@@ -56,6 +56,8 @@ LEVELS = Format(
     3, each=_SOG,
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
+SITE = Format("index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3)
+SITE_SCENE = "scene.sog"
 FILES = (  # of endings that end alike the longest first
     Format(
         ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
@@ -144,10 +146,11 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model, which needs cameras, is allowed.
+    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a web site, which have cameras.
     """
-    chosen = next((row for row in FORMATS if row.names(path)), None)
-    if chosen is not None and (chosen.max_degree < 0 or not {LEVELS: levels, COLMAP: cameras}.get(chosen, True)):
+    allowed = {LEVELS: levels, COLMAP: cameras, SITE: cameras}
+    chosen = next((row for row in (*FORMATS, SITE) if row.names(path)), None)
+    if chosen is not None and (chosen.max_degree < 0 or not allowed.get(chosen, True)):
         chosen = None
     if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
@@ -155,7 +158,7 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
     if chosen is None:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder named {FOLDER}" if cameras else ""
+        folder = f", a new folder for a web site, or one named {FOLDER}" if cameras else ""
         former = next((ending for ending in FORMER_ENDINGS if Path(path).name.lower().endswith(ending)), None)
         gone = "" if former is None else f"{former} is no longer written; "
         raise UsageError(f"{path}: {gone}expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
