@@ -77,7 +77,7 @@ def _commands_page() -> str:
     lines = [NOTICE, "", COMMANDS_HEAD]
     for name, command in _all_commands().items():
         usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```", ""]
+        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", f"`{usage}`", ""]
         arguments = [p for p in command.params if p.param_type_name == "argument"]
         lines += [f"- `{p.metavar or p.name.upper()}`: {_line(p.help)}" for p in arguments]
         same: dict[str, list[str]] = {}
@@ -171,31 +171,16 @@ def _settings_page() -> str:
 
 
 def _exporters_page(page: str) -> str:
-    """Renew the lists of a page: what lies between the comments that name them and those that end them."""
+    """Renew the list of a page: what lies between the comment that names it and the one that ends it."""
     from gsmerge.scene.exporters import EXPORTERS
-    from gsmerge.scene.no_gaussians import POINTS_ONLY
 
-    exporters = EXPORTERS.values()
-    page = _renew(page, "names", [f"- `{one.name}`: {'; '.join(_habits(one))}" for one in exporters])
     results: dict[str, list[str]] = {}
-    for model in (model for one in exporters for model in one.models):
-        results.setdefault(model.result, []).append(f"{model.title} ({model.leaves})")
-    page = _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
-    files = ((row, ", ".join(f"`{file}`" for file in row.files)) for row in POINTS_ONLY)
-    return _renew(page, "points", [f"- {row.title} ({names}): {row.remedy}" for row, names in files])
-
-
-def _habits(exporter: Any) -> list[str]:
-    """What an exporter does, but for what most do: logits, rotations wxyz, degree 0, normals."""
-    order = "rows without pixels" if exporter.order == "none" else exporter.order
-    kinds = "" if exporter.order == "none" else ", ".join(exporter.kinds)
-    degrees = "" if exporter.degrees == (0,) else f"degree {', '.join(map(str, exporter.degrees))}"
-    quats = "" if exporter.quats == "wxyz" else f"rotations {exporter.quats}"
-    opacity = "" if exporter.opacity == "logit" else f"{exporter.opacity} opacities"
-    normals = "normals as bytes" if exporter.byte_columns else "" if exporter.normals else "no normals"
-    elements = ", ".join(f"`{name}`" for name in exporter.elements)
-    comment = exporter.comment and f"comment {exporter.comment}"
-    return [fact for fact in (order, kinds, opacity, quats, degrees, normals, elements, comment) if fact]
+    for one in EXPORTERS.values():
+        for model in one.models:
+            leaves = model.leaves.replace("; no cameras", "").replace("no cameras", "")
+            facts = "; ".join(filter(None, (f"`{one.name}`", leaves)))
+            results.setdefault(model.result, []).append(f"{model.title} ({facts})")
+    return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
 
 
 def _formats_page(page: str) -> str:
