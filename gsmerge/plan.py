@@ -220,7 +220,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     if asked <= 1:
         return 1
     if problems:
-        raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
+        raise UsageError(f"blocks {asked}: expected one piece (--set blocks=none) with {problems[0]}")
     if asked > scene.num_views:
         raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
     return asked
@@ -230,7 +230,7 @@ def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
     """Note that a cluster has no use for a scene that is compacted in one piece."""
     if blocks == 1 and options.blocks.engine.engine != "local":
         problems = blocks_problems(scene, options)
-        remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
+        remedy = f"which {problems[0]} needs" if problems else "--set blocks=NUMBER makes several"
         note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
 
 
@@ -306,7 +306,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
+            " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
     return checkpoint

@@ -20,7 +20,7 @@ from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
 
 Range = tuple[float, float]
-ERRORS = (  # ranges that --noise scales; the others are habits of the exporter
+ERRORS = (  # ranges that the setting noise scales; the others are habits of the exporter
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
 )
