@@ -28,9 +28,8 @@ COMMANDS_HEAD = """# Commands
 SETTINGS_HEAD = """# Settings
 
 `compact`, `batch`, `extend` and `lab stress` take them as `--set NAME=VALUE`, such as `--set poses=fixed`; in Python
-they are arguments of `gsmerge.compact`. `--set help` lists those of a command. In brackets: the default, and the
-possible values; without a default the program chooses. [Options](commands.md#gsmerge-compact) of `compact` are
-settings, too: `--k 2` is `--set k=2`."""
+they are arguments of `gsmerge.compact`, and `help(gsmerge.CompactOptions)` says more. `--set help` lists those of a
+command. In brackets: default, possible values. [Options](commands.md#gsmerge-compact) of `compact` are settings too."""
 
 
 def main() -> int:
@@ -82,7 +81,8 @@ def _commands_page() -> str:
         lines += [f"- `{p.metavar or p.name.upper()}`: {_line(p.help)}" for p in arguments]
         same: dict[str, list[str]] = {}
         for option in _options(command):
-            owner = known.setdefault((option.name, option.help), name)
+            words = "" if option.name == "set" else option.help  # --set differs only in its example
+            owner = known.setdefault((option.name, words), name)
             if owner == name:
                 lines.append(_option(option))
             else:
@@ -99,15 +99,10 @@ def _options(command: Any) -> list[Any]:
 
 def _option(param: Any) -> str:
     """A line for an option: its names, its value, its default, and its help."""
-    from gsmerge.settings.compact import CompactOptions
-    from gsmerge.settings.setting import flat_settings
-
     named = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
     value = "" if param.is_flag else f" {_value(param)}"
     default = _line(_default(param))
-    setting = flat_settings(CompactOptions).get(param.name)
-    text = _line(setting.text if setting and setting.help == param.help else param.help)
-    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {text}"
+    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {_line(param.help)}"
 
 
 def _value(param: Any) -> str:
@@ -221,7 +216,8 @@ def _list(settings: Iterable[Any]) -> list[str]:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
         values = _line(one.values(null=False))
         facts = "; ".join(filter(None, (default, "" if values in BARE else values)))
-        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {_line(one.text)}")
+        text = _line(one.text if one.default is None else one.help)
+        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines
 
 
