@@ -66,7 +66,8 @@ class CompactOptions(Settings):
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",
-        "They do if no fit follows; a draft or a fast run uses only their decoder heads.", metavar="FILE|NAME")  # fmt: skip
+        "They do if no fit follows; a draft or a fast run uses only their decoder heads.",
+        metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
