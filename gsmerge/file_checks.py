@@ -82,7 +82,7 @@ def damage(path: Path) -> list[str]:
     """List what reading a file does not meet: bytes behind its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
     if path.is_dir():
-        return [f"{ply.name}: {problem}" for ply in find_scene_files(path).plys for problem in damage(ply)]
+        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in damage(file)]
     found = _damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
     left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
     return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
