@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from typing import Any
 from weakref import ref
 
@@ -50,7 +51,7 @@ def compact(
         384
     """
     options = (options or CompactOptions()).with_settings(settings)
-    given = ref(scene) if isinstance(scene, Scene) else scene
+    given = scene if isinstance(scene, str | PathLike) else ref(scene)
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
         size = measure_size(scene)

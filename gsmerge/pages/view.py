@@ -93,7 +93,7 @@ def view(
         if (moved := getattr(value, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
     data = collect(
-        "scene" if isinstance(scene, Scene) else Path(scene).stem, shown, gaussians,
+        Path(scene).stem if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
         progress=progress or (lambda *_: None),
     )  # fmt: skip
