@@ -1,4 +1,4 @@
-"""Every format that is written, opened by programs of others, for docs/guide/open-it.md.
+"""Every format that is written, opened by programs of others, for docs/guide/formats.md.
 
 gsmerge compact demo -o small.ply
 python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout

@@ -68,6 +68,10 @@ FORMER_OPTIONS = {
     "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
     "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
     "draw_only": "a call without scenes draws what the folder holds",
+    "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
+    "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",
+    "antialiased": "gsmerge.render in Python has it", "superpixels": "gsmerge.superpixels in Python has them",
+    "dry_run": "no file of yours is replaced unless you say so", "overwrite": "what gsmerge made is replaced",
 }  # fmt: skip
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",

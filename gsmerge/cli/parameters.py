@@ -327,7 +327,7 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
 
 
 def number_or_text(text: str) -> int | str:
-    """Parse ``--k`` or ``--superpixels``: a number, or a word such as "auto"."""
+    """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
 
 
@@ -362,7 +362,6 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", parser=number_or_text),
-        setting_option("superpixels", parser=number_or_text),
         setting_option("budget"),
         setting_option("quality"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
@@ -374,9 +373,7 @@ _TABLE = (
     ),
     panel(
         MEASURING,
-        setting_option("photo_side"),
-        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="both, where installed"),
-        setting_option("lpips_views"),
+        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="alex, where installed"),
     ),
     panel(
         OUTPUT,
@@ -384,7 +381,6 @@ _TABLE = (
         setting_option("drop"),
         *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
         option("output", Path, "", "--output", "-o"),
-        setting_option("antialiased"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
                "than the input does, by more than .5 dB."),

@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 PAGE_MARK, PAGE_HEAD = b'<meta name="generator" content="gsmerge ', 4096
 
 
+# In the first bytes of what gsmerge makes for readers: pages, JSON, CSV, Markdown
+MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
+MARKED = 4000  # of these bytes
+
+
 @dataclass(frozen=True)
 class FileOptions(Settings):
     """Options for writing a result."""
@@ -152,6 +157,18 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
     _check_place(output.parent, output, "a folder to write to")
+
+
+def check_replaced(outputs: Sequence[Path]) -> None:
+    """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
+    for output in outputs:
+        try:
+            with open(output, "rb") as file:
+                start = file.read(MARKED)
+        except OSError:  # there is none yet, or writing fails with its own reason
+            continue
+        if start and not any(mark in start for mark in MARKS):
+            raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another with --output")
 
 
 def _check_place(folder: Path, output: Path, expected: str) -> None:

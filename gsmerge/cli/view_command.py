@@ -50,12 +50,11 @@ def view(args: opt.Args) -> None:
         return
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, view_page
-    from gsmerge.scene.files import scene_title
 
     sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
     with stage_progress(quiet=args.silent) as progress:
         data = collect(
-            scene_title(files.ply), pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
+            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
             segmentation=segmentation, threads=args.threads, progress=progress,
         )  # fmt: skip
     page = view_page(data)

@@ -17,7 +17,17 @@ from gsmerge.geometry import middle_depth
 from gsmerge.io.formats import spz
 from gsmerge.io.photo_files import encode_indexed, photo_array
 from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Progress, Quality, ResultScores, evaluate, near_plane
+from gsmerge.measure.evaluate import (
+    INPUT,
+    EvaluateOptions,
+    Evaluation,
+    OnImage,
+    Progress,
+    Quality,
+    ResultScores,
+    evaluate,
+    near_plane,
+)
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
@@ -37,6 +47,7 @@ OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or d
 MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
 MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
 MIN_OPACITY = 1 / 255  # what is fainter is not drawn
+Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
 FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
 
 
@@ -129,17 +140,40 @@ def collect(
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
     Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own.
     """
-    pictures = photo_array(with_row_colors(scene).images)
-    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
-    splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
-    stills: dict[tuple[str, str, int], bytes] = {}
+    stills: Stills = {}
+    nets = (LPIPS,) if lpips_available(LPIPS) else ()
+    options = EvaluateOptions(nets, threads=threads)
+    evaluation = evaluate(
+        scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
+    )
+    progress("superpixels and the view from outside", 0, 0)
+    with use_threads(threads):
+        return page_data(title, scene, results, file_bytes, held_out, evaluation, stills, segmentation)
+
+
+def still_keeper(stills: Stills) -> OnImage:
+    """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds what is drawn to ``stills``."""
 
     def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
         stills[result, split, view] = encode_still(to_picture(image))
 
-    nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, threads=threads)
-    evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=keep)
+    return keep
+
+
+def page_data(
+    title: str,
+    scene: Scene,
+    results: Mapping[str, Gaussians],
+    file_bytes: Sequence[int],
+    held_out: Views | None,
+    evaluation: Evaluation,
+    stills: Stills,
+    segmentation: SegmentOptions | None = None,
+) -> ViewData:
+    """Make the content of a page of what was measured: see :func:`collect`."""
+    pictures = photo_array(with_row_colors(scene).images)
+    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
+    splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     sides = [
@@ -149,6 +183,8 @@ def collect(
     means = frame.enter(named[evaluation.results[:2][-1].name]).means
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
+        if split not in evaluation.num_views:  # only held-out views were measured
+            continue
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
         encoded = encoded or [None] * len(names)
         for i, name in enumerate(short_names(names)):
@@ -163,10 +199,8 @@ def collect(
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
-    progress("superpixels and the view from outside", 0, 0)
-    with use_threads(threads):
-        outside = _outside_view(scene, named, frame, len(views))
-        shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
+    outside = _outside_view(scene, named, frame, len(views))
+    shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
     share, _ = evaluation.results[0].mean_covered("context")

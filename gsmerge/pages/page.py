@@ -7,7 +7,6 @@ import hashlib
 import html
 import json
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -17,9 +16,7 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.measure.preview import Picture
-from gsmerge.measure.scores import filled_tables, page_notes, page_title
-from gsmerge.pages.data import PageView, ViewData, encode_still
+from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Cameras
 
@@ -84,35 +81,6 @@ def view_page(data: ViewData) -> str:
     )
 
 
-def report_page(document: Mapping[str, Any], pictures: Sequence[Sequence[tuple[str, Picture]]]) -> str:
-    """Make the HTML page of an evaluation: headline, pictures with a swipe, tables.
-
-    Args:
-        document: As of :func:`gsmerge.measure.scores.evaluation_document`.
-        pictures: For each view the text and the picture of each scene.
-    """
-    results = document["results"]
-    title = headline = page_title(document)
-    tiles: list[tuple[str, str, str]] = []
-    if len(results) > 1:
-        before, after = results[:2]
-        split = "target" if "target" in before["mean"] else "context"
-        old, new = (result["mean"][split]["psnr_visible"] for result in (before, after))
-        reference = PHOTOS if split == "target" else document["reference"]
-        headline = headline_of(before["num_gaussians"], after["num_gaussians"], old, new, reference)
-        milliseconds = [1000 * result["render_seconds"] for result in (before, after)]
-        tiles = [
-            ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}"),
-            ("File", human_bytes(before["bytes"]), human_bytes(after["bytes"])),
-            ("Render time", f"{milliseconds[0]:.1f}", f"{milliseconds[1]:.1f} ms"),
-        ]
-    views = [[(text, data_uri(encode_still(picture), "image/webp")) for text, picture in row] for row in pictures]
-    return render_template(
-        "report.html", policy=PICTURES, title=title, views=views, headline=headline, tiles=tiles,
-        tables=list(filled_tables(document)), notes=page_notes(document),
-    )  # fmt: skip
-
-
 def headline(data: ViewData, place: int = 1) -> str:
     """Write the headline of a result: share of Gaussians and change of quality; for one scene alone its size."""
     before = data.sides[0]
@@ -121,16 +89,12 @@ def headline(data: ViewData, place: int = 1) -> str:
         has_quality = quality is not None and np.isfinite(quality)
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
     after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
-    return headline_of(before.num_gaussians, after.num_gaussians, before.mean.psnr, after.mean.psnr, reference)
-
-
-def headline_of(num_before: int, num_after: int, old: float | None, new: float | None, reference: str = PHOTOS) -> str:
-    """Write the :func:`headline` from counts and PSNR (dB) before and after; infinite ``old``: the reference."""
-    share = 100 * num_after / max(num_before, 1)
+    old, new = before.mean.psnr, after.mean.psnr
+    share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
     if new is None or old is None or not np.isfinite(new):
         return said
-    if not np.isfinite(old):
+    if not np.isfinite(old):  # the input itself is the reference
         return f"{said}, {new:.1f} dB from the input's own renders"
     words = ROW_COLORS if reference == ROW_COLORS else "the photos"
     return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
@@ -267,6 +231,6 @@ def _environment() -> jinja2.Environment:
     made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    made.filters |= {"bytes": human_bytes, "number": _number, "unbroken": _unbroken}
+    made.filters |= {"bytes": human_bytes, "number": _number}
     made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
     return made

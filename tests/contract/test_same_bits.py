@@ -30,6 +30,7 @@ REFUSED = {
 OTHERS = (
     "pages/",
     "research/",
+    "measure/clip.py",
     "measure/lpips.py",
     "measure/preview.py",
     "networks/tensors.py",

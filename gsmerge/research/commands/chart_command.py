@@ -94,7 +94,7 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     with opt.usage_errors():
         own = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
     run: dict[str, Any] = {name: fixed.pop(name) for name in ("seed", "threads") if name in fixed}
-    nets, notes = lpips_networks(own.lpips)
+    nets, notes = lpips_networks(own.lpips, NETS)
     grid = parse_grid(args.grid or (), fixed)
     with opt.usage_errors():
         measured = EvaluateOptions(nets, own.lpips_views, photo_side=own.photo_side)
