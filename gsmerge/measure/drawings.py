@@ -188,7 +188,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
     texts = [
-        (path.absolute().name, f"{len(gaussians):,} Gaussians, {human_bytes(size)}")
+        (path.absolute().name, f"{len(gaussians):,} Gaussians", human_bytes(size))
         for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
     ]
 

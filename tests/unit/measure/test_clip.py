@@ -191,12 +191,19 @@ def test_lines_between_scenes_start_evenly_and_stay_inside() -> None:
 
 
 def test_captions_stay_in_their_scene_s_part() -> None:
-    texts = [
-        ("a name that is much longer than its part of the frame has room for.ply", "1,182,720 Gaussians, 80.4 MB")
-    ] * 2
-    for width, height in ((480, 352), (1920, 1080), (64, 48)):
+    name = "a name that is longer than its part of the frame has room for.ply"
+    texts = [(name, "1,182,720 Gaussians", "80.4 MB"), ("small.ply", "52,038 Gaussians", "3.5 MB")]
+    tall = {}
+    for width, height in ((480, 352), (1920, 1080), (256, 480), (64, 48)):
         left, right = clip.make_captions(texts, width, height)
         for caption, start, end in ((left, 0, width // 2), (right, width // 2, width)):
-            tall, wide = caption.text.shape[:2]
-            assert start <= caption.left < caption.left + wide <= end
-            assert 0 <= caption.top < caption.top + min(tall, height) <= height
+            box = caption.text.shape
+            assert start <= caption.left < caption.left + box[1] <= end or width == 64
+            assert caption.top >= 0
+            tall[width] = box[0] / height
+        frame = np.full((height, width, 3), 128, np.uint8)
+        left.draw(frame)
+        assert (frame == 245).any() or width == 64  # text
+        assert (frame[: left.top] == 128).all()
+    assert tall[480] == pytest.approx(tall[1920], abs=0.03)  # as large a part of a small frame
+    assert tall[256] > tall[480]  # a line more, for there is less room
