@@ -1,4 +1,4 @@
-"""Every format that is written, opened by programs of others, for docs/guide/open-it.md.
+"""Every format that is written, opened by programs of others, for docs/guide/formats.md.
 
 gsmerge compact demo -o small.ply
 python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout
@@ -167,10 +167,11 @@ def spark_values(chromium: str, path: Path) -> Values:
     """Values of a file by Spark, of the release that `gsmerge view` has, in a browser."""
     from browser import browser
 
-    script = gzip.decompress(files("gsmerge.pages").joinpath(ENGINE).read_bytes()).decode()
+    script, _, module = gzip.decompress(files("gsmerge.pages").joinpath(ENGINE).read_bytes()).partition(b"\0")
+    numbers = f"window.sparkModule = Uint8Array.fromBase64('{base64.b64encode(module).decode()}');"
     page = path.with_name("spark.html").resolve()
     data = base64.b64encode(path.read_bytes()).decode()
-    page.write_text(f'<script id="file" type="text/plain">{data}</script><script>{script}</script>')
+    page.write_text(f'<script id="file" type="text/plain">{data}</script><script>{numbers}{script.decode()}</script>')
     with tempfile.TemporaryDirectory() as profile, browser(chromium, Path(profile)) as tab:
         tab.open(page)
         rows = tab.run(SPARK.replace("NAME", path.name))

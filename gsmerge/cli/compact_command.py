@@ -92,6 +92,7 @@ def _compact(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
+    from gsmerge.io.formats.table import COLMAP, PLY, SITE
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -101,12 +102,15 @@ def _compact(args: opt.Args) -> None:
         require_ray()
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = output_file(args.output or default_output(files.base), default_output(files.base).name)
+    default = default_output(files.base)
+    out = output_file(args.output or default, default.name)
     streamed, model = is_index(out), model_files(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if model and (settings.budget.in_bytes or settings.budget.levels > 1):
-        raise UsageError(f"{out}: expected a --budget in Gaussians and no --levels for a COLMAP model")
+    if model and settings.budget.levels > 1:
+        raise UsageError(f"{out}: expected no --levels for a web site or a COLMAP model")
+    if COLMAP.names(out) and settings.budget.in_bytes:
+        raise UsageError(f"{out}: expected a --budget in Gaussians for a COLMAP model")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
@@ -139,8 +143,9 @@ def _compact(args: opt.Args) -> None:
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
-        view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
-        lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
+        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) else []
+        look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
+        lines = result_table(document, shlex.join(look) or None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if args.strict and document["psnr_input_views"]["before"] is None:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)

@@ -327,7 +327,7 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
 
 
 def number_or_text(text: str) -> int | str:
-    """Parse ``--k`` or ``--superpixels``: a number, or a word such as "auto"."""
+    """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
 
 
@@ -362,7 +362,6 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", parser=number_or_text),
-        setting_option("superpixels", parser=number_or_text),
         setting_option("budget"),
         setting_option("quality"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),

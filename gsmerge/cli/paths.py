@@ -15,6 +15,9 @@ from gsmerge.settings.setting import Settings, setting
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
 
+# In the head of every page that gsmerge makes
+PAGE_MARK, PAGE_HEAD = b'<meta name="generator" content="gsmerge ', 4096
+
 
 # In the first bytes of what gsmerge makes for readers: pages, JSON, CSV, Markdown
 MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
@@ -42,21 +45,48 @@ def default_output(ply: Path) -> Path:
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the file that an output names: ``name`` in a folder that exists, the points of a model for ``colmap``.
+    """Return the file that an output names: of a folder its main file, or in an existing folder the file ``name``.
 
-    A page of gsmerge marks a folder as a web site, which is written as such.
+    A folder named ``colmap`` is a COLMAP model, a new or empty one and one with a site of gsmerge a web site.
     """
-    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
+    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS, SITE
 
     if output.name == FOLDER:
         return output / PLACE / POINTS
-    return output / name if output.is_dir() and not (output / "index.html").exists() else output
+    if _is_site(output):
+        return output / SITE.ending
+    return output / name if output.is_dir() else output
+
+
+def _is_site(output: Path) -> bool:
+    """Return whether a folder is, or is to become, a web site; a file's name has an ending."""
+    from gsmerge.io.formats.table import SITE
+
+    if not os.path.lexists(output):
+        return not output.suffix
+    try:
+        return output.is_dir() and (not any(output.iterdir()) or is_page(output / SITE.ending))
+    except OSError:  # no permission to look into it: the check of outputs says so
+        return False
+
+
+def is_page(path: Path) -> bool:
+    """Return whether a file is a page that gsmerge made."""
+    try:
+        with path.open("rb") as file:
+            return PAGE_MARK in file.read(PAGE_HEAD)
+    except OSError:
+        return False
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
-    """List the files of an output that is a COLMAP model; SceneError if another program wrote the model."""
-    from gsmerge.io.formats.table import POINTS
+    """List the other files of a web site, or of a COLMAP model, of which another program's is a SceneError."""
+    from gsmerge.io.formats.table import POINTS, SITE
 
+    if SITE.names(output):
+        from gsmerge.pages.site import NAMES
+
+        return tuple(output.with_name(name) for name in NAMES.values())
     if output.name != POINTS:
         return ()
     from gsmerge.io.cameras.colmap_model import files_beside

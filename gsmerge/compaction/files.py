@@ -18,12 +18,12 @@ from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.formats.table import COLMAP, INDEX
+from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
@@ -90,7 +90,7 @@ def compact_files(
             result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         comments = [RESULT_COMMENT, *load.comments]
-        views_named = result.cameras[views], names, files.images
+        views_named = result.cameras[views], names, files
         written = _write_results(add, outputs, first, results, comments, views_named, parts)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
@@ -118,22 +118,26 @@ def _write_results(
     first: Path,
     results: Sequence[CompactResult],
     comments: Sequence[str],
-    views: tuple[Cameras, Sequence[str], Path | None],
+    views: tuple[Cameras, Sequence[str], SceneFiles],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
 
-    A COLMAP model has the ``views``, too: cameras, names, and the folder of their photos; ``parts`` are those of a
-    ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
-    renamed.
+    A COLMAP model and a web site have the ``views``, too: cameras, names, and the files of the scene; ``parts`` are
+    those of a ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before
+    they are renamed.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    cameras, names, files = views
     if ending == COLMAP.ending:
         from gsmerge.compaction.placement import add_colmap, name_photos
 
-        cameras, names, photos = views
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(photos, names))}
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(files.images, names))}
+    if ending == SITE.ending:
+        from gsmerge.pages.site import add_site
+
+        return {out: add_site(add, out, first, results[0].gaussians, cameras, scene_title(files.ply), comments)}
     if parts is not None:
         return parts.write(add, out, first, comments)
     written = {out: [first]}
@@ -150,7 +154,8 @@ def _write_results(
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Say in the settings whose bytes a budget counts."""
-    budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
+    name = SITE_SCENE if SITE.names(outputs.result) else outputs.result.name
+    budget = replace(settings.budget, output=name, spz_version=outputs.spz_version)
     return replace(settings, budget=budget)
 
 

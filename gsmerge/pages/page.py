@@ -18,6 +18,7 @@ from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
+from gsmerge.types import Cameras
 
 if TYPE_CHECKING:
     import jinja2
@@ -164,18 +165,24 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _view(view: PageView) -> dict[str, Any]:
-    """Convert a view for the page's script: row-major world to camera, intrinsics in pixels."""
-    camera = view.camera
+    """Convert a view for the page's script."""
     return {
         "name": view.name,
         "held_out": view.held_out,
         "outside": view.outside,
+        **camera_numbers(view.camera, view.distance),
+        "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
+    }
+
+
+def camera_numbers(camera: Cameras, distance: float) -> dict[str, Any]:
+    """Describe a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
+    return {
         "viewmat": camera.viewmats[0].reshape(-1).tolist(),
         "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
         "width": camera.width,
         "height": camera.height,
-        "distance": view.distance,
-        "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
+        "distance": distance,
     }
 
 

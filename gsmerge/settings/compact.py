@@ -59,7 +59,7 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
-    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/guide/baselines.md "
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/internals/plugins.md "
         "lists them.",
         "Packages add methods by entry points (`gsmerge.compaction.methods.Method`); for all but `gsmerge` the number "
         "of Gaussians has to be settled beforehand.", choices=method_names, metavar="NAME")  # fmt: skip

@@ -56,7 +56,7 @@ def call(command: str, scene: Path) -> list[object]:
     if command == "extend":
         return [command, scene / output, scene, *rest]
     if command == "generate":
-        return [command, "-o", scene / output, *rest]
+        return ["lab", command, "-o", scene / output, *rest]
     more = [scene / "scene.ply", *targets] if command == "view" else []
     return [*command.split(), scene, *more, "-o", scene / output, *rest]
 
@@ -92,7 +92,7 @@ def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
-@pytest.mark.parametrize("command", ["compact", "view", "compact a state", "generate"])
+@pytest.mark.parametrize("command", ["compact", "compact a state"])
 def test_a_dry_run_writes_nothing(command: str, small_copy: Path, run: Run) -> None:
     words = call(command, small_copy)
     before = listing(small_copy)

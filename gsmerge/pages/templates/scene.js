@@ -62,10 +62,13 @@ async function unpackSplats(packed) {
   return new Uint8Array(await new Blob(blocks).arrayBuffer());
 }
 
-// Runs the compressed script of the renderer; its exports are then in `Vendor`.
-async function loadVendor() {
+// Runs the compressed script of the renderer, which its WebAssembly follows; its exports are then in `Vendor`.
+async function loadVendor(packed) {
+  const bytes = await gunzip(packed);
+  const end = bytes.indexOf(0);
+  window.sparkModule = bytes.slice(end + 1);
   const script = document.createElement("script");
-  script.src = URL.createObjectURL(new Blob([await gunzip(takeBytes("engine"))], { type: "text/javascript" }));
+  script.src = URL.createObjectURL(new Blob([bytes.subarray(0, end)], { type: "text/javascript" }));
   await new Promise((resolve, reject) => {
     script.onload = resolve;
     script.onerror = () => reject(new Error("the renderer does not load"));
@@ -103,8 +106,8 @@ class SplatView {
     return this.results.has(source);
   }
 
-  async add(source, packed) {
-    const mesh = new Vendor.SplatMesh({ fileBytes: await unpackSplats(packed), fileName: "scene.spz" });
+  async add(source, fileBytes, fileName = "scene.spz") {
+    const mesh = new Vendor.SplatMesh({ fileBytes, fileName });
     await mesh.initialized;
     // As gsmerge's own renderer: sorted by depth, 0.3 square pixels of low-pass, nothing below 1/255
     const spark = new Vendor.SparkRenderer({

@@ -221,7 +221,7 @@ async function load(made) {
   for (const source of [state.left, state.right]) {
     const { splats, count } = data.sources[source];
     const drawable = splats && !(made.software && count > SOFTWARE_MOST);
-    if (drawable && !made.has(source) && id(splats)) await made.add(source, takeBytes(splats));
+    if (drawable && !made.has(source) && id(splats)) await made.add(source, await unpackSplats(takeBytes(splats)));
   }
 }
 
@@ -233,7 +233,7 @@ async function startScene() {
   const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
   await painted().then(painted); // the first still comes first
   try {
-    await loadVendor();
+    await loadVendor(takeBytes("engine"));
     const moved = () => {
       if (state.atCamera) {
         state.atCamera = false;

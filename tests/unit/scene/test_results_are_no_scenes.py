@@ -85,7 +85,7 @@ def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> N
     tiny.save(tmp_path)
     assert header_content(tmp_path / "scene.ply") == "Gaussians"
     size = ["--scenes", "1", "--views", "2", "--size", "32x24"]
-    assert main(["generate", "-o", str(tmp_path / "made"), *size, "--quiet"]) == 0
+    assert main(["lab", "generate", "-o", str(tmp_path / "made"), *size, "--quiet"]) == 0
     assert header_content(tmp_path / "made/scene_0000/scene.ply") == "Gaussians"
 
 
