@@ -337,6 +337,18 @@ def test_tables_for_people(actual: Evaluation) -> None:
     assert "smaller" not in lines[1]
 
 
+def test_narrow_terminals_keep_psnr_and_whole_words(actual: Evaluation) -> None:
+    wide = evaluation_lines(document_of(actual))
+    assert max(map(len, wide)) == 80
+    words = {word for line in wide for word in line.split()}
+    for columns in (79, 40):
+        lines = evaluation_lines(document_of(actual), columns)
+        assert max(map(len, lines)) <= columns
+        assert {word for line in lines for word in line.split()} <= words
+        assert any("PSNR (dB)" in line for line in lines)
+        assert not any("bytes each" in line for line in lines)
+
+
 def test_costs_are_columns(actual: Evaluation) -> None:
     text = "\n".join(evaluation_lines(document_of(actual)))
     assert "4.0 x" in text
