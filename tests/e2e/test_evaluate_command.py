@@ -62,6 +62,21 @@ def test_other_sizes(scene_copy: Path, run: Run) -> None:
     assert "PSNR 0.5x" in run(*call, "--set", "zoom=.5").out
 
 
+@pytest.mark.parametrize("setting", ["context=false", "photo_side=48", "views=3"])
+def test_a_page_shows_what_was_measured(setting: str, scene_copy: Path, small: Path, run: Run) -> None:
+    page = scene_copy / "page.html"
+    call = ("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none", "-o", page)
+    if setting == "views=3":
+        call = (*call[:3], *call[5:])
+    document = json.loads(run(*call, "--set", setting, "--json", code=0).out)
+    split = "context" if setting == "views=3" else "target"
+    text = page.read_text()
+    assert f"{document['results'][1]['mean'][split]['psnr_visible']:.2f}" in text
+    shown = sum(document["num_views"].values())
+    assert text.count('"held_out":true') == document["num_views"].get("target", 0)
+    assert text.count('"held_out":') == shown + 1  # and the view from outside
+
+
 def test_photos_of_a_given_size(scene_copy: Path, small: Path, run: Run) -> None:
     call = ("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none")
     document = json.loads(run(*call, "--set", "photo_side=48", "--set", "speed=true", "--json").out)
