@@ -19,6 +19,7 @@ TOPICS = {
     "Data": ("Scene", "Gaussians", "Cameras", "Views"),
     "Errors": ("GsmergeError", "SceneError"),
 }
+ELSEWHERE = {"CompactOptions": "settings.md", "CompactReport": "report.md"}  # pages that describe the fields
 HEAD = """# Python API
 
 Every public name of `gsmerge`, from its docstring, which `help()` shows in full; [the guide](../guide/python.md) says
@@ -55,8 +56,9 @@ def _describe(name: str, value: Any) -> list[str]:
             lines += ["", f"Returns: {body}"]
         elif title == "Args":
             entries = re.findall(r"^(\*{0,2}\w+): (.*?)(?=^\*{0,2}\w+: |\Z)", body, re.DOTALL | re.MULTILINE)
-            shown = [] if value is gsmerge.CompactOptions else entries  # which settings.md has
-            lines += [""] + [f"- `{entry}`: {' '.join(about.split())}" for entry, about in shown] if shown else []
+            listed = [f"- `{entry}`: {' '.join(about.split())}" for entry, about in entries]
+            names = ", ".join(f"`{entry}`" for entry, _ in entries)
+            lines += ["", *([f"Fields, [described]({ELSEWHERE[name]}): {names}."] if name in ELSEWHERE else listed)]
     return lines
 
 
