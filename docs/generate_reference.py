@@ -20,11 +20,12 @@ REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
-BARE = ("a whole number", "a number", "text", "true or false")  # values that the default or the text shows as well
 KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 COMMANDS_HEAD = """# Commands
 
-`gsmerge COMMAND --help` prints the same. What is in brackets is the default. [Exit codes](exit-codes.md)."""
+`gsmerge COMMAND --help` prints the same; what is in brackets is the default. `gsmerge SCENE` takes the options of
+`compact`, and opens the page of `view`. Where a command has no `--threads` or `--seed`, `GSMERGE_THREADS` and
+`GSMERGE_SEED` of the environment are read. [Exit codes](exit-codes.md)."""
 SETTINGS_HEAD = """# Settings
 
 `compact`, `batch`, `extend` and `lab stress` take them as `--set NAME=VALUE`, such as `--set poses=fixed`; in Python
@@ -172,7 +173,7 @@ def _exporters_page(page: str) -> str:
     results: dict[str, list[str]] = {}
     for one in EXPORTERS.values():
         for model in one.models:
-            leaves = model.leaves.replace("; no cameras", "").replace("no cameras", "")
+            leaves = model.leaves.partition(";")[0].replace("no cameras", "")
             facts = "; ".join(filter(None, (f"`{one.name}`", leaves)))
             results.setdefault(model.result, []).append(f"{model.title} ({facts})")
     return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
@@ -214,8 +215,7 @@ def _list(settings: Iterable[Any]) -> list[str]:
     lines = []
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
-        values = _line(one.values(null=False))
-        facts = "; ".join(filter(None, (default, "" if values in BARE else values)))
+        facts = "; ".join(filter(None, (default, _line(one.values(null=False)) if one.words else "")))
         text = _line(one.text if one.default is None else one.help)
         lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines
