@@ -24,7 +24,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
 
 from .conftest import Run, assert_refused
 
