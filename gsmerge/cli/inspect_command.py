@@ -43,7 +43,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
         facts = inspect_scene(path, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints))
         problems = check_content(path).problems if path.name == INDEX else damage(path)
     document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if facts["compact"] is None:
         place, _, problem = facts["alignment_problem"].partition(": ")
         raise SceneError(place, problem)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from former_formats import compressed_bytes
 from hostile.gsm_files import entry, filled, with_array, with_text
 from messages import ERROR, says
 from safetensors.numpy import load_file
@@ -34,7 +35,11 @@ def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sound file of every kind. Read only."""
     folder = Path(shutil.copytree(small_scene, tmp_path_factory.mktemp("sound") / "room"))
     for name in FORMATS[1:]:
-        write_gaussians(folder / name, gsmerge.read_ply(folder / "scene.ply").gaussians)
+        gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
+        if name == "a.compressed.ply":
+            (folder / name).write_bytes(compressed_bytes(gaussians))
+        else:
+            write_gaussians(folder / name, gaussians)
     shutil.copy(IN_PACKAGE["shipped"], folder / "networks.safetensors")
     cameras = gsmerge.read_cameras(folder / "transforms.json")
     np.savez(folder / "views.npz", extrinsics=cameras.viewmats[:, :3], intrinsics=cameras.Ks)

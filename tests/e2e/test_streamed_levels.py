@@ -82,4 +82,4 @@ def test_others_write_no_levels(kind: str, small_scene: Path, index: Path, tmp_p
         "state": (("compact", state, "-o", index), index),
         "batch": (("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json"), "output"),
     }[kind]
-    assert_refused(run(*words), 2, place, ".compressed.ply")
+    assert_refused(run(*words), 2, place, ".ply")
