@@ -20,6 +20,7 @@ import pytest
 from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
+from saved_cameras import camera_comments
 from tiny_scene import (
     make_tiny,
     save_json,
@@ -34,7 +35,6 @@ import gsmerge
 from gsmerge.cli.parameters import parse_pairs
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import read_cameras, read_gaussians, read_images
-from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
