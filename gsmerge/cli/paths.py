@@ -178,16 +178,6 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
         raise SceneError(output, f"cannot be written: no permission for {nearest}", "name another with --output")
 
 
-def is_camera_file(path: Path) -> bool:
-    """Return whether a file is one of the camera files that ``compact`` writes beside results."""
-    from gsmerge.io.cameras.read import read_cameras
-
-    try:
-        return len(read_cameras(path)) > 0
-    except SceneError:
-        return False
-
-
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that reading the scene uses."""
     paths = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
