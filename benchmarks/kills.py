@@ -40,7 +40,7 @@ COMMANDS = {
     "extend": ("extend {out}/a.gsm {b} --set effort=draft", "extend {out}/a.gsm {a} --set effort=draft"),
     "batch": (f"batch {{scenes}} -o {{out}} --jobs 1 {FAST}", None),
     "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
-    "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
+    "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite" for x in "ab"),
 }
 # Imported before the commands are run, which would each do it anew
 MODULES = ("gsmerge.cli.app", "gsmerge.compaction.files", "gsmerge.networks.apply", "gsmerge.states.files")

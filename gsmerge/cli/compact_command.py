@@ -58,7 +58,8 @@ PARAMETERS = (
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A folder named colmap: a COLMAP model. A folder that exists: into it.", "SCENE.compact.ply"),
+               "A new name without an ending, such as site/: a web site. A folder named colmap: a COLMAP model. "
+               "Another folder that exists: into it.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 

@@ -137,7 +137,7 @@ def _seconds_of(making: float | str) -> float:
         seconds = document.get("total_seconds") if isinstance(document, dict) else None
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
         raise SceneError(
-            Path(str(making)), "expected seconds or the JSON of a compact run (total_seconds), found neither"
+            Path(str(making)), "expected seconds or the report of a compact run (total_seconds), found neither"
         )
     return float(seconds)
 

@@ -72,7 +72,8 @@ def _check_files(args: opt.Args) -> None:
     }
     lines = [result.line for result in checks if several or not result.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    count = f"wrong files: {len(wrong)} of {len(checks)}" if several else ""
     if wrong and several and not args.silent:
-        raise SceneError(f"{len(wrong)} of {len(checks)} files", "refused, for the causes above")
+        raise SceneError(wrong[0].path, "refused, for the cause above", count)
     if wrong:
-        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), "and others" if len(wrong) > 1 else "")
+        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), count)

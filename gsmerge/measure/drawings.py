@@ -157,7 +157,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
     def draw(_: int) -> Iterator[Picture]:
         parts = [(path.name, gaussians) for path, gaussians in group.scenes]
-        shown = [photos[[used[i]]][0] for i in ids] if len(photos) else None
+        shown = [photos[used[i]] for i in ids] if len(photos) else None
         if shown and options.size:
             shown = [fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(parts, cameras[ids], shown, ids, background=options.background)
@@ -188,15 +188,18 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
     texts = [
-        (path.absolute().name, f"{len(gaussians):,} Gaussians, {human_bytes(size)}")
+        (path.absolute().name, f"{len(gaussians):,} Gaussians", human_bytes(size))
         for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
     ]
 
     def draw(threads: int) -> Iterator[Picture]:
+        if len(texts) == 1:
+            yield from (picture for (picture,) in group.draw(cameras, options, threads, near))
+            return
         captions = make_captions(texts, cameras.width, cameras.height)
         places = swipe_places(len(texts), len(cameras), options.fps, cameras.width)
         for drawn, row in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
-            yield draw_swipe(drawn, row, captions) if len(drawn) > 1 else drawn[0]
+            yield draw_swipe(drawn, row, captions)
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}

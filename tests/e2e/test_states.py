@@ -64,19 +64,14 @@ def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, 
 
 @sweep(
     "wish",
-    [
-        ("--budget", 700, "--k", 2),
-        ("--k", "mixed"),
-        ("--budget", "auto"),
-        ("--set", "recipe=paper"),
-        ("--budget", "3%"),
-    ],
+    [("budget=700", "k=2"), ("k=mixed",), ("budget=auto",), ("recipe=paper",), ("budget=3%",)],
     ids=str,
     often=3,
 )
 def test_what_the_batch_was_asked_for_is_the_default(
-    wish: tuple[str | int, ...], made_scene: Path, tmp_path: Path, run: Run
+    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
+    wish = tuple(word for pair in wish for word in ("--set", pair))
     kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
     assert run("extend", kept, made_scene, *SMALL, *wish).code == 0
     assert run("compact", kept, *PLAIN, "-o", one).code == 0

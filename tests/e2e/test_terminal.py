@@ -167,7 +167,7 @@ def test_a_compact_scene_is_known_again(small_copy: Path, tmp_path: Path, run: R
     views = ("--cameras", small_copy / "transforms.json", "--images", small_copy / "images")
     second = run("compact", out, "-o", again, *words, *views, code=0)
     assert second.err.count("already (") == 1
-    scored = run("evaluate", small_copy, out, "--views", 2, "--lpips", "none")
+    scored = run("evaluate", small_copy, out, "--set", "views=2", "--lpips", "none")
     assert "small.ply: " in scored.err
     assert "more" in scored.err
     assert "more" not in run("evaluate", small_copy, out, "--lpips", "none").err

@@ -142,7 +142,7 @@ def test_a_folder_with_a_result_and_its_cameras_needs_no_options(small_copy: Pat
     for place in (out, out / "small.ply"):
         facts = json.loads(run("inspect", place, "--json", code=0).out)
         assert (facts["cameras"], facts["num_views"]) == (str(out / "small.cameras.json"), count)
-    run("render", out, "--as", "views", "-o", tmp_path / "pictures", code=0)
+    run("render", out, "-o", tmp_path / "pictures", code=0)
     assert len(list((tmp_path / "pictures").iterdir())) == count
     document = json.loads(run("evaluate", out, "--lpips", "none", "--json", code=0).out)
     assert document["num_views"]["context"] == count
