@@ -126,7 +126,7 @@ def test_no_command_breaks_a_word_or_a_row_of_figures(
     quick = ("--fit", "none", "--budget", 300)
     for words in (
         ("compact", "s", "-o", "a.ply", *quick), ("batch", "s", "-o", "b", *quick), ("inspect", "a.ply"),
-        ("convert", "a.ply", "a.sog"), ("compact", "s", "-o", "a.ply"),
+        ("convert", "a.ply", "a.sog"), ("compact", "s", "-o", "a.ply"), ("extend", "a.gsm", "s"),
     ):  # fmt: skip
         _, output = in_terminal(*words, columns=columns)
         *_, text = re.split(r"\r\x1b\[\d*A|\x1b\[\d?K", output.decode())  # after the last bar is erased
