@@ -72,12 +72,11 @@ def _all_commands() -> dict[str, Any]:
 
 
 def _commands_page() -> str:
-    """Usage, arguments and options of every command; what an earlier command has in the same words is only named."""
+    """Arguments and options of every command; what an earlier command has in the same words is only named."""
     known: dict[tuple[str, str], str] = {}
     lines = [NOTICE, "", COMMANDS_HEAD]
     for name, command in _all_commands().items():
-        usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", f"`{usage}`", ""]
+        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), ""]
         arguments = [p for p in command.params if p.param_type_name == "argument"]
         lines += [f"- `{p.metavar or p.name.upper()}`: {_line(p.help)}" for p in arguments]
         same: dict[str, list[str]] = {}
