@@ -10,7 +10,7 @@ from sweeps import sweep
 from .conftest import Run
 
 FORMATS = ("a.ply", "a.sog", "lod-meta.json", "a.spz", "a.splat", "a.glb", "a.usdc")
-QUICK = ("--effort", "draft", "--fit", "none", "-q")
+QUICK = ("--effort", "draft", "--set", "fit=none", "-q")
 
 
 def file_bytes(folder: Path) -> int:

@@ -60,9 +60,9 @@ def test_bars_end_full(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) 
     monkeypatch.setenv("COLUMNS", columns)
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
         progress("read: small.ply", 1, 3)
-        progress("evaluate: input", 11, 12)
+        progress("superpixels and the view from outside: input", 11, 12)
     lines = terminal.lines()
-    for name, count in (("read", "3/3"), ("evaluate", "12/12")):
+    for name, count in (("read", "3/3"), ("superpixels and", "12/12")):
         last = [line for line in lines if line.startswith(name)][-1]
         assert "━" * bar in last
         assert count in last
