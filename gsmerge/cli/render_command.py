@@ -55,6 +55,7 @@ def render(args: opt.Args) -> None:
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_path
+    from gsmerge.report import document_head
 
     files = args.files(args.scenes[0])
     like = drawings.frame_files(files, args.cameras, args.images)
@@ -70,7 +71,8 @@ def render(args: opt.Args) -> None:
     drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(files, args.scenes, like, args.output, args.opacity, hints, **arguments)
     )
-    document = drawings.drawing_document(drawing, args.output)
+    document = {**document_head(), "output": str(args.output), "pictures": [str(path) for path in drawing.paths]}
+    document |= drawing.facts
     say_notes(document["notes"], quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress:
         document |= drawings.write_drawing(drawing, overwrite=args.overwrite, progress=progress)

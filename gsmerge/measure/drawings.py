@@ -40,7 +40,6 @@ from gsmerge.measure.preview import (
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR
-from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -243,9 +242,8 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
             )
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            cameras = sample_path(
-                path, cameras, depth, options.frames or max(round(SECONDS[path.kind] * options.fps), least)
-            )
+            count = options.frames or max(round(SECONDS[path.kind] * options.fps), least)
+            cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
     return group, cameras, NEAR * depth, ids
@@ -305,16 +303,6 @@ def picture_stems(names: Sequence[str]) -> list[str]:
         if len({stem.lower() for stem in stems}) == len(stems):  # some file systems do not tell case apart
             break
     return stems
-
-
-def drawing_document(drawing: Drawing, output: Path) -> dict[str, Any]:
-    """Return the report of a drawing as plain JSON types."""
-    return {
-        **document_head(),
-        "output": str(output),
-        "pictures": [str(path) for path in drawing.paths],
-        **drawing.facts,
-    }
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
