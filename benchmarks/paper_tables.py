@@ -58,7 +58,7 @@ def mean_cell(runs: Runs) -> str:
 
 
 def share(runs: Runs) -> str:
-    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f} %"
+    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f}%"
 
 
 def compared(runs: Runs, whole: Runs) -> str:
@@ -73,7 +73,7 @@ def difference(runs: Runs, whole: Runs) -> Interval:
 
 
 def plus_minus(interval: Interval) -> str:
-    return f"{interval.mean:+.2f} ± {interval.high - interval.mean:.2f}"
+    return f"{interval.mean:+.2f} ±{interval.high - interval.mean:.2f}"
 
 
 def over_counts(bench: Bench, way: Way) -> Runs:
@@ -128,7 +128,7 @@ def backbones_section(bench: Bench) -> str:
             runs = whole if way is WHOLE else bench.runs(way, case)
             kept = np.mean([run["count"] / before[scene]["count"] for scene, run in runs.items()])
             less = "" if runs is whole else f" ({difference(runs, whole).mean:+.2f})"
-            cells.append(f"{100 * kept:.1f} %: {mean_cell(runs)}{less}")
+            cells.append(f"{100 * kept:.1f}%: {mean_cell(runs)}{less}")
         rows.append((way.name, *cells, *printed.BACKBONES.get(way.key, ("",) * 3)))
     names = ("DA3", "DepthSplat", "AnySplat, voxels")
     head = ("", "plain", *STYLES[:2], "anysplat, voxels", *(f"printed: {name}" for name in names))
@@ -145,7 +145,7 @@ def ablation_section(bench: Bench) -> str:
     known += [(name, bench.runs(WHOLE, Case(size=size)), whole) for size, name in RESIZED.items()]
     rows = []
     for name, runs, base in known:
-        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f} %"
+        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f}%"
         gain = "" if runs is base else words(difference(runs, base))
         rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
     names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95 %)")

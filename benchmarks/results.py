@@ -131,7 +131,7 @@ def sizes_table(records: Sequence[RunRecord]) -> str:
     for ask in FIRST:
         cells = [(pick_runs(records, ask, size), size) for size in SIZES]
         rows.append((ask[0], *(quality(some) + kept(some, size) if some else "" for some, size in cells)))
-    rows.append(("the input, 100 %", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
+    rows.append(("the input, 100%", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
     return make_table(("method", *SIZES), rows)
 
 

@@ -20,17 +20,17 @@ REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
-BARE = ("a whole number", "a number", "text", "true or false")  # values that the default or the text shows as well
 KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
 COMMANDS_HEAD = """# Commands
 
-`gsmerge COMMAND --help` prints the same. What is in brackets is the default. [Exit codes](exit-codes.md)."""
+`gsmerge COMMAND --help` prints the same; what is in brackets is the default. `gsmerge SCENE` takes the options of
+`compact`, and opens the page of `view`. Where a command has no `--threads` or `--seed`, `GSMERGE_THREADS` and
+`GSMERGE_SEED` of the environment are read. [Exit codes](exit-codes.md)."""
 SETTINGS_HEAD = """# Settings
 
 `compact`, `batch`, `extend` and `lab stress` take them as `--set NAME=VALUE`, such as `--set poses=fixed`; in Python
-they are arguments of `gsmerge.compact`. `--set help` lists those of a command. In brackets: the default, and the
-possible values; without a default the program chooses. [Options](commands.md#gsmerge-compact) of `compact` are
-settings, too: `--k 2` is `--set k=2`."""
+they are arguments of `gsmerge.compact`, and `help(gsmerge.CompactOptions)` says more. `--set help` lists those of a
+command. In brackets: default, possible values. [Options](commands.md#gsmerge-compact) of `compact` are settings too."""
 
 
 def main() -> int:
@@ -77,12 +77,13 @@ def _commands_page() -> str:
     lines = [NOTICE, "", COMMANDS_HEAD]
     for name, command in _all_commands().items():
         usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```", ""]
+        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", f"`{usage}`", ""]
         arguments = [p for p in command.params if p.param_type_name == "argument"]
         lines += [f"- `{p.metavar or p.name.upper()}`: {_line(p.help)}" for p in arguments]
         same: dict[str, list[str]] = {}
         for option in _options(command):
-            owner = known.setdefault((option.name, option.help), name)
+            words = "" if option.name == "set" else option.help  # --set differs only in its example
+            owner = known.setdefault((option.name, words), name)
             if owner == name:
                 lines.append(_option(option))
             else:
@@ -99,15 +100,10 @@ def _options(command: Any) -> list[Any]:
 
 def _option(param: Any) -> str:
     """A line for an option: its names, its value, its default, and its help."""
-    from gsmerge.settings.compact import CompactOptions
-    from gsmerge.settings.setting import flat_settings
-
     named = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
     value = "" if param.is_flag else f" {_value(param)}"
     default = _line(_default(param))
-    setting = flat_settings(CompactOptions).get(param.name)
-    text = _line(setting.text if setting and setting.help == param.help else param.help)
-    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {text}"
+    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {_line(param.help)}"
 
 
 def _value(param: Any) -> str:
@@ -171,31 +167,16 @@ def _settings_page() -> str:
 
 
 def _exporters_page(page: str) -> str:
-    """Renew the lists of a page: what lies between the comments that name them and those that end them."""
+    """Renew the list of a page: what lies between the comment that names it and the one that ends it."""
     from gsmerge.scene.exporters import EXPORTERS
-    from gsmerge.scene.no_gaussians import POINTS_ONLY
 
-    exporters = EXPORTERS.values()
-    page = _renew(page, "names", [f"- `{one.name}`: {'; '.join(_habits(one))}" for one in exporters])
     results: dict[str, list[str]] = {}
-    for model in (model for one in exporters for model in one.models):
-        results.setdefault(model.result, []).append(f"{model.title} ({model.leaves})")
-    page = _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
-    files = ((row, ", ".join(f"`{file}`" for file in row.files)) for row in POINTS_ONLY)
-    return _renew(page, "points", [f"- {row.title} ({names}): {row.remedy}" for row, names in files])
-
-
-def _habits(exporter: Any) -> list[str]:
-    """What an exporter does, but for what most do: logits, rotations wxyz, degree 0, normals."""
-    order = "rows without pixels" if exporter.order == "none" else exporter.order
-    kinds = "" if exporter.order == "none" else ", ".join(exporter.kinds)
-    degrees = "" if exporter.degrees == (0,) else f"degree {', '.join(map(str, exporter.degrees))}"
-    quats = "" if exporter.quats == "wxyz" else f"rotations {exporter.quats}"
-    opacity = "" if exporter.opacity == "logit" else f"{exporter.opacity} opacities"
-    normals = "normals as bytes" if exporter.byte_columns else "" if exporter.normals else "no normals"
-    elements = ", ".join(f"`{name}`" for name in exporter.elements)
-    comment = exporter.comment and f"comment {exporter.comment}"
-    return [fact for fact in (order, kinds, opacity, quats, degrees, normals, elements, comment) if fact]
+    for one in EXPORTERS.values():
+        for model in one.models:
+            leaves = model.leaves.partition(";")[0].replace("no cameras", "")
+            facts = "; ".join(filter(None, (f"`{one.name}`", leaves)))
+            results.setdefault(model.result, []).append(f"{model.title} ({facts})")
+    return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
 
 
 def _formats_page(page: str) -> str:
@@ -234,9 +215,9 @@ def _list(settings: Iterable[Any]) -> list[str]:
     lines = []
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
-        values = _line(one.values(null=False))
-        facts = "; ".join(filter(None, (default, "" if values in BARE else values)))
-        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {_line(one.text)}")
+        facts = "; ".join(filter(None, (default, _line(one.values(null=False)) if one.words else "")))
+        text = _line(one.text if one.default is None else one.help)
+        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines
 
 

@@ -14,7 +14,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
-from gsmerge.io.formats.table import SCENE_SUFFIXES, may_hold_gaussians
+from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
@@ -73,16 +73,19 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 def holds_scene(path: Path) -> bool:
     """Return whether a path is read as a scene, and not as cameras, networks, levels or a state alone."""
-    if path.is_dir():
+    if os.path.isdir(path):
         return bool(list_plys(path))
-    return path.suffix.lower() in SCENE_SUFFIXES and (not path.exists() or may_hold_gaussians(path))
+    suffix = path.suffix.lower()
+    return suffix in SCENE_SUFFIXES and (
+        suffix not in SEVERAL_USES or (os.path.exists(path) and may_hold_gaussians(path))
+    )
 
 
 def damage(path: Path) -> list[str]:
     """List what reading a file does not meet: bytes behind its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
-    if path.is_dir():
-        return [f"{ply.name}: {problem}" for ply in find_scene_files(path).plys for problem in damage(ply)]
+    if os.path.isdir(path):
+        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in damage(file)]
     found = _damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
     left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
     return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []

@@ -11,7 +11,15 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, say_warning, separate_stdout, stage_progress
+from gsmerge.cli.console import (
+    print_document,
+    say,
+    say_notes,
+    say_warning,
+    separate_stdout,
+    stage_progress,
+    terminal_columns,
+)
 from gsmerge.cli.paths import (
     FileOptions,
     check_format,
@@ -51,7 +59,8 @@ PARAMETERS = (
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A folder named colmap: a COLMAP model. A folder that exists: into it.", "SCENE.compact.ply"),
+               "A new name without an ending, such as site/: a web site. A folder named colmap: a COLMAP model. "
+               "Another folder that exists: into it.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -131,7 +140,7 @@ def _compact(args: opt.Args) -> None:
 
     outputs = Outputs(
         out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version, full_columns=writing.columns == "full",
+        full_columns=writing.columns == "full",
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -145,8 +154,8 @@ def _compact(args: opt.Args) -> None:
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) else []
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
-        lines = result_table(document, shlex.join(look) or None)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet)
+        lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     if args.strict and document["psnr_input_views"]["before"] is None:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
@@ -181,7 +190,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     with stage_progress(quiet=args.silent) as progress:
         document = compact_file(
             path, out, settings, k=args.k, budget=args.budget, mixed=mixed, always_fit=args.fit is not None,
-            normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
+            normals=writing.normals, overwrite=args.overwrite,
             dry_run=args.dry_run, progress=progress, seconds_before=before,
         )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
@@ -226,4 +235,4 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
         document = plan_files(load, settings, Outputs(out, overwrite=args.overwrite))
-    print_document(document, plan_lines(document), as_json=args.json, wrap=True)
+    print_document(document, plan_lines(document), as_json=args.json)

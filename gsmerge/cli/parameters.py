@@ -338,9 +338,7 @@ AFTER = argument(
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 
 # What commands share: a text, and names of options
-COMPACT_SCENE = (
-    "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat, .glb, .usdc, .usda or .usdz, by its name."
-)
+COMPACT_SCENE = "The compact scene: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz, by its name."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
 RUN = "seed threads"

@@ -32,9 +32,6 @@ class FileOptions(Settings):
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
     columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
         "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
-    spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
-        "degree 4.",
-        "The latter needs `gsmerge[spz4]`.", choices=(3, 4))  # fmt: skip
     viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
         "for viewers.")  # fmt: skip
 
@@ -109,11 +106,9 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version, levels=levels, cameras=cameras).ending
+    ending = output_format(output, levels=levels, cameras=cameras).ending
     if options.columns == "full" and (ending != ".ply" or not options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
-    if options.spz_version != 3 and ending != ".spz":
-        raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:

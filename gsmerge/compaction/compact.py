@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from typing import Any
+from weakref import ref
 
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
@@ -51,6 +53,7 @@ def compact(
         384
     """
     options = (options or CompactOptions()).with_settings(settings)
+    given = scene if isinstance(scene, str | PathLike) else ref(scene)
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
         size = measure_size(scene)
@@ -61,8 +64,8 @@ def compact(
 
             blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
-                return compact_in_blocks(scene, options, choices, blocks, covisibility)
-        return compact_piece(scene, options)
+                return replace(compact_in_blocks(scene, options, choices, blocks, covisibility), scene=given)
+        return replace(compact_piece(scene, options), scene=given)
 
 
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:

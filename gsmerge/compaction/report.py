@@ -9,7 +9,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line
+from gsmerge.report import (
+    document_head,
+    file_sha256,
+    html_table,
+    seconds_document,
+    seconds_line,
+    text_table,
+    wrap_line,
+)
 from gsmerge.runtime.memory import human_bytes
 
 
@@ -49,7 +57,7 @@ class CompactReport:
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
         worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
             that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
-        psnr_reference: What PSNR of the input views is measured against: "photos", or "the rows' own colours"; None
+        psnr_reference: What PSNR of the input views is measured against: "photos", or "the model's own pixels"; None
             where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
@@ -167,8 +175,11 @@ def summary_lines(document: Mapping[str, Any]) -> list[str]:
     return [summary_line(document), *level_lines(document), *curve_lines(document)]
 
 
-def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal, at most 80 columns wide, with a ``next_step`` if any."""
+def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
+    """Return the closing table of ``compact`` in a terminal, ``columns`` wide, with a ``next_step`` if any.
+
+    Paths and the next step, which people copy, are never broken.
+    """
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
     ratio = f"{100 * document['ratio']:.2f} %"
     rows = [
@@ -187,12 +198,13 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
-    table = [f"  {name:9}  {old:>12}  {new:>12}  {remark}".rstrip() for name, old, new, remark in rows]
-    curve = curve_lines(document)
-    cameras = document.get("viewer_cameras")
-    last = [] if cameras is None else [f"  cameras    {cameras}"]
-    last += [] if next_step is None else [f"  next       {next_step}"]
-    return [after["path"], *table, *level_lines(document), *curve, *last]
+    figures = text_table([row[:3] for row in rows], "  ")
+    hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
+    lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
+    lines += [(line, 0) for line in (*level_lines(document), *curve_lines(document))]
+    wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
+    last = {"cameras": document.get("viewer_cameras"), "next": next_step}
+    return [after["path"], *wrapped, *(f"  {name:9}  {text}" for name, text in last.items() if text is not None)]
 
 
 def _judged_by(fidelity: Mapping[str, Any]) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import TYPE_CHECKING, Any
+from weakref import ReferenceType
 
 import numpy as np
 
@@ -20,10 +22,12 @@ from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 
 if TYPE_CHECKING:
     import torch
+
+    from gsmerge.pages.view import Page
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class CompactResult:
         cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
             wrong, see ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+        scene: The path of the scene that was given, or a reference to it that does not keep it in memory.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
@@ -47,6 +52,25 @@ class CompactResult:
     report: CompactReport
     cameras: Cameras
     coarser: tuple[CompactResult, ...] = ()
+    scene: StrPath | ReferenceType[Scene] | None = field(default=None, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"scene": self.scene if isinstance(self.scene, str | PathLike) else None}
+
+    def show(self, scene: Scene | StrPath | None = None) -> Page:
+        """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
+
+        ``scene``: the input, which only needs to be given where it is in memory no more; without it the result is shown
+        alone.
+        """
+        from gsmerge.pages.view import view
+
+        if scene is None:
+            scene = self.scene() if isinstance(self.scene, ReferenceType) else self.scene
+        if scene is not None:
+            return view(scene, self)
+        names = tuple(f"view {i}" for i in range(len(self.cameras)))
+        return view(Scene(self.gaussians, self.cameras, None, None, names))
 
     def __repr__(self) -> str:
         levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""

@@ -95,7 +95,7 @@ def compact_tensors(
         shape: Views, height and width; None: those of the images.
         names: Names of the views; None: numbers.
         order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
-            (trained scenes, voxels), for which cameras are optional.
+            (trained scenes, voxels); cameras are then optional.
         check_rotations: Refuse rotations that follow the surface far better in another convention;
             False for models whose own renderer takes them unchanged.
         progress: See :func:`gsmerge.compact`.

@@ -21,7 +21,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
 PHOTOS = "photos"  # what results are fitted to and measured against, in messages
-ROW_COLORS = "the rows' own colours"  # the same where there are none
+ROW_COLORS = "the model's own pixels"  # the same where there are none
 RENDERS = "renders of the input"  # and where the rows belong to no pixels either
 NO_PHOTOS = f"no photos: {ROW_COLORS} stand in for them; photos are named with --images"
 FAINT = 0.1  # opacity of a pixel's Gaussians below which their colours mean little

@@ -28,15 +28,15 @@ class SceneSize:
         return self.height * self.width
 
 
-def measure_size(scene: Scene, *, photos: bool | None = None, drawn: bool = False) -> SceneSize:
+def measure_size(scene: Scene, *, photos: bool | None = None, drawn: bool | None = None) -> SceneSize:
     """Return the sizes of a scene.
 
-    ``photos``, ``drawn``: see :class:`SceneSize`; None: whether the scene has photos, or pixels whose colours stand in.
+    ``photos``, ``drawn``: see :class:`SceneSize`; None: as for a scene of which a photo is not found to be of another.
     """
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
         scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
-        photos=scene.is_shown if photos is None else photos, drawn=drawn,
+        photos=len(scene) > 0 if photos is None else photos, drawn=not scene.is_shown if drawn is None else drawn,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip

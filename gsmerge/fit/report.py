@@ -58,6 +58,6 @@ def record_fit(report: FitReport | None) -> None:
         note("the fit was not accepted: held-out patches of the photos did not get better")
 
 
-def report_steps(step: int, steps: int, photos: float) -> None:
-    """Report progress of the fit: step, and PSNR (dB) of the last photos."""
-    report_progress(f"fit: photos {photos:.1f} dB", step, steps)
+def report_steps(step: int, steps: int, photos: float, half_size: bool) -> None:
+    """Report progress of the fit: step, and PSNR (dB) of the last photos, which is higher at half their size."""
+    report_progress(f"fit: {'half-size ' * half_size}photos {photos:.1f} dB", step, steps)

@@ -323,15 +323,14 @@ def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
     count = int(drawn.sum())
     if count > MAX_GAUSSIANS:
         return None, 0
-    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREES[3])
+    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
     degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
     columns = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
-    header = columns.header(3)
-    checksum = zlib.crc32(header)
+    checksum = zlib.crc32(columns.header)
     for part in columns.parts:
         checksum = zlib.crc32(part.tobytes(), checksum)
     planes = [np.diff(part, axis=0, prepend=part[:1] & 0).T.tobytes() for part in columns.parts]
-    return gzip.compress(b"".join([header, checksum.to_bytes(4, "little"), *planes]), mtime=0), degree
+    return gzip.compress(b"".join([columns.header, checksum.to_bytes(4, "little"), *planes]), mtime=0), degree
 
 
 def highest_degree(harmonics: np.ndarray) -> int:

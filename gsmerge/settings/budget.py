@@ -31,7 +31,6 @@ class BudgetOptions(Settings):
         "lose at most so much against the best, such as -0.2dB.",
         "The best is what the scene's own curve reaches.", metavar="30dB|-0.2dB")  # fmt: skip
     output: str = setting("a.ply", "Name of the file whose bytes a size counts, with its ending.", internal=True)
-    spz_version: int = setting(3, "Version of that file, if it is a `.spz`.", internal=True)
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
         "Each is fitted by itself.", least=1, most=8)  # fmt: skip

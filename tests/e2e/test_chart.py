@@ -51,6 +51,9 @@ def budgets(merges: list[CompactOptions]) -> list[object]:
     return [settings.budget.budget for settings in merges]
 
 
+NO_PROXIES = ("--set", "proxy_views=0")
+
+
 def runs(folder: Path) -> dict[str, RunRecord]:
     """All runs by their label; none may be left out."""
     records, notes = read_runs(folder)
@@ -59,16 +62,9 @@ def runs(folder: Path) -> dict[str, RunRecord]:
 
 
 def again(run: Run, folder: Path, *options: object) -> Outcome:
-    return run(
-        "lab",
-        "chart",
-        folder / "room",
-        "--output",
-        folder / "out",
-        *CHART_TARGETS,
-        *CHART_FAST[2 * ("--grid" in options) :],
-        *options,
-    )
+    fast = CHART_FAST[2 * ("--grid" in options) :]
+    where = ("--output", folder / "out") if "--output" not in options else ()
+    return run("lab", "chart", folder / "room", *where, *CHART_TARGETS, *fast, *NO_PROXIES, *options)
 
 
 def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
@@ -134,10 +130,10 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
 
 @pytest.mark.slow
 def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[CompactOptions], run: Run) -> None:
-    assert again(run, copied, "--rerun").code == 0
+    assert again(run, copied, "--set", "rerun=true").code == 0
     assert budgets(merges)[-2:] == ["1%", "2%"]
     count = len(merges)
-    assert again(run, copied, "--seed", 1).code == 0
+    assert again(run, copied, "--set", "seed=1").code == 0
     assert {settings.seed for settings in merges[count:]} == {1}
     ply = copied / "room" / "scene.ply"
     data = bytearray(ply.read_bytes())
@@ -188,7 +184,17 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
     bad = Path(shutil.copytree(copied / "room", copied / "bad"))
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
     outcome = run(
-        "lab", "chart", bad, copied / "room", "--output", copied / "out", *CHART_TARGETS, *CHART_FAST, "--quiet", code=5
+        "lab",
+        "chart",
+        bad,
+        copied / "room",
+        "--output",
+        copied / "out",
+        *CHART_TARGETS,
+        *CHART_FAST,
+        *NO_PROXIES,
+        "--quiet",
+        code=5,
     )
     assert names(outcome.err, "3 of 3", "bad/input")
     assert outcome.err.count("\n") == 1
@@ -196,7 +202,7 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
 
 @pytest.mark.slow
 def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) -> None:
-    outcome = again(run, copied, "--grid", "views=2,9", "--json")
+    outcome = again(run, copied, "--grid", "views=2,9", "--grid", "budget=1%,2%", "--json")
     assert outcome.code == 0
     document = json.loads(outcome.out)
     assert document["num_done"] == 3

@@ -9,8 +9,8 @@ from sweeps import sweep
 
 from .conftest import Run
 
-FORMATS = ("a.ply", "a.sog", "lod-meta.json", "a.compressed.ply", "a.spz", "a.splat", "a.glb", "a.usdc")
-QUICK = ("--effort", "draft", "--fit", "none", "-q")
+FORMATS = ("a.ply", "a.sog", "lod-meta.json", "a.spz", "a.splat", "a.glb", "a.usdc")
+QUICK = ("--effort", "draft", "--set", "fit=none", "-q")
 
 
 def file_bytes(folder: Path) -> int:

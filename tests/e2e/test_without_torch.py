@@ -91,7 +91,7 @@ def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
     rows = np.concatenate([np.tile([*head, 0, 0], (len(w2c), 1)), w2c[:, :3].reshape(-1, 12)], 1)
     torch.save([{"key": "scene", "cameras": torch.from_numpy(rows).float()}], scene / "a.torch")
     (scene / "transforms.json").unlink()
-    done = call("-m", "gsmerge", "inspect", "scene", "--json")
+    done = call("-m", "gsmerge", "inspect", "scene/a.torch", "--json")
     assert done.returncode == 0, done.stderr
     assert "re10k chunk" in done.stdout
 

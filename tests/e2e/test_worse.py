@@ -19,7 +19,7 @@ from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
-FEW = ("--budget", 30, "--fit", "none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
+FEW = ("--budget", 30, "--set", "fit=none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
 SAID = "worse"
 
 

@@ -41,7 +41,7 @@ def make_results(folder: Path, *, threads: int = 2) -> dict[str, str]:
         out = folder / f"{number}.ply"
         for call in calls:
             words = [word.format(scene=scenes[scene], out=out) for word in call.split()]
-            code = main([*words, "--threads", str(threads), "--quiet"])
+            code = main([*words, "--set", f"threads={threads}", "--quiet"])
             assert code == 0, (name, code)
         hashes[name] = hash_rows(out)
     return hashes

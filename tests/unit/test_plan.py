@@ -211,6 +211,13 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
 
 
+def test_a_scene_without_pixels_and_photos_is_planned_as_it_is_fitted(scene: Scene) -> None:
+    bare = replace(unaligned_scenes.without_order(scene), images=None)
+    options = options_of(budget=200, fit_steps=9)
+    run, made = estimate(bare, options), compact(bare, options).report.options
+    assert (run["fit"], run["fit_steps"]) == (made["fit"], made["fit_steps"]) == ("full", 9)
+
+
 SETTLED = [{}, {"budget": 200}, {"budget": "3%", "effort": "fast"}, {"budget": "30kB", "effort": "draft"}]
 OPEN = [  # merging across views decides how many there are, of at most as many
     {"effort": "draft"}, {"effort": "fast", "k": 2}, {"superpixels": 40, "fit": "none"}, {"recipe": "paper"},

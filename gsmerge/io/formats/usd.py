@@ -24,15 +24,11 @@ from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3  # as far as renderers go
 PRIM = "Gaussians"
-INSTALL = 'pip install "usd-core>=26.3,<27"'  # as the extra usd asks for; works beside a wheel and in a checkout
+# As the extra asks for; the second works beside a wheel and in a checkout
+INSTALL = 'install gsmerge[usd], or pip install "usd-core>=26.3,<27"'
 # USDZ: contents begin at multiples of 64 bytes, behind an extra field of this kind; a file's header has 30 bytes
 _ALIGNMENT, _PADDING, _ZIP_HEADER, _UNIX, _EXTRA = 64, 0x1986, 30, 3, struct.Struct("<HH")
 _REACH = 3.0  # standard deviations about a centre that the extent holds
-
-
-def usda_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.usda``, which is text, without comments; ValueError if there is NaN or inf."""
-    return _export(gaussians, ".usda")
 
 
 def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:

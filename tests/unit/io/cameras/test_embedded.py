@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from former_formats import compressed_bytes
 from messages import refuses
 from plyfile import PlyData
 from tiny_scene import make_tiny
@@ -22,7 +23,11 @@ CAMERAS = Cameras(TINY.w2c, np.tile(TINY.K, (3, 1, 1)), TINY.width, TINY.height)
 
 
 def write(path: Path, comments: list[str]) -> Path:
-    write_gaussians(path, TINY.gaussians, comments=["SplatRenderMode: mip", *comments])
+    comments = ["SplatRenderMode: mip", *comments]
+    if path.name.endswith(".compressed.ply"):
+        path.write_bytes(compressed_bytes(TINY.gaussians, comments))
+    else:
+        write_gaussians(path, TINY.gaussians, comments=comments)
     return path
 
 
