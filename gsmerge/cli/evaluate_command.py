@@ -85,7 +85,7 @@ def evaluate(args: opt.Args) -> None:
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
-    print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, quiet=args.silent)
 
 
