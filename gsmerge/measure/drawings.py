@@ -186,9 +186,11 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     """Prepare a clip, or its frames as pictures, of the scenes along a path, with lines that move between them."""
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
+    paths = [path.absolute() for path, _ in group.scenes]
+    same = len({path.name for path in paths}) < len(paths)
     texts = [
-        (path.absolute().name, f"{len(gaussians):,} Gaussians", human_bytes(size))
-        for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
+        ("/".join(path.parts[-2:]) if same else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
+        for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
     ]
 
     def draw(threads: int) -> Iterator[Picture]:
