@@ -89,7 +89,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     if method is SUPERPIXELS:
         return method, []
     place, size = f"method {method.name}", measure_size(scene)
-    if "photos" in method.needs and not size.photos:
+    if "photos" in method.needs and (size.drawn or not size.photos):
         raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
     if "pixels" in method.needs and not size.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
