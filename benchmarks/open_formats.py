@@ -1,4 +1,4 @@
-"""Every format that is written, opened by programs of others, for docs/guide/open-it.md.
+"""Every format that is written, opened by programs of others, for docs/guide/formats.md.
 
 gsmerge compact demo -o small.ply
 python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout
@@ -42,8 +42,8 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.cameras.colmap_model import POINTS
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.formats.table import FOLDER, PLACE
+from gsmerge.pages.page import ENGINE
 from gsmerge.research.baselines.simple import find_program
-from gsmerge.view.page import ENGINE
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "e2e"))
 
@@ -167,10 +167,11 @@ def spark_values(chromium: str, path: Path) -> Values:
     """Values of a file by Spark, of the release that `gsmerge view` has, in a browser."""
     from browser import browser
 
-    script = gzip.decompress(files("gsmerge.view").joinpath(ENGINE).read_bytes()).decode()
+    script, _, module = gzip.decompress(files("gsmerge.pages").joinpath(ENGINE).read_bytes()).partition(b"\0")
+    numbers = f"window.sparkModule = Uint8Array.fromBase64('{base64.b64encode(module).decode()}');"
     page = path.with_name("spark.html").resolve()
     data = base64.b64encode(path.read_bytes()).decode()
-    page.write_text(f'<script id="file" type="text/plain">{data}</script><script>{script}</script>')
+    page.write_text(f'<script id="file" type="text/plain">{data}</script><script>{numbers}{script.decode()}</script>')
     with tempfile.TemporaryDirectory() as profile, browser(chromium, Path(profile)) as tab:
         tab.open(page)
         rows = tab.run(SPARK.replace("NAME", path.name))
@@ -209,7 +210,7 @@ def find_programs(args: argparse.Namespace) -> Iterator[Program]:
     def spark() -> Program:
         if (chromium := shutil.which("chromium")) is None:
             raise UsageError("expected chromium, found none")
-        sources = json.loads(files("gsmerge.view").joinpath("vendor/SOURCES.json").read_text())
+        sources = json.loads(files("gsmerge.pages").joinpath("vendor/SOURCES.json").read_text())
         number = sources["packages"]["@sparkjsdev/spark"]["version"]
         endings = (".ply", "opened/a.spz", ".splat", ".sog")
         return Program("Spark", number, endings, partial(spark_values, chromium))

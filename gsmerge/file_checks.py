@@ -1,30 +1,27 @@
-"""Read files to their ends, and list what is wrong with each."""
+"""Read files to their ends, and say of each why ``compact`` would refuse it."""
 
 from __future__ import annotations
 
 import os
 import zipfile
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.io import file_notes, read_cameras, read_gaussians
+from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import as_pinholes, to_cameras
-from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras, read_sharp_camera
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
-from gsmerge.io.formats.read import FileInfo, degree_notes
-from gsmerge.io.formats.table import SCENE_SUFFIXES
+from gsmerge.io.formats.table import SCENE_SUFFIXES, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
+from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import find_scene_files, list_plys
-from gsmerge.scene.no_gaussians import check_scene_file
 from gsmerge.scene.read import load_files
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.gsm_file import read_gsm, wrong_checksums
 from gsmerge.states.state_file import load_state
 
@@ -35,7 +32,7 @@ ARCHIVES = (".sog", ".npz", CHUNK)
 
 @dataclass(frozen=True)
 class FileCheck:
-    """Content of a file and the problems found in it."""
+    """Content of a file, and why it is refused."""
 
     path: str
     kind: str  # "Gaussians", "cameras", "networks" or "state"; "" where it cannot be read
@@ -60,20 +57,35 @@ class FileCheck:
         return f"ok     {self.path}: {self.count:,} {unit or f'groups, {self.kind}'}{layout}{views}{size}"
 
 
-def check_content(path: Path) -> FileCheck:
-    """Read a file of Gaussians, cameras or networks, a ``.gsm`` or a scene to its end, and check its content.
+def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> FileCheck:
+    """Read Gaussians with the cameras and photos beside them, cameras, networks or a ``.gsm`` to the end.
 
-    The ending tells the kind of file. A folder has cameras, or a scene, which is read as ``compact`` reads it.
-    UsageError if a package is missing.
+    The ending tells the kind of file. A scene is read as ``compact`` reads it. UsageError if a package is missing.
     """
     try:
-        file_check = _read(path)
+        file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
     except SceneError as error:
         return FileCheck(str(path), "", problems=(_problem(error, path),))
-    damaged = _damaged_member(path) if path.suffix.lower() in ARCHIVES else None
-    problems = (*file_check.problems, *([damaged] if damaged else []))
+    problems = (*file_check.problems, *damage(path))
     size = 0 if path.is_dir() else path.stat().st_size
     return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
+
+
+def holds_scene(path: Path) -> bool:
+    """Return whether a path is read as a scene, and not as cameras, networks, levels or a state alone."""
+    if path.is_dir():
+        return bool(list_plys(path))
+    return path.suffix.lower() in SCENE_SUFFIXES and (not path.exists() or may_hold_gaussians(path))
+
+
+def damage(path: Path) -> list[str]:
+    """List what reading a file does not meet: bytes behind its content, and wrong checksums of its parts."""
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return [f"{ply.name}: {problem}" for ply in find_scene_files(path).plys for problem in damage(ply)]
+    found = _damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
+    left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
+    return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
 
 
 def _problem(error: SceneError, path: Path) -> str:
@@ -89,62 +101,21 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    is_folder = os.path.isdir(path)
-    if is_folder and list_plys(path):
-        return _read_scene(path)
-    if is_folder or suffix in CAMERAS:
+    if os.path.isdir(path) or suffix in CAMERAS:
         return _read_cameras(path)
     check_file(path)
-    if suffix not in SCENE_SUFFIXES:
-        endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
-        raise SceneError(path, f"expected one of {endings}, found another kind of file", "it is not checked")
-    file_check = _read_gaussians(path)
-    beside: list[Path | None] = []
-    with suppress(SceneError):  # of another file
-        files = find_scene_files(path)
-        beside = [files.cameras, files.images, files.masks]
-    names = [place.name for place in beside if place not in (None, path)]
-    return replace(file_check, notes=(*file_check.notes, *_not_read(names, " beside it")))
+    endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
+    raise SceneError(path, f"expected one of {endings}, found another kind of file")
 
 
-def _read_gaussians(path: Path) -> FileCheck:
-    """Read a file of Gaussians, with the cameras inside it."""
-    check_scene_file(path)
-    info, suffix = read_gaussians(path).info, path.suffix.lower()
-    problems = _problems(info)
-    if suffix == ".spz":
-        problems += [problem for problem in [spz.problem_at_end(path)] if problem]
-    elif suffix == ".ply":
-        if holds_cameras(path):
-            pinholes, *_ = as_pinholes(read_cameras(path), ())
-            to_cameras(pinholes)
-        read_sharp_camera(path)
-        left = ply.bytes_after_rows(path)
-        behind = f"{left:,} bytes after the last of {info.count:,} rows, which nothing reads"
-        problems += [behind] if left else []
-    notes = (*(note for note in file_notes(info) if "opacit" in note), *degree_notes(info))
-    return FileCheck(str(path), "Gaussians", info.count, info.layout, info.file_bytes, tuple(problems), notes)
-
-
-def _read_scene(path: Path) -> FileCheck:
-    """Read all Gaussians of a folder, with the cameras and photos that belong to them."""
-    files = find_scene_files(path)
-    parts = [_read_gaussians(ply) for ply in files.plys]
-    starts = [f"{ply.name}: " if files.parts else "" for ply in files.plys]
-    problems = [start + text for start, part in zip(starts, parts, strict=True) for text in part.problems]
-    notes = [note for part in parts for note in part.notes]
-    scene = replace(
-        parts[0], path=str(path), count=sum(part.count for part in parts),
-        file_bytes=sum(part.file_bytes for part in parts),
+def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileCheck:
+    """Read the Gaussians of a scene, with the cameras and photos that belong to them."""
+    load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
+    info, views = load.info, load.views
+    return FileCheck(
+        str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=tuple(load.notes),
+        num_views=len(views.cameras), num_photos=0 if views.images is None else len(views.images),
     )  # fmt: skip
-    try:
-        load = load_files(files)
-    except SceneError as error:
-        problems.append(_problem(error, path))
-    else:
-        notes += [note for note in load.notes if note not in file_notes(load.info)]
-        scene = replace(scene, num_views=len(load.views.cameras), num_photos=len(load.views.images))
-    return replace(scene, problems=tuple(problems), notes=tuple(dict.fromkeys(notes)))
 
 
 def _read_cameras(path: Path) -> FileCheck:
@@ -176,20 +147,9 @@ def _read_levels(path: Path) -> FileCheck:
     """Read all levels of an index, one after the other."""
     index = streamed.read_index(path)
     infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
-    problems = [f"level {level}: {problem}" for level, info in enumerate(infos) for problem in _problems(info)]
     beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
-    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, tuple(problems))
-
-
-def _problems(info: FileInfo) -> list[str]:
-    """Describe the rows that a reader sets aside or changes."""
-    extreme = "Gaussian(s) with a log scale beyond +-30 or a harmonic beyond +-1e6"
-    counted = {
-        "row(s) with NaN or inf": info.num_nonfinite,
-        extreme: info.num_clipped_scales,
-        "Gaussian(s) with a rotation of length 0": info.num_zero_quats,
-    }
-    return [f"{count:,} of {info.count:,} {what}" for what, count in counted.items() if count]
+    notes = dict.fromkeys(note for info in infos for note in file_notes(info))
+    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, notes=tuple(notes))
 
 
 def _read_gsm(path: Path) -> FileCheck:

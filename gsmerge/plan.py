@@ -231,7 +231,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     if asked <= 1:
         return 1
     if problems:
-        raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
+        raise UsageError(f"blocks {asked}: expected one piece (--set blocks=none) with {problems[0]}")
     if asked > scene.num_views:
         raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
     return asked
@@ -239,9 +239,9 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
     """Note that a cluster has no use for a scene that is compacted in one piece."""
-    if blocks == 1 and options.blocks.engine.name != "local":
+    if blocks == 1 and options.blocks.engine.engine != "local":
         problems = blocks_problems(scene, options)
-        remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
+        remedy = f"which {problems[0]} needs" if problems else "--set blocks=NUMBER makes several"
         note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
 
 
@@ -305,7 +305,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
     If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
-    fit gains more by further steps (docs/laboratory/networks.md).
+    fit gains more by further steps (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -334,7 +334,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
+            " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
     return checkpoint
@@ -423,7 +423,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/laboratory/large-scenes.md.
+    docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps

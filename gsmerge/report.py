@@ -7,6 +7,8 @@ import hashlib
 import html
 import io
 import json
+import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 from gsmerge import __version__
 
 SCHEMA_VERSION = 1
+MAX_WIDTH = 10_000  # columns of a table in a pipe
+MIN_NAME = 12  # columns that a table's first keeps in a narrow terminal
 
 
 def file_sha256(*paths: Path) -> str:
@@ -63,10 +67,42 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
     return out.getvalue()
 
 
-def text_table(rows: Sequence[Sequence[str]], indent: str = "") -> list[str]:
-    """Write rows as lines for a terminal, with the first column left-aligned and others right-aligned."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [indent + "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+def text_table(
+    rows: Sequence[Sequence[str]], indent: str = "", *, columns: int | None = None, least: Sequence[int] = ()
+) -> list[str]:
+    """Write rows as lines for a terminal, with the first column left-aligned and others right-aligned.
+
+    ``columns``: width of the terminal; None: any. What does not fit is left out: the columns ``least``, by number and
+    in this order, then others from the last on, but for the first two. A first column that is too wide still is cut in
+    its middle.
+    """
+    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or MAX_WIDTH) - len(indent)
+    shown = list(range(len(widths)))
+    for place in (*least, *reversed(shown[2:])):
+        if place in shown and sum(widths[i] + 2 for i in shown) - 2 > room:
+            shown.remove(place)
+    widths[0] = min(widths[0], max(MIN_NAME, room - sum(widths[i] + 2 for i in shown[1:])))
+    cells = [[_cut(row[0], widths[0]).ljust(widths[0]), *(row[i].rjust(widths[i]) for i in shown[1:])] for row in rows]
+    return [indent + "  ".join(line) for line in cells]
+
+
+def _cut(text: str, width: int) -> str:
+    """Cut letters from the middle of a text that is wider."""
+    half = (width - 3) // 2
+    return text if len(text) <= width else f"{text[: width - 3 - half]}...{text[-half:]}"
+
+
+def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
+    """Break a line between words at ``columns`` (None: never), with further lines indented.
+
+    They begin at the column ``hang`` or else at the line's first value, or two columns in where these have no room.
+    """
+    if columns is None or len(line) <= columns:
+        return [line]
+    label = re.match(r" *\S+(?: \S+)?  +|(?:note|warning|error): ", line)
+    indents = (hang, len(label[0]) if label else 2)
+    indent = " " * next((indent for indent in indents if 0 < indent < columns // 2), 2)
+    return textwrap.wrap(line, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:

@@ -1,9 +1,12 @@
-"""Makes gsmerge/view/vendor: Spark and three.js in one compressed script, their licences, and where they came from.
+"""Makes gsmerge/pages/vendor: Spark and three.js in one compressed file, their licences, and where they came from.
 
 python tools/vendor_viewer.py
 
-Only who changes a version needs this; it runs on Linux x86-64 and takes npm, which fetches four packages, and no Node
-program of them is run. Equal versions give equal bytes, and a test compares the script with its hash in SOURCES.json.
+Only who changes a version needs this; it runs on Linux x86-64 and takes npm, which fetches five packages, and Node,
+which runs one of them. Equal versions give equal bytes, and a test compares the content with its hash in SOURCES.json.
+
+The file holds the script, a zero byte, and Spark's WebAssembly without what our pages never call: in the script it
+would be text in base64, which compresses badly.
 """
 
 from __future__ import annotations
@@ -12,12 +15,13 @@ import base64
 import gzip
 import hashlib
 import json
+import re
 import subprocess
 import tarfile
 import tempfile
 from pathlib import Path
 
-VENDOR = Path(__file__).parents[1] / "gsmerge" / "view" / "vendor"
+VENDOR = Path(__file__).parents[1] / "gsmerge" / "pages" / "vendor"
 SCRIPT = "spark-three.js.gz"
 # npm package -> version, and its hash as the registry and `npm view PACKAGE dist.integrity` give it
 PACKAGES = {
@@ -37,6 +41,10 @@ PACKAGES = {
         "0.28.2",
         "sha512-4xTZr1FUmSoQW4XIWmit3tzQrUTZM+N3P0XV8xROKYF50XfI7xeO90+1bZvNwxIufQ9hDQVRJH5YhgPVF8A/HQ==",
     ),
+    "binaryen": (
+        "132.0.0",
+        "sha512-4Usg7yEvwO3FMso3Oov6qkOOHSod1IEv+boKkh77kTljM+eNBouqCTbqWswGzbG+vDNO/b/v2C4gfEh1WgB9Lg==",
+    ),
 }
 LICENCES = {"@sparkjsdev/spark": "LICENSE.spark", "three": "LICENSE.three", "fflate": "LICENSE.fflate"}
 # What the page's own script uses of the two
@@ -47,10 +55,31 @@ export {
   Points, Scene, ShaderMaterial, Vector3, WebGLRenderer,
 } from "three";
 """
+# Exports of Spark's WebAssembly that decoding a file and sorting it call
+CALLED = [
+    "memory",
+    "__externref_table_alloc",
+    "__externref_table_dealloc",
+    "__wbg_chunkdecoder_free",
+    "__wbindgen_exn_store",
+    "__wbindgen_externrefs",
+    "__wbindgen_free",
+    "__wbindgen_malloc",
+    "__wbindgen_realloc",
+    "__wbindgen_start",
+    "chunkdecoder_finish",
+    "chunkdecoder_push",
+    "decode_to_packedsplats",
+    "simd_enabled",
+    "sort32_splats",
+    "sort_splats",
+    "wasm_start",
+]
+MODULE = rb'\w+\("([A-Za-z0-9+/=]{100000,})"\)(?=\.buffer)'  # the bytes of the WebAssembly
 
 
 def main() -> None:
-    """Fetch, check, bundle, compress."""
+    """Fetch, check, bundle, cut, compress."""
     with tempfile.TemporaryDirectory() as work:
         modules = Path(work) / "node_modules"
         for package in PACKAGES:
@@ -61,6 +90,9 @@ def main() -> None:
         options = ("--bundle", "--minify", "--format=iife", "--global-name=Vendor", "--legal-comments=none")
         subprocess.run([esbuild, entry, *options, f"--outfile={bundle}"], cwd=work, check=True)
         script = bundle.read_bytes()
+        (match,) = re.finditer(MODULE, script)
+        module = cut_module(base64.b64decode(match[1]), modules / "binaryen" / "bin" / "wasm-metadce", Path(work))
+        script = b"".join([script[: match.start()], b"window.sparkModule", script[match.end() :], b"\0", module])
         VENDOR.mkdir(parents=True, exist_ok=True)
         VENDOR.joinpath(SCRIPT).write_bytes(gzip.compress(script, 9, mtime=0))
         for package, name in LICENCES.items():
@@ -72,6 +104,17 @@ def main() -> None:
     }
     VENDOR.joinpath("SOURCES.json").write_text(json.dumps(sources, indent=2) + "\n", encoding="utf-8")
     print(f"{VENDOR}: {len(script):,} bytes, {VENDOR.joinpath(SCRIPT).stat().st_size:,} compressed")
+
+
+def cut_module(module: bytes, program: Path, work: Path) -> bytes:
+    """The module without the functions that none of ``CALLED`` reaches."""
+    given, graph, cut = work / "given.wasm", work / "graph.json", work / "cut.wasm"
+    given.write_bytes(module)
+    root = {"name": "root", "reaches": CALLED, "root": True}
+    graph.write_text(json.dumps([root, *({"name": name, "export": name} for name in CALLED)]), encoding="utf-8")
+    options = ("--graph-file", graph, "-o", cut)
+    subprocess.run(["node", program, given, *options], check=True, stdout=subprocess.DEVNULL)
+    return cut.read_bytes()
 
 
 def fetch(package: str, folder: Path) -> Path:

@@ -11,13 +11,14 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
 from gsmerge import __version__
 from gsmerge.cli.console import plain_warnings, say
+from gsmerge.cli.parameters import SEED, listed_settings
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -32,30 +33,45 @@ from gsmerge.errors import (
 )
 from gsmerge.runtime.plugins import COMMANDS as PLUGINS
 from gsmerge.runtime.plugins import find_plugins, load_plugin
-from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import FileHints
 from gsmerge.settings.setting import flat_settings
 
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
 PROGRAM = "gsmerge"
 INTERRUPTED = 130
-DEBUG, HELP_ALL = "--debug", "--help-all"
+DEBUG = "--debug"
 
 # What other programs call a command, and the number of Gaussians
 OTHER_WORDS = {
     "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
     "convert": ("transform", "export", "join", "crop", "translate"),
-    "inspect": ("info", "stats", "describe", "show"),
+    "inspect": ("info", "stats", "describe", "show", "validate", "verify", "lint", "test"),
     "evaluate": ("eval", "measure", "metrics", "score", "report"),
-    "check": ("validate", "verify", "lint", "test"),
     "render": ("preview", "segment"),
     "view": ("viewer", "compare"),
 }
-# Commands and options of 0.1 -> what to do instead; to be left out after the next release
-FORMER_COMMANDS = {"encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2"}
+# Commands and options of 0.1 -> what to type instead; to be left out after the next release
+FORMER_COMMANDS = {
+    "encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2", "check": "gsmerge inspect",
+    **{name: f"gsmerge lab {name}" for name in ("chart", "generate", "stress", "train")},
+}  # fmt: skip
 FORMER_OPTIONS = {
     "rerun": "use --overwrite", "max_memory": "use --jobs", "retries": "a second call makes what failed",
     "timeout": "end the run, and a second call goes on", "device": "all runs on the processor",
-    "align": "views are scored as they are",
+    "align": "views are scored as they are", "help_all": "use --help", "report": "use --json > FILE",
+    "save_cameras": "they are in NAME.cameras.json beside the result",
+    "embed_cameras": "they are in NAME.cameras.json beside the result",
+    **dict.fromkeys(("up", "scale", "rotate", "translate"), "use gsmerge convert for it"),
+    "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
+    "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
+    "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
+    "draw_only": "a call without scenes draws what the folder holds",
+    "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
+    "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",
+    "antialiased": "gsmerge.render in Python has it", "superpixels": "gsmerge.superpixels in Python has them",
+    "dry_run": "no file of yours is replaced unless you say so", "overwrite": "what gsmerge made is replaced",
 }  # fmt: skip
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
@@ -66,10 +82,25 @@ BUDGET_WORDS = (
 COMMANDS = {
     "Compact": ("compact", "convert"),
     "Many scenes, and views in batches": ("batch", "extend"),
-    "Look and measure": ("inspect", "check", "view", "render", "evaluate"),
+    "Look and measure": ("inspect", "view", "render", "evaluate"),
 }
 OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
-RESEARCH, ADDED = "Research", "Added by other packages"
+LAB, LOOK = "lab", "look"  # the group of research commands, and compact with a page, which a scene's name alone calls
+ADDED = "Added by other packages"
+# In 40 columns
+OPENING = """\
+gsmerge scene.ply   compact it and look
+gsmerge COMMAND -h  what a command takes
+
+compact   1 to 10 % of the Gaussians
+convert   other formats and frames
+batch     many scenes
+extend    views that arrive in batches
+inspect   what files hold
+view      a page to compare on
+render    pictures and clips
+evaluate  scores against photos
+lab       research: charts, training"""
 
 
 class Command(TyperCommand):
@@ -90,24 +121,58 @@ def make_app(only: str | None = None) -> typer.Typer:
     made = typer.Typer(
         name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
     )
-    made.callback(invoke_without_command=True)(root)
+    made.callback()(root)
     for panel, names in COMMANDS.items():
         for name in names:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
                 made.command(cls=Command, rich_help_panel=panel)(function)
-    if only in OWN_COMMANDS:
+    if only == LOOK:
+        made.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
+    if only in (*OWN_COMMANDS, LOOK):
         return made
+    lab = typer.Typer()
     for name, entry in find_plugins(PLUGINS).items():
-        if only in (None, name) and name not in OWN_COMMANDS:
+        is_ours = _is_ours(entry)
+        if only in (None, LAB if is_ours else name) and name not in OWN_COMMANDS:
             try:
                 function = load_plugin(PLUGINS, name)
             except UsageError as error:  # a package that is broken must not take the others with it
                 say(f"{PROGRAM}: warning: {error}")
                 continue
-            panel = RESEARCH if entry.module.startswith("gsmerge.") else ADDED
-            made.command(name, cls=Command, rich_help_panel=panel)(function)
+            place = (
+                lab.command(name, cls=Command) if is_ours else made.command(name, cls=Command, rich_help_panel=ADDED)
+            )
+            place(function)
+    if only in (None, LAB):
+        help = "Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
+        made.add_typer(lab, name=LAB, help=help, no_args_is_help=True, rich_help_panel="Research")
     return made
+
+
+def _is_ours(entry: EntryPoint) -> bool:
+    return entry.module.startswith("gsmerge.")
+
+
+def _command_of(words: list[str]) -> str | None:
+    """Name the only command that is to be imported; None: all, for the help or an error."""
+    name = words[0] if words else ""
+    if name in (*OWN_COMMANDS, LAB, LOOK):
+        return name
+    entry = find_plugins(PLUGINS).get(name)
+    return None if entry is None or _is_ours(entry) else name
+
+
+def _is_scene(word: str) -> bool:
+    """Return whether a first word is a scene in place of a command: a path that exists, or a name of such files."""
+    if word.startswith("-") or word in FORMER_COMMANDS or _command_of([word]) is not None:
+        return False
+    if os.path.lexists(word) or "." not in word:
+        return os.path.lexists(word)
+    from gsmerge.io.formats.table import SCENE_SUFFIXES
+    from gsmerge.settings.extend import SUFFIX
+
+    return word.lower().endswith((*SCENE_SUFFIXES, SUFFIX))
 
 
 def __getattr__(name: str) -> Any:
@@ -123,7 +188,6 @@ def _print_version(value: bool) -> None:
 
 
 def root(
-    context: typer.Context,
     _: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
@@ -132,8 +196,6 @@ def root(
     ] = False,
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
 
 
 def _usage_message(error: Any) -> str:
@@ -143,7 +205,7 @@ def _usage_message(error: Any) -> str:
     parameters = [] if error.ctx is None else error.ctx.command.params
     has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "option_name"):
-        message = _suggest(error.option_name, parameters) or message
+        message = _suggest(error.option_name, error.ctx.command) or message
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
@@ -154,29 +216,20 @@ def _usage_message(error: Any) -> str:
     return f"{message}; see '{place} --help'"
 
 
-def _suggest(option: str, parameters: Sequence[Any]) -> str | None:
+def _suggest(option: str, command: Any) -> str | None:
     """Suggest ``--set`` or ``--hint`` for a setting that has no option of its own; None for other names."""
-    if option == HELP_ALL:
-        return f"{HELP_ALL}: expected a command before it, such as {PROGRAM} compact {HELP_ALL}"
     name = option.lstrip("-").replace("-", "_")
-    names = {parameter.name for parameter in parameters}
+    names = {parameter.name for parameter in command.params}
     if name in names:
         return None
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
-    if name in FORMER_OPTIONS:
-        return f"{option} is no option any more: {FORMER_OPTIONS[name]}"
     if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
-    if "set" not in names:
-        return None
-    from gsmerge.cli.paths import FileOptions
-
-    settings = flat_settings(CompactOptions) | flat_settings(FileOptions)
-    positive = name.removeprefix("no_")
+    positive, settings = name.removeprefix("no_"), listed_settings(getattr(command.callback, "kinds", ()))
     if positive not in settings:
-        return None
+        return f"{option} is no option any more: {FORMER_OPTIONS[name]}" if name in FORMER_OPTIONS else None
     default = settings[positive].default
     value = str(not default).lower() if isinstance(default, bool) else "VALUE"
     return f"{option} is no option: use --set {positive}={value}"
@@ -247,7 +300,6 @@ def run(args: Sequence[str] | None = None) -> int:
         say(f"{PROGRAM}: error: {message}")
         return code
 
-    is_command = bool(words) and (words[0] in OWN_COMMANDS or words[0] in find_plugins(PLUGINS))
     signals: list[signal.Signals] = []
 
     def stopped() -> int:
@@ -256,7 +308,11 @@ def run(args: Sequence[str] | None = None) -> int:
     try:
         with plain_warnings(), _orderly_stop(signals):
             _check_working_directory()
-            app = make_app(words[0] if is_command else None)
+            if not words:
+                print(OPENING)
+                return 0
+            words = [LOOK, *words] if words and _is_scene(words[0]) else words
+            app = make_app(_command_of(words))
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # whoever read our output has seen enough
                 sys.stdout.flush()

@@ -15,6 +15,8 @@ import typer
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import one_line, print_document, say, say_warning, separate_stdout, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
@@ -40,13 +42,14 @@ def parse_jobs(text: str) -> int:
                    "it.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
-    "hint k superpixels budget quality effort fit set",
+    "hint budget quality effort",
+    opt.settings_option(CompactOptions, Engine, example="fit=none"),
     *opt.panel(
         "Running",
         opt.option("jobs", str, "Scenes at once: a number, or auto.", wording="auto", parser=parse_jobs,
                    metavar="N|auto"),
     ),
-    "engine address",
+    "engine",
     opt.output("Folder for the results; scenes whose result it holds are skipped.", default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
@@ -58,7 +61,6 @@ def parse_jobs(text: str) -> int:
     "strict dry_run seed",
     opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),
-    rare="hint fit seed threads quiet",
 )  # fmt: skip
 def batch(args: opt.Args) -> None:
     """Compact many scenes, each on its own: a failure stops no other scene, and a second call continues."""
@@ -69,10 +71,11 @@ def batch(args: opt.Args) -> None:
     from gsmerge.batch import BatchOptions, find_jobs
     from gsmerge.batch.records import RecordIndex
 
+    settings, place = args.make(CompactOptions, Engine)
     with opt.usage_errors():
         options = BatchOptions(
-            args.settings(), args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
-            args.overwrite, args.engine, args.address,
+            settings, args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
+            args.overwrite, place.engine, place.address,
         )  # fmt: skip
     if options.engine == "ray" and not args.dry_run:
         from gsmerge.runtime.work import require_ray

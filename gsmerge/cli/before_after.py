@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gsmerge.cli.parameters import Args, usage_errors
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.evaluate import NETS
+from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
 if TYPE_CHECKING:
     from gsmerge.io import GaussianFile
@@ -21,12 +21,14 @@ if TYPE_CHECKING:
 SAME = 1e-5  # difference of two poses, of 1 and of their numbers, that writing and reading may make
 
 
-def lpips_networks(choice: str | None) -> tuple[tuple[str, ...], list[str]]:
-    """Choose LPIPS networks by ``--lpips``, by default those installed; with a note if none is."""
+def lpips_networks(
+    choice: str | None, usual: Sequence[str] = EvaluateOptions().lpips
+) -> tuple[tuple[str, ...], list[str]]:
+    """Choose LPIPS networks by ``--lpips``, by default those ``usual`` that are installed; with a note if none is."""
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
     if choice is None:
-        nets = tuple(net for net in NETS if lpips_available(net))
+        nets = tuple(net for net in usual if lpips_available(net))
         return nets, [] if nets else [f"LPIPS is left out, its weights are not installed: {INSTALL}"]
     nets = {"both": NETS, "none": ()}.get(choice, (choice,))
     if not all(map(lpips_available, nets)):
@@ -44,6 +46,13 @@ class BeforeAfter:
     plys: dict[str, GaussianFile]  # the compact versions by name
     cameras: dict[str, Cameras]  # of the input views, by name of a version that was made with others than the scene's
     notes: list[str]  # what was adapted, one sentence each
+
+    @property
+    def title(self) -> str:
+        """Name of the scene."""
+        from gsmerge.scene.files import scene_title
+
+        return scene_title(self.load.files.ply)
 
     @property
     def gaussians(self) -> dict[str, Gaussians]:

@@ -14,7 +14,6 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, say_warning, separate_stdout, stage_progress
 from gsmerge.cli.paths import (
     FileOptions,
-    check_embedding,
     check_format,
     check_outputs,
     checkpoint_files,
@@ -26,14 +25,15 @@ from gsmerge.cli.paths import (
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
-    from gsmerge.settings.compact import CompactOptions
 
-
+VIEWED = (".ply", ".spz", ".sog", ".splat", ".glb")  # endings that a page shows
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that say something about a state, too
@@ -43,21 +43,48 @@ OF_STATES = (
 )  # fmt: skip
 
 
-@opt.command(
+PARAMETERS = (
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined. Or a .gsm of gsmerge "
                  "extend."),
-    f"{opt.READING} masks k superpixels budget quality levels blocks",
-    "effort fit exposure poses method recipe checkpoint set crop drop up scale rotate translate",
+    f"{opt.READING} masks budget quality levels k effort fit",
+    opt.settings_option(CompactOptions, FileOptions, Engine),
+    "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A folder named colmap: a COLMAP model.", "SCENE.compact.ply"),
-    f"overwrite strict report save_cameras embed_cameras dry_run engine address {opt.RUN}",
-    rare="hint masks levels blocks fit exposure poses method recipe checkpoint crop drop up scale rotate"
-         " translate strict save_cameras embed_cameras"
-         f" engine address json quiet {opt.RUN}",
+               "A folder named colmap: a COLMAP model. A folder that exists: into it.", "SCENE.compact.ply"),
+    "overwrite strict dry_run seed threads",
 )  # fmt: skip
+
+
+@opt.command(*PARAMETERS)
 def compact(args: opt.Args) -> None:
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
+    _compact(args)
+
+
+@opt.command(*PARAMETERS)
+def look(args: opt.Args) -> None:
+    """Compact a scene, and open a page with the result beside it: ``gsmerge SCENE``."""
+    is_state = any(path.suffix.lower() == SUFFIX for path in args.scenes)
+    scene = args.scenes[0]
+    usual = default_output(scene if is_state else args.files(*args.scenes).base)
+    args.output = output_file(args.output or usual, usual.name)
+    # Files that were joined, and a state, have no page of their own
+    shown = [args.output] if is_state or len(args.scenes) > 1 else [scene, args.output]
+    if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
+        words = shlex.join(["gsmerge", "view", *map(str, shown)])
+        raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
+    _compact(args)
+    if args.dry_run or args.output.suffix.lower() not in VIEWED:
+        return
+    from gsmerge.cli.view_command import view
+
+    before, *after = shown
+    cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "hint"))
+    opt.call(view, before=before, after=after, **cameras, open=not args.json, quiet=args.silent)
+
+
+def _compact(args: opt.Args) -> None:
     start = perf_counter()
     if any(path.suffix.lower() == SUFFIX for path in args.scenes):
         _compact_state(args, start)
@@ -65,32 +92,36 @@ def compact(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.settings.compact import CompactOptions
-    from gsmerge.settings.placement import PlacementOptions
+    from gsmerge.io.formats.table import COLMAP, PLY, SITE
 
-    settings, writing, placement = args.make(CompactOptions, FileOptions, PlacementOptions)
-    settings = _with_engine(settings, args)
+    settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
+    settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
+    if engine.engine == "ray" and not args.dry_run:
+        from gsmerge.runtime.work import require_ray
+
+        require_ray()
     _check_scenes(args)
     files = args.files(*args.scenes)
-    out = output_file(args.output or default_output(files.base))
+    default = default_output(files.base)
+    out = output_file(args.output or default, default.name)
     streamed, model = is_index(out), model_files(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if model and (settings.budget.in_bytes or settings.budget.levels > 1):
-        raise UsageError(f"{out}: expected a --budget in Gaussians and no --levels for a COLMAP model")
+    if model and settings.budget.levels > 1:
+        raise UsageError(f"{out}: expected no --levels for a web site or a COLMAP model")
+    if COLMAP.names(out) and settings.budget.in_bytes:
+        raise UsageError(f"{out}: expected a --budget in Gaussians for a COLMAP model")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
     beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
-    named = (out, *model, *levels, args.report, beside, args.save_cameras)
+    named = (out, *model, *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True, cameras=True)
     if writing.columns == "full" and settings.budget.in_bytes:
         raise UsageError(
             f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"
         )
-    if args.embed_cameras:
-        check_embedding(out, settings.budget)
     if args.dry_run:
         print_plan(args, files, settings, out, hints)
         return
@@ -99,22 +130,22 @@ def compact(args: opt.Args) -> None:
     from gsmerge.compaction.report import result_table, summary_lines
 
     outputs = Outputs(
-        out, report=args.report, viewer_cameras=cameras, saved_cameras=args.save_cameras,
-        embed_cameras=args.embed_cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version, full_columns=writing.columns == "full", placement=placement,
+        out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
+        spz_version=writing.spz_version, full_columns=writing.columns == "full",
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
-    with separate_stdout(args.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
+    with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
             files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
-            hashed=args.json or args.report is not None, seconds_before=seconds_before,
+            hashed=args.json, seconds_before=seconds_before,
         )  # fmt: skip
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
-        view = shlex.join(["gsmerge", "view", str(args.scenes[0]), str(out)])
-        lines = result_table(document, view if out.suffix.lower() == ".ply" else None)
+        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) else []
+        look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
+        lines = result_table(document, shlex.join(look) or None)
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if args.strict and document["psnr_input_views"]["before"] is None:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
@@ -131,10 +162,9 @@ def _compact_state(args: opt.Args, start: float) -> None:
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
     args.require_scene(OF_STATES, path)
-    out = args.output or default_output(path)
+    out = output_file(args.output or default_output(path), default_output(path).name)
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
-    from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.decode import OF_MIXED
     from gsmerge.states.files import compact_file, compact_line
@@ -156,19 +186,6 @@ def _compact_state(args: opt.Args, start: float) -> None:
         )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, compact_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
-
-
-def _with_engine(settings: CompactOptions, args: opt.Args) -> CompactOptions:
-    """Return the settings with the requested engine; UsageError if it is not installed."""
-    from gsmerge.settings.stages import Engine
-
-    with opt.usage_errors():
-        engine = Engine(args.engine, args.address)
-    if engine.name == "ray" and not args.dry_run:
-        from gsmerge.runtime.work import require_ray
-
-        require_ray()
-    return replace(settings, blocks=replace(settings.blocks, engine=engine))
 
 
 def _check_scenes(args: opt.Args) -> None:
@@ -208,8 +225,5 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
 
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
-        outputs = Outputs(
-            out, saved_cameras=args.save_cameras, embed_cameras=args.embed_cameras, overwrite=args.overwrite
-        )
-        document = plan_files(load, settings, outputs)
+        document = plan_files(load, settings, Outputs(out, overwrite=args.overwrite))
     print_document(document, plan_lines(document), as_json=args.json, wrap=True)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import sys
-import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -16,6 +14,7 @@ Progress = Callable[[str, int, int], None]
 
 MAX_LINE = 5000  # characters
 SHORT = 5  # seconds: what is left is shown from so many on
+NARROW = 60  # columns below which bars are short and say less
 OPENING = "start ..."  # on a terminal until a command has its first line or bar
 
 _opening: list[str] = []  # what stands on the terminal's last line, to be erased
@@ -47,27 +46,28 @@ def _erase_opening() -> None:
 
 
 def say(message: str, *, quiet: bool = False) -> None:
-    """Print one status line on stderr unless ``quiet``; ignore a closed stderr."""
+    """Print one status line on stderr unless ``quiet``, wrapped in a terminal; ignore a closed stderr."""
     if not quiet:
+        from gsmerge.report import wrap_line
+
         _erase_opening()
         with suppress(OSError):
-            print(one_line(message), file=sys.stderr, flush=True)
+            print("\n".join(wrap_line(one_line(message), terminal_columns(sys.stderr))), file=sys.stderr, flush=True)
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
     """Print a line on stderr for each note about the input or the run, unless ``quiet``."""
     for note in notes:
-        for line in wrap_line(f"note: {one_line(note)}", _columns(sys.stderr)):
-            say(line, quiet=quiet)
+        say(f"note: {note}", quiet=quiet)
 
 
 def say_warning(text: str, *, quiet: bool = False) -> None:
     """Print a warning on stderr unless ``quiet``, in red where it is a terminal with colours."""
-    start, end = ("\033[31m", "\033[0m") if _has_colors(sys.stderr) else ("", "")
-    if not quiet:
-        _erase_opening()
-        with suppress(OSError):
-            print(f"{start}gsmerge: warning: {one_line(text)}{end}", file=sys.stderr, flush=True)
+    colored = not quiet and _has_colors(sys.stderr)
+    with suppress(OSError):
+        print("\033[31m" * colored, end="", file=sys.stderr)
+        say(f"gsmerge: warning: {text}", quiet=quiet)
+        print("\033[0m" * colored, end="", file=sys.stderr, flush=True)
 
 
 def _has_colors(stream: Any) -> bool:
@@ -75,31 +75,22 @@ def _has_colors(stream: Any) -> bool:
     return not os.environ.get("NO_COLOR") and bool(stream.isatty() or os.environ.get("FORCE_COLOR"))
 
 
-def _columns(stream: Any) -> int | None:
+def terminal_columns(stream: Any) -> int | None:
     """Return the width of a stream's terminal; None if it is no terminal."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 
-def wrap_line(line: str, columns: int | None) -> list[str]:
-    """Break a line between words at ``columns`` (None: never), with further lines indented to the first value."""
-    if columns is None or len(line) <= columns:
-        return [line]
-    label = re.match(r" *\S+(?: \S+)?  +|note: ", line)
-    indent = " " * len(label[0]) if label and len(label[0]) < columns // 2 else ""
-    return textwrap.wrap(line, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-
-
 def print_document(
-    document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = False
+    document: Mapping[str, Any], lines: Sequence[str] | str, *, as_json: bool, quiet: bool = False, wrap: bool = True
 ) -> None:
-    """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break lines for a terminal."""
-    from gsmerge.report import to_json
+    """Print a result on stdout as JSON or, unless ``quiet``, as lines; ``wrap``: break long lines in a terminal."""
+    from gsmerge.report import to_json, wrap_line
 
     _erase_opening()
     if as_json:
         sys.stdout.write(to_json(document))
     elif not quiet:
-        columns = _columns(sys.stdout) if wrap else None
+        columns = terminal_columns(sys.stdout) if wrap else None
         for line in [lines] if isinstance(lines, str) else lines:
             print("\n".join(wrap_line(one_line(line), columns)))
 
@@ -128,6 +119,13 @@ def _terminal(*, quiet: bool) -> Any:
     return console if console.is_terminal else None
 
 
+def _bar(console: Any) -> Any:
+    """Make the column of bars, which are short in a narrow terminal."""
+    from rich.progress import BarColumn
+
+    return BarColumn(16 if console.width >= NARROW else 8)
+
+
 @contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar per stage on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
@@ -149,17 +147,19 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             seconds = task.time_remaining
             return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
 
-    columns = (
-        rich.TextColumn("{task.description:>12}"), rich.BarColumn(16), rich.TimeElapsedColumn(),
-        rich.TextColumn("{task.fields[count]}"), TimeLeft(), rich.TextColumn("{task.fields[detail]}"),
-    )  # fmt: skip
+    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}") for name in ("count", "detail"))
+    columns: tuple[rich.ProgressColumn, ...] = (rich.TextColumn("{task.description:>12}"), _bar(console), count)
+    if console.width >= NARROW:
+        columns = *columns[:2], rich.TimeElapsedColumn(), count, TimeLeft(), detail
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:
         tasks: dict[str, Any] = {}
+        totals: dict[str, int] = {}
         running: list[str] = []
 
         def finish() -> None:
             for name in running:
-                bars.update(tasks[name], total=1, completed=1)
+                count = f"{totals[name]}/{totals[name]}" if name in totals else ""
+                bars.update(tasks[name], total=1, completed=1, count=count)
                 bars.stop_task(tasks[name])
             running.clear()
 
@@ -174,9 +174,11 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
                 tasks[name] = bars.add_task(name, total=None, count="", detail="")
                 running.append(name)
             if total and (detail or name not in STAGES):
+                totals[name] = total
                 bars.update(tasks[name], completed=done, total=total, count=f"{done}/{total}", detail=detail)
 
         yield move
+        finish()
 
 
 @contextmanager
@@ -210,8 +212,8 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, s
     from rich.text import Text
 
     columns = (
-        rich.BarColumn(16), rich.MofNCompleteColumn(), rich.TimeElapsedColumn(), rich.TextColumn("left"),
-        rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+        _bar(console), rich.MofNCompleteColumn(), *[rich.TimeElapsedColumn()] * (console.width >= NARROW),
+        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
     )  # fmt: skip
     bars, last = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
     with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):

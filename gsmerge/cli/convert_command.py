@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.cli import parameters as opt
@@ -9,6 +10,17 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import FileOptions, check_format, check_outputs, model_files, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.stages import CleanOptions
+
+
+@dataclass(frozen=True)
+class PhotoOptions(Settings):
+    """Photos that a conversion reads."""
+
+    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and whose names a "
+        "COLMAP model has.", metavar="PATH")  # fmt: skip
 
 
 @opt.command(
@@ -18,31 +30,28 @@ from gsmerge.settings.extend import SUFFIX
                  "folder named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it."),
-    opt.changed("images", help="Photos of the cameras, which --drop sky needs, and whose names a COLMAP model has."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
-    opt.changed("set", help="Any other setting of the written file, such as normals=false; may be repeated."),
+    opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",
 )  # fmt: skip
 def convert(args: opt.Args) -> None:
     """Write Gaussians in another format, frame or extent, as they are: nothing is merged or fitted."""
-    from gsmerge.settings.placement import PlacementOptions
-    from gsmerge.settings.stages import CleanOptions
-
     *inputs, output = args.paths
     if not inputs:
         raise UsageError(f"expected files to read and one to write, got {output} alone")
     if any(path.suffix.lower() == SUFFIX for path in inputs):
         _convert_state(args, inputs, output)
         return
-    writing, cleaning, placement = args.make(FileOptions, CleanOptions, PlacementOptions)
-    output = output_file(output)
-    check_outputs((output, *model_files(output)), (*inputs, args.cameras, args.images), overwrite=args.overwrite)
+    writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
+    images = None if photos.images is None else Path(photos.images)
+    output = output_file(output, inputs[0].name)
+    check_outputs((output, *model_files(output)), (*inputs, args.cameras, images), overwrite=args.overwrite)
     check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
 
     options = ConvertOptions(
-        inputs, output, args.cameras, args.images, args.opacity, cleaning, placement,
+        inputs, output, args.cameras, images, args.opacity, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full", spz_version=writing.spz_version,
         overwrite=args.overwrite,
     )  # fmt: skip

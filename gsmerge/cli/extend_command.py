@@ -11,12 +11,15 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import one_line, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.extend import ExtendOptions
 
 
 @opt.command(
     opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
     opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as compact takes it."),
-    f"{opt.READING} k max_k superpixels budget effort recipe checkpoint set {opt.RUN}",
+    opt.READING,
+    opt.settings_option(CompactOptions, ExtendOptions, example="superpixels=2%"),
 )
 def extend(args: opt.Args) -> None:
     """Add the views of scenes to a state; gsmerge compact makes results of any size from it at any time."""
@@ -24,8 +27,6 @@ def extend(args: opt.Args) -> None:
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
-    from gsmerge.settings.compact import CompactOptions
-    from gsmerge.settings.extend import ExtendOptions
     from gsmerge.states.files import batch_line, extend_file
 
     settings = args.values(CompactOptions, ExtendOptions)

@@ -1,22 +1,78 @@
-"""``gsmerge inspect``: what a scene's files hold, and what compact would make of them."""
+"""``gsmerge inspect``: what files hold, whether they are sound, and what compact would make of a scene."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from pathlib import Path
+
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
+from gsmerge.errors import SceneError, UsageError
 
 
-@opt.command(opt.SCENE, opt.READING, "masks threads")
+@opt.command(
+    opt.argument("paths", list[Path], "SCENE|FILE...", "A scene, or several; also cameras, .gsm files, networks and "
+                 "lod-meta.json."),
+    opt.READING,
+)  # fmt: skip
 def inspect(args: opt.Args) -> None:
-    """Say what a scene holds, whether its pixels line up, and what compact would make of it."""
-    hints = args.hints()
+    """Read files to their ends, and say what they hold and what compact would make, or refuse, of each scene."""
+    from gsmerge.file_checks import holds_scene
+    from gsmerge.io.formats.table import INDEX
+
+    path = args.paths[0]
+    if len(args.paths) == 1 and (holds_scene(path) or path.name == INDEX):
+        _inspect_scene(args, path)
+        return
+    if args.cameras is not None or args.images is not None:
+        raise UsageError("--cameras and --images: expected one scene with them")
+    _check_files(args)
+
+
+def _inspect_scene(args: opt.Args, path: Path) -> None:
+    """Describe a scene at length; SceneError if ``compact`` refuses it."""
     from gsmerge.compaction.inspect import inspect as inspect_scene
     from gsmerge.compaction.inspect import inspection_lines
+    from gsmerge.file_checks import check_content, damage
+    from gsmerge.io.formats.table import INDEX
     from gsmerge.report import document_head
     from gsmerge.runtime.record import record_run
 
-    places = {"cameras": args.cameras, "images": args.images, "masks": args.masks}
+    hints = args.hints()
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
-        facts = inspect_scene(args.scene, **places, opacity=args.opacity, threads=args.threads, **vars(hints))
-    document, lines = {**document_head(), **facts}, inspection_lines(facts)
+        facts = inspect_scene(path, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints))
+        problems = check_content(path).problems if path.name == INDEX else damage(path)
+    document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)
+    if facts["compact"] is None:
+        place, _, problem = facts["alignment_problem"].partition(": ")
+        raise SceneError(place, problem)
+    if problems:
+        raise SceneError(path, "; ".join(problems))
+
+
+def _check_files(args: opt.Args) -> None:
+    """Print a line for each file; SceneError if ``compact`` refuses one."""
+    from gsmerge.file_checks import FileCheck, check_content
+    from gsmerge.report import document_head
+
+    checks, hints = list[FileCheck](), args.hints()
+    with stage_progress(quiet=args.silent) as progress:
+        for path in args.paths:
+            progress(f"inspect: {path.name}", len(checks), len(args.paths))
+            checks.append(check_content(path, opacity=args.opacity, hints=hints))
+    wrong, several = [result for result in checks if result.problems], len(checks) > 1
+    notes = [f"{result.path}: {note}" for result in checks for note in result.notes]
+    say_notes(notes, quiet=args.silent)
+    document = {
+        **document_head(),
+        "files": [asdict(result) for result in checks],
+        "num_wrong": len(wrong),
+        "notes": notes,
+    }
+    lines = [result.line for result in checks if several or not result.problems]
+    print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    if wrong and several and not args.silent:
+        raise SceneError(f"{len(wrong)} of {len(checks)} files", "refused, for the causes above")
+    if wrong:
+        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), "and others" if len(wrong) > 1 else "")

@@ -8,7 +8,10 @@ help, values and default in words are those of the setting (:func:`setting_optio
 from __future__ import annotations
 
 import json
+import os
 import re
+import shutil
+import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from copy import copy
@@ -25,12 +28,12 @@ import typer
 
 from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
+from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
-from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
-from gsmerge.settings.setting import Setting, flat_settings, join_words
+from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words
 from gsmerge.settings.stages import CROP_FILES, Engine
 
 if TYPE_CHECKING:
@@ -43,10 +46,11 @@ INPUT, COUNT, METHOD, MEASURING, OUTPUT, GENERAL = (
 # In the help, of plain values
 METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
 REQUIRED = Parameter.empty
-SETTINGS_PAGE = "docs/reference/settings.md"
+LIST = "help"  # for which --set prints all settings
+SEED = "GSMERGE_SEED"  # of the environment: the seed where a command is given none
 
 SETTINGS = {
-    setting.name: setting for kind in (EvaluateOptions, Engine, ExtendOptions, PlacementOptions, CompactOptions)
+    setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
     for setting in flat_settings(kind).values()
 }  # fmt: skip
 
@@ -79,7 +83,7 @@ class Args(SimpleNamespace):
         settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
         with usage_errors():
             return [
-                kind().with_settings(arguments) if hasattr(kind, "with_settings") else kind(**arguments)
+                kind().with_settings(arguments) if kind is CompactOptions else change_settings(kind(), arguments)
                 for kind, arguments in zip(kinds, settings, strict=True)
             ]
 
@@ -91,6 +95,8 @@ class Args(SimpleNamespace):
         for name in options.keys() & chosen.keys():
             raise UsageError(f"--set {name}: expected it once, got --{name.replace('_', '-')} too")
         values = options | chosen
+        if "seed" in settings:
+            values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
         if Path(values.get("crop") or "").suffix.lower() in CROP_FILES:
             from gsmerge.io.crop_file import read_crop
 
@@ -147,18 +153,37 @@ def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]
         if not sign:
             raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
         if name not in settings:
-            near = "".join(f", perhaps {word}" for word in get_close_matches(name, settings, 1))
-            raise UsageError(f"{flag} {name}: unknown{near}; {SETTINGS_PAGE} lists all")
+            near = join_words(get_close_matches(name, settings, 3, 0.5))
+            near = f"; perhaps {near}" if near else ""
+            more = f"{flag} {LIST} lists all" if flag == "--set" else f"expected {join_words(settings)}"
+            raise UsageError(f"{flag} {name}: unknown{near}; {more}")
         if name in values:
             raise UsageError(f"{flag} {name}: expected it once, got it twice")
-        readings: list[Any] = [text]
-        with suppress(ValueError, RecursionError):
-            readings.insert(0, json.loads(text))
+        readings = _read_value(text)
+        if settings[name].is_list:
+            readings.append([_read_value(part.strip())[0] for part in text.split(",")])
         fitting = [value for value in readings if settings[name].fits(value)]
         if not fitting:
             raise UsageError(f"{flag} {name}: expected {settings[name].expected(readings[0], null=True)}, got {text!r}")
         values[name] = fitting[0]
     return values
+
+
+def _read_value(text: str) -> list[Any]:
+    """Read a value as JSON or as a number, where it is one, and as text."""
+    readings: list[Any] = [text]
+    for read in (float, json.loads):
+        with suppress(ValueError, RecursionError):
+            readings.insert(0, read(text))
+    return readings
+
+
+def _environment_seed() -> dict[str, int]:
+    """Return the seed of the environment, if there is one; UsageError if it is no seed."""
+    text = os.environ.get(SEED)
+    if text is not None and not text.isdecimal():
+        raise UsageError(f"{SEED}: expected a whole number from 0, got {text!r}")
+    return {} if text is None else {"seed": int(text)}
 
 
 @contextmanager
@@ -240,17 +265,12 @@ def _escape(help: str) -> str:
     return re.sub(r"\[(?=[a-z])", r"\\[", help.replace("`", ""))
 
 
-def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[[Args], None]], Callable[..., None]]:
-    """Decorate a command with its parameters in the order of the help; ``rare`` options show only in ``--help-all``."""
+def command(*parameters: str | Parameter) -> Callable[[Callable[[Args], None]], Callable[..., None]]:
+    """Decorate a command with its parameters in the order of the help."""
     listed: dict[str, Parameter] = {}
-    for parameter in (*parameters, "json quiet", *(["help_all"] if rare else [])):
+    for parameter in (*parameters, "json quiet"):
         for name in parameter.split() if isinstance(parameter, str) else [parameter.name]:
             listed.setdefault(name, OPTIONS[name] if isinstance(parameter, str) else parameter)
-    for name in rare.split():
-        listed[name] = _change(listed[name], hidden=True)
-    if rare:
-        hidden = ", ".join(f"--{name.replace('_', '-')}" for name in listed if name in rare.split())
-        listed["help_all"] = _change(listed["help_all"], help=f"Show all options and exit, also {hidden}.")
 
     def decorate(function: Callable[[Args], None]) -> Callable[..., None]:
         @wraps(function)
@@ -262,22 +282,52 @@ def command(*parameters: str | Parameter, rare: str = "") -> Callable[[Callable[
 
         run.__signature__ = Signature(list(listed.values()))  # type: ignore[attr-defined]
         run.__annotations__ = {}
+        run.kinds = getattr(get_args(listed["set"].annotation)[1], "kinds", ()) if "set" in listed else ()  # type: ignore[attr-defined]
         return run
 
     return decorate
 
 
-def _show_all(context: typer.Context, value: bool) -> None:
-    """Print the complete help, including rare options."""
-    if value:
-        for parameter in context.command.params:
-            parameter.hidden = False  # type: ignore[attr-defined]
-        print(context.get_help())
+def call(function: Callable[..., None], **values: Any) -> None:
+    """Run another command with some of its parameters; the others have their defaults."""
+    declared: Signature = function.__signature__  # type: ignore[attr-defined]
+    function(**{name: parameter.default for name, parameter in declared.parameters.items()} | values)
+
+
+def settings_option(*kinds: type | LazyFunction, help: str = "Any other setting, such as {}; may be repeated. --set "
+                    "help lists them all.", example: str = "match=aabb") -> Parameter:  # fmt: skip
+    """Declare ``--set`` of a command for settings of ``kinds``, which ``--set help`` lists; heavy ones are lazy."""
+
+    def show(values: list[str] | None) -> list[str] | None:
+        if LIST not in (values or ()):
+            return values
+        print("\n".join(_settings_lines(listed_settings(kinds))))
         raise typer.Exit
+
+    return changed("set", help=help.format(example), callback=show, is_eager=True, kinds=kinds)
+
+
+def listed_settings(kinds: Iterable[type | LazyFunction]) -> dict[str, Setting]:
+    """List the settings of a command's ``--set`` by name."""
+    loaded = (kind.load() if isinstance(kind, LazyFunction) else kind for kind in kinds)
+    return {name: declared for kind in loaded for name, declared in flat_settings(kind).items()}
+
+
+def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
+    """Write each setting with its default, and what it does, for a terminal."""
+    width, lines = max(40, shutil.get_terminal_size().columns), list[str]()
+    for name, declared in settings.items():
+        default = declared.default
+        shown = default if isinstance(default, str) else json.dumps(default, default=str)
+        if isinstance(default, tuple):
+            shown = ",".join(map(str, default))
+        lines += [f"{name}={shown}", *textwrap.wrap(declared.help, width, initial_indent="    ",
+                  subsequent_indent="    ")]  # fmt: skip
+    return lines
 
 
 def number_or_text(text: str) -> int | str:
-    """Parse ``--k`` or ``--superpixels``: a number, or a word such as "auto"."""
+    """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
 
 
@@ -312,24 +362,18 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", parser=number_or_text),
-        setting_option("superpixels", parser=number_or_text),
         setting_option("budget"),
         setting_option("quality"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),
-        setting_option("blocks", parser=number_or_text),
-        setting_option("max_k"),
     ),
     panel(
         METHOD,
-        *map(setting_option, ("effort", "fit", "exposure", "poses", "method", "recipe", "checkpoint")),
-        option("set", list[str], f"Any other setting, such as match=aabb; may be repeated. {SETTINGS_PAGE} lists "
-               "them.", metavar="NAME=VALUE"),
+        *map(setting_option, ("effort", "fit")),
+        option("set", list[str], "Any other setting; may be repeated.", metavar="NAME=VALUE"),
     ),
     panel(
         MEASURING,
-        setting_option("photo_side"),
-        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="both, where installed"),
-        setting_option("lpips_views"),
+        option("lpips", ("both", *NETS, "none"), SETTINGS["lpips"].help, wording="alex, where installed"),
     ),
     panel(
         OUTPUT,
@@ -337,20 +381,15 @@ _TABLE = (
         setting_option("drop"),
         *map(setting_option, ("up", "scale", "rotate", "translate", "sh_degree")),
         option("output", Path, "", "--output", "-o"),
-        setting_option("antialiased"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
                "than the input does, by more than .5 dB."),
-        option("report", Path, "Write the JSON report to this file."),
-        option("save_cameras", Path, "Write the cameras as used, moved where they were wrong, as transforms.json."),
-        switch("embed_cameras", "Write the cameras as used into the .ply, too, as comments that other programs skip."),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),
     panel(
         "Running",
         setting_option("engine", default="local", wording=None),
-        setting_option("address"),
     ),
     panel(
         GENERAL,
@@ -358,8 +397,6 @@ _TABLE = (
         setting_option("threads"),
         switch("quiet", "Print errors only.", "-q"),
     ),
-    panel("Options", switch("help_all", "", is_eager=True, callback=_show_all,
-                            expose_value=False)),
 )  # fmt: skip
 OPTIONS = {parameter.name: parameter for parameters in _TABLE for parameter in parameters}
 

@@ -9,12 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CHECKPOINTS
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
+
+# In the head of every page that gsmerge makes
+PAGE_MARK, PAGE_HEAD = b'<meta name="generator" content="gsmerge ', 4096
+
+
+# In the first bytes of what gsmerge makes for readers: pages, JSON, CSV, Markdown
+MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
+MARKED = 4000  # of these bytes
 
 
 @dataclass(frozen=True)
@@ -37,17 +44,49 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def output_file(output: Path) -> Path:
-    """Return the file that an output names; for a folder ``colmap``, that is the points of the COLMAP model."""
-    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS
+def output_file(output: Path, name: str) -> Path:
+    """Return the file that an output names: of a folder its main file, or in an existing folder the file ``name``.
 
-    return output / PLACE / POINTS if output.name == FOLDER else output
+    A folder named ``colmap`` is a COLMAP model, a new or empty one and one with a site of gsmerge a web site.
+    """
+    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS, SITE
+
+    if output.name == FOLDER:
+        return output / PLACE / POINTS
+    if _is_site(output):
+        return output / SITE.ending
+    return output / name if output.is_dir() else output
+
+
+def _is_site(output: Path) -> bool:
+    """Return whether a folder is, or is to become, a web site; a file's name has an ending."""
+    from gsmerge.io.formats.table import SITE
+
+    if not os.path.lexists(output):
+        return not output.suffix
+    try:
+        return output.is_dir() and (not any(output.iterdir()) or is_page(output / SITE.ending))
+    except OSError:  # no permission to look into it: the check of outputs says so
+        return False
+
+
+def is_page(path: Path) -> bool:
+    """Return whether a file is a page that gsmerge made."""
+    try:
+        with path.open("rb") as file:
+            return PAGE_MARK in file.read(PAGE_HEAD)
+    except OSError:
+        return False
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
-    """List the files of an output that is a COLMAP model; SceneError if another program wrote the model."""
-    from gsmerge.io.formats.table import POINTS
+    """List the other files of a web site, or of a COLMAP model, of which another program's is a SceneError."""
+    from gsmerge.io.formats.table import POINTS, SITE
 
+    if SITE.names(output):
+        from gsmerge.pages.site import NAMES
+
+        return tuple(output.with_name(name) for name in NAMES.values())
     if output.name != POINTS:
         return ()
     from gsmerge.io.cameras.colmap_model import files_beside
@@ -75,16 +114,6 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
     if options.spz_version != 3 and ending != ".spz":
         raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
-
-
-def check_embedding(output: Path, budget: BudgetOptions) -> None:
-    """Raise UsageError if cameras cannot be embedded: no comments in the format, or a budget in bytes."""
-    if output.suffix.lower() != ".ply":
-        raise UsageError(f"--embed-cameras: expected an output as .ply, got {output.name}; use --save-cameras FILE")
-    if budget.in_bytes:
-        raise UsageError(
-            f"--embed-cameras: expected a --budget without cameras inside, got {budget.budget}; give a number"
-        )
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
@@ -128,6 +157,18 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     if os.path.lexists(output) and not overwrite:
         raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
     _check_place(output.parent, output, "a folder to write to")
+
+
+def check_replaced(outputs: Sequence[Path]) -> None:
+    """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
+    for output in outputs:
+        try:
+            with open(output, "rb") as file:
+                start = file.read(MARKED)
+        except OSError:  # there is none yet, or writing fails with its own reason
+            continue
+        if start and not any(mark in start for mark in MARKS):
+            raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another with --output")
 
 
 def _check_place(folder: Path, output: Path, expected: str) -> None:

@@ -48,14 +48,13 @@ def view(args: opt.Args) -> None:
     if args.dry_run:
         print_document(document, f"would write {output}", as_json=args.json)
         return
-    from gsmerge.view.data import collect
-    from gsmerge.view.page import headline, view_page
+    from gsmerge.pages.data import collect
+    from gsmerge.pages.page import headline, view_page
 
     sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
     with stage_progress(quiet=args.silent) as progress:
-        title = files.ply.parent.absolute().name if files.ply.stem == "scene" else files.ply.stem
         data = collect(
-            title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
+            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
             segmentation=segmentation, threads=args.threads, progress=progress,
         )  # fmt: skip
     page = view_page(data)

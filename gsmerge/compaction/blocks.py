@@ -91,7 +91,7 @@ def compact_in_blocks(
     size = gaussians_at_once(scene.num_gaussians, count)
     memory = memory_bytes(size, photos=measure_size(scene).photos, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
-    with start_work(engine.name, engine.address, threads=options.threads, memory=memory) as work:
+    with start_work(engine.engine, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:
@@ -300,7 +300,7 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
     """Return options with the fit steps and the networks that were chosen for the whole scene."""
     checkpoint = options.checkpoint if choices.checkpoint != "none" else "none"
     settings: dict[str, Any] = {"fit_steps": choices.fit.steps, "checkpoint": checkpoint}
-    if options.blocks.engine.name != "local" and os.path.isfile(options.checkpoint):
+    if options.blocks.engine.engine != "local" and os.path.isfile(options.checkpoint):
         settings["require_checkpoint"] = True  # a node without it would make other bytes
     options = options.with_settings(settings)
     return replace(options, fit=replace(options.fit, share=choices.limits.share))

@@ -42,7 +42,9 @@ def compact(
         progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
-    Raises SceneError for a path that cannot be read, ValueError for a setting that is unknown or out of range.
+    Raises:
+        SceneError: If a path cannot be read.
+        ValueError: If a setting is unknown or out of range.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget="5%")

@@ -35,14 +35,14 @@ from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, input_format
+from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, SITE, input_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.files import result_cameras
+from gsmerge.scene.files import result_cameras, scene_title
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import CleanOptions
@@ -167,6 +167,10 @@ def _write(
         first = add(out)
         if ending == COLMAP.ending:
             written = add_colmap(add, out, first, gaussians, cameras, name_photos(options.images, names))
+        elif ending == SITE.ending:
+            from gsmerge.pages.site import add_site
+
+            written = add_site(add, out, first, gaussians, cameras, scene_title(options.inputs[0]), comments)
         elif ending == INDEX:
             ((_, files),) = add_levels(add, out, first, [gaussians], comments)
             written = [first, *files]
@@ -176,7 +180,7 @@ def _write(
                 spz_version=options.spz_version,
             )  # fmt: skip
             written = [first]
-        if len(cameras) and ending != COLMAP.ending:
+        if len(cameras) and ending not in (COLMAP.ending, SITE.ending):
             beside = viewer_cameras_path(out)
             add(beside).write_text(viewer_cameras(cameras, names), encoding="utf-8")
         num_bytes = sum(path.stat().st_size for path in written)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.files import Outputs, check_saved_cameras, sized
+from gsmerge.compaction.files import Outputs, check_colmap, sized
 from gsmerge.compaction.methods import check_method
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise, missing_notes
@@ -99,7 +99,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return as a document what :func:`compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
-    check_saved_cameras(scene, outputs)
+    check_colmap(scene, out)
     _, unused = check_method(settings, scene)
     notes = [*load.notes, *unused, *missing_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

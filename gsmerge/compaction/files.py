@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -14,21 +14,18 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.cameras.embedded import camera_comments
-from gsmerge.io.cameras.json_files import viewer_cameras, write_transforms
+from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.formats.table import COLMAP, INDEX
+from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
 from gsmerge.io.formats.write import output_notes
-from gsmerge.report import to_json
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Scene
 
@@ -41,15 +38,11 @@ class Outputs:
     """Files that a run writes: all, or none."""
 
     result: Path  # its name chooses the format; a ``lod-meta.json`` holds all levels, in chunks beside it
-    report: Path | None = None  # JSON document
     viewer_cameras: Path | None = None  # it may exist already with the same content, beside a result in another format
-    saved_cameras: Path | None = None  # ``transforms.json`` with all intrinsics
-    embed_cameras: bool = False  # also write the cameras into the header of a ``.ply``
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     spz_version: int = 3
     full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
-    placement: PlacementOptions = field(default_factory=PlacementOptions)  # frame of what is written
 
 
 def compact_files(
@@ -63,7 +56,7 @@ def compact_files(
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Read a scene, compact it, and write result, levels, cameras and report: all files or none.
+    """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
 
@@ -73,10 +66,9 @@ def compact_files(
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
     with atomic_outputs(overwrite=outputs.overwrite) as add:
-        at = {out: add(out)}
-        at |= {path: add(path) for path in (outputs.report, outputs.saved_cameras) if path is not None}
+        first = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
-        check_saved_cameras(load.scene, outputs)
+        check_colmap(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras
@@ -89,7 +81,7 @@ def compact_files(
         if len(result.gaussians) == 0:
             problem = "expected Gaussians that show something, found none that is left once they are merged"
             raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
-        result = _placed(result, outputs)
+        result = _padded(result) if outputs.full_columns else result
         parts = None
         if ending == INDEX:
             from gsmerge.compaction.streamed_parts import split_levels
@@ -97,18 +89,15 @@ def compact_files(
             parts = split_levels(result, load.scene, settings, progress)
             result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
-        embedded = [camera_comments(level.cameras[views], names) if outputs.embed_cameras else [] for level in results]
-        comments = [[RESULT_COMMENT, *load.comments, *lines] for lines in embedded]
-        views_named = result.cameras[views], names, files.images
-        written = _write_results(add, outputs, at[out], results, comments, views_named, parts)
+        comments = [RESULT_COMMENT, *load.comments]
+        views_named = result.cameras[views], names, files
+        written = _write_results(add, outputs, first, results, comments, views_named, parts)
         if cameras_path is not None:
             text = viewer_cameras(result.cameras[views], names)
             if not shared:
                 add(cameras_path).write_text(text, encoding="utf-8")
             elif cameras_path.read_text(encoding="utf-8", errors="replace") != text:
                 raise _other_cameras(cameras_path)
-        if outputs.saved_cameras is not None:
-            write_transforms(at[outputs.saved_cameras], result.cameras[views], names)
         notes = output_notes(out, result.gaussians.sh_degree, outputs.spz_version, files.images)
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
@@ -118,8 +107,6 @@ def compact_files(
             recognised=load.recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
-        if outputs.report is not None:
-            at[outputs.report].write_text(to_json(document), encoding="utf-8", errors="replace")
     if parts is not None:
         parts.remove_unused(out)
     return document
@@ -130,32 +117,36 @@ def _write_results(
     outputs: Outputs,
     first: Path,
     results: Sequence[CompactResult],
-    comments: Sequence[Sequence[str]],
-    views: tuple[Cameras, Sequence[str], Path | None],
+    comments: Sequence[str],
+    views: tuple[Cameras, Sequence[str], SceneFiles],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
-    """Write a result, whose file is ``first`` now, and its coarser levels, each with its lines of the header.
+    """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
 
-    A COLMAP model has the ``views``, too: cameras, names, and the folder of their photos; ``parts`` are those of a
-    ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before they are
-    renamed.
+    A COLMAP model and a web site have the ``views``, too: cameras, names, and the files of the scene; ``parts`` are
+    those of a ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before
+    they are renamed.
     """
     out = outputs.result
     ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    cameras, names, files = views
     if ending == COLMAP.ending:
         from gsmerge.compaction.placement import add_colmap, name_photos
 
-        cameras, names, photos = views
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(photos, names))}
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(files.images, names))}
+    if ending == SITE.ending:
+        from gsmerge.pages.site import add_site
+
+        return {out: add_site(add, out, first, results[0].gaussians, cameras, scene_title(files.ply), comments)}
     if parts is not None:
-        return parts.write(add, out, first, comments[0])
+        return parts.write(add, out, first, comments)
     written = {out: [first]}
     for level in range(1, len(results)):
         path = level_output(out, level)
         written[path] = [add(path)]
-    for (file,), result, lines in zip(written.values(), results, comments, strict=True):
+    for (file,), result in zip(written.values(), results, strict=True):
         write_gaussians(
-            file, result.gaussians, overwrite=True, comments=lines, ending=ending, normals=outputs.normals,
+            file, result.gaussians, overwrite=True, comments=comments, ending=ending, normals=outputs.normals,
             spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
@@ -163,25 +154,17 @@ def _write_results(
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Say in the settings whose bytes a budget counts."""
-    budget = replace(settings.budget, output=outputs.result.name, spz_version=outputs.spz_version)
+    name = SITE_SCENE if SITE.names(outputs.result) else outputs.result.name
+    budget = replace(settings.budget, output=name, spz_version=outputs.spz_version)
     return replace(settings, budget=budget)
 
 
-def _placed(result: CompactResult, outputs: Outputs) -> CompactResult:
-    """Move a result, its levels and its cameras into the output frame, and add columns that are written as zeros."""
-    options = outputs.placement
-    if not (options.asked or outputs.full_columns):
-        return result
-    from gsmerge.compaction.placement import NUM_FULL, find_placement, pad_harmonics, place
+def _padded(result: CompactResult) -> CompactResult:
+    """Add the columns of a result and its levels that are written as zeros."""
+    from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 
-    frame = find_placement(options, result.cameras if len(result.cameras) else None)
-
-    def move(level: CompactResult) -> CompactResult:
-        gaussians, cameras = place(level.gaussians, level.cameras, frame, options.sh_degree)
-        gaussians = pad_harmonics(gaussians, NUM_FULL) if outputs.full_columns else gaussians
-        return replace(level, gaussians=gaussians, cameras=cameras, coarser=tuple(map(move, level.coarser)))
-
-    return move(result)
+    coarser = tuple(map(_padded, result.coarser))
+    return replace(result, gaussians=pad_harmonics(result.gaussians, NUM_FULL), coarser=coarser)
 
 
 def _views_once(scene: Scene) -> list[int]:
@@ -204,19 +187,10 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
-def check_saved_cameras(scene: Scene, outputs: Outputs) -> None:
-    """Raise UsageError if cameras are to be written and the scene has none, or too many to embed."""
-    options = {
-        f"--save-cameras {outputs.saved_cameras}": outputs.saved_cameras is not None,
-        "--embed-cameras": outputs.embed_cameras,
-        f"{outputs.result}": COLMAP.names(outputs.result),
-    }
-    wanted = next((option for option, is_chosen in options.items() if is_chosen), None)
-    if len(scene) == 0 and wanted is not None:
-        raise UsageError(f"{wanted}: expected a scene with cameras, got none")
-    if outputs.embed_cameras:
-        views = _views_once(scene)
-        camera_comments(scene.cameras[views], [scene.names[view] for view in views])  # refuses too many before the work
+def check_colmap(scene: Scene, out: Path) -> None:
+    """Raise UsageError if a COLMAP model is to be written and the scene has no cameras."""
+    if len(scene) == 0 and COLMAP.names(out):
+        raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 
 def _compact_notes(loaded: Loaded) -> tuple[str, ...]:

@@ -16,27 +16,29 @@ from gsmerge.geometry import (
     rotmat_to_quat,
     step_outside,
 )
-from gsmerge.kernels.elementary import cos, sin
-from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.elementary import arctan2, cos, sin
+from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.measure.fog import CAMERAS
 from gsmerge.types import Cameras
 
-PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
+PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline|turntable)(?:,back:(?P<back>[^,]*))?")
 MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
 FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
 TURN = 6 * FINE  # the same for a whole orbit
 # Half axes of an orbit, shares of the distance of its middle: as far as half of the cameras are apart within these.
 # The least is what one photo bears, the most turns the view by 14 degrees to each side.
 ACROSS, UPRIGHT = (0.06, 0.25), (0.03, 0.125)
+LEVEL = 0.01  # squared sine of the angle by which cameras turn from which on their horizon says more than their mean up
+CLOSE = 0.1  # least radius of a turntable, a share of the depth
 SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Path of a camera for a video: an orbit or a spline.
+    """Path of a camera for a video.
 
     Args:
-        kind: "orbit" or "spline".
+        kind: "orbit", "spline" or "turntable".
         turn: Degrees by which an orbit turns to each side; None: it stays where cameras are.
         back: Step back from the path, a share of the viewing depth.
     """
@@ -53,11 +55,11 @@ def parse_path(text: str) -> CameraPath | None:
         ValueError: If the text begins as a path does and goes on otherwise, or a number is out of range.
     """
     kind = re.split("[:,]", text, maxsplit=1)[0]
-    if kind not in ("orbit", "spline"):
+    if kind not in ("orbit", "spline", "turntable"):
         return None
     match = PATH.fullmatch(text)
     if match is None:
-        form = "orbit[:DEGREES][,back:SHARE]" if kind == "orbit" else "spline[,back:SHARE]"
+        form = f"{kind}{'[:DEGREES]' if kind == 'orbit' else ''}[,back:SHARE]"
         raise ValueError(f"path: expected {form}, got {text}")
     turn = _parse_number(match["turn"], "orbit: expected degrees", MAX_TURN)
     back = _parse_number(match["back"], "back: expected a share of the depth", MAX_BACK)
@@ -78,7 +80,7 @@ def _parse_number(text: str | None, expected: str, most: float) -> float | None:
 
 
 def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Make the ``count`` cameras of an orbit or a spline through the cameras of a scene.
+    """Make the ``count`` cameras of a path through or about the cameras of a scene.
 
     Args:
         path: Its kind, and how far it leaves the cameras.
@@ -93,7 +95,10 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
         raise ValueError(f"frames: expected at least 2, got {count}")
     if path.kind == "spline":
         return spline(step_back(cameras, depth, path.back), (1 + path.back) * depth, count)
-    made = orbit(cameras, depth, count) if path.turn is None else wide_orbit(cameras, depth, count, path.turn)
+    if path.kind == "turntable":
+        made = turntable(cameras, depth, count)
+    else:
+        made = orbit(cameras, depth, count) if path.turn is None else wide_orbit(cameras, depth, count, path.turn)
     return step_back(made, depth, path.back)
 
 
@@ -152,11 +157,8 @@ def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
     angles = np.linspace(0, 2 * np.pi, TURN + 1)
     even = _at_equal_steps(shifts(angles), angles, np.arange(count) / count)
     eyes = shifts(even)
-    looks = normalize(depth * axes[2] - eyes)
-    right = normalize(np.cross(axes[1], looks))
-    turned = np.stack([right, np.cross(looks, right), looks], 1)
-    Ks = np.repeat(cameras.Ks[middle][None].astype(np.float64), count, 0)
-    return replace(cameras, viewmats=_viewmats(turned, centre + eyes), Ks=Ks)
+    turned = _look(depth * axes[2] - eyes, axes[1])
+    return replace(cameras[[middle] * count], viewmats=_viewmats(turned, centre + eyes))
 
 
 def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Cameras:
@@ -174,6 +176,47 @@ def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Camer
     angles = np.linspace(0, 2 * np.pi, TURN + 1)
     even = _at_equal_steps(camera_centres(turned(angles)), angles, np.arange(count) / count)
     return replace(cameras[[middle] * count], viewmats=turned(even))
+
+
+def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
+    """Turn once about the scene's middle, which stays in the middle of the picture, with a level horizon.
+
+    Height and distance are the medians of the cameras'; the first frame is on the side of the middle camera. Frames
+    are evenly spaced and form a loop.
+    """
+    middle, up, towards = _axis(cameras, depth)
+    offsets = camera_centres(cameras.viewmats) - middle
+    heights = (offsets * up).sum(1)
+    radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), CLOSE * depth)
+    angles = 2 * np.pi * np.arange(count)[:, None] / count
+    eyes = radius * (cos(angles) * towards + sin(angles) * np.cross(up, towards)) + np.median(heights) * up
+    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(_look(-eyes, -up), middle + eyes))
+
+
+def turned_degrees(cameras: Cameras, depth: float) -> float:
+    """Measure the degrees of a :func:`turntable` within which all cameras stand."""
+    middle, up, towards = _axis(cameras, depth)
+    offsets = camera_centres(cameras.viewmats) - middle
+    angles = np.sort(arctan2((offsets * np.cross(up, towards)).sum(1), (offsets * towards).sum(1)))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    return float(np.degrees(2 * np.pi - gaps.max()))
+
+
+def _axis(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the axis of a turntable: a point ``[3]`` on it, the way up, and the level way back of the middle camera.
+
+    The point is the median of those ``depth`` in front of the cameras. Up is the mean of the cameras' own, and at right
+    angles to what they hold level, if they turn.
+    """
+    axes = cameras.viewmats[:, :3, :3].astype(np.float64)
+    middle = lower_median(camera_centres(cameras.viewmats) + depth * axes[:, 2])
+    own = axes[median_camera(cameras)]
+    rights = axes[:, 0]
+    # A little of the middle camera's up, since those of all may cancel each other
+    mean = -axes[:, 1].mean(0) - SAME * own[1]
+    up = normalize(solve(matmul(rights.T, rights) / len(axes) + LEVEL * np.eye(3), mean))
+    back = (own[2] * up).sum() * up - own[2]
+    return middle, up, normalize(back if _lengths(back) > CLOSE else np.cross(own[0], up))  # it may look straight down
 
 
 def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
@@ -242,6 +285,13 @@ def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt((vectors * vectors).sum(-1))
+
+
+def _look(directions: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Make the rotations ``[n,3,3]`` of cameras that look in ``directions [n,3]``, with ``down [3]`` below."""
+    looks = normalize(directions)
+    right = normalize(np.cross(down, looks))
+    return np.stack([right, np.cross(looks, right), looks], 1)
 
 
 def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Drawings of scenes: a panel beside photos, a picture for each camera, frames along a path, and superpixels."""
+"""Drawings of scenes: a panel beside photos, a picture for each camera, and clips along a path."""
 
 from __future__ import annotations
 
@@ -16,42 +16,47 @@ from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES
-from gsmerge.measure.camera_path import parse_path, sample_path, viewing_depth
-from gsmerge.measure.preview import (
+from gsmerge.measure.camera_path import parse_path, sample_path, turned_degrees, viewing_depth
+from gsmerge.measure.clip import (
     FOLDER,
+    GIF,
     H264,
+    MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
+    SUFFIXES,
+    draw_swipe,
+    make_captions,
+    swipe_places,
+    write_clip,
+)
+from gsmerge.measure.preview import (
     Picture,
     contact_sheet,
-    draw_borders,
-    draw_heat,
-    draw_means,
-    is_video,
     outside_pictures,
     save_picture,
     to_picture,
     view_pictures,
-    write_video,
 )
+from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
-from gsmerge.raster.photos import NEAR, scene_pictures
+from gsmerge.raster.photos import NEAR
 from gsmerge.report import document_head
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
-from gsmerge.scene.read import Loaded, SceneViews, load_files, place_cameras_in_scene, read_rows
+from gsmerge.scene.read import Loaded, SceneViews, place_cameras_in_scene, read_rows
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.superpixels import count_for, saliency, segment
 from gsmerge.types import Cameras, Gaussians
 
 PANEL_VIEWS = 4  # rows of a panel
-PATH_FRAMES = 120  # of a path, at least
+SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
-FPS = 30  # frames per second
-KINDS = ("borders", "means", "saliency")  # pictures of the superpixels of a view
+FPS, GIF_FPS = 30.0, 12.5  # frames per second
+GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
+HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
 
 
 @dataclass(frozen=True)
@@ -66,15 +71,24 @@ class DrawOptions:
     hints: ReadHints = AUTO
     views: int | None = None  # Views at most; None: all, of a panel four
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
-    frames: int | None = None  # Along the path; None: 120, of a spline at least 4 for each view
-    fps: int | None = None  # Frames of a video per second; None: 30
+    frames: int | None = None  # Along the path; None: those of SECONDS, of a spline at least 4 for each view
+    size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
     background: float = 0.0  # Grey level
-    antialiased: bool = False
-    segmentation: SegmentOptions | None = None  # How superpixels are cut
 
     def choose(self, count: int, most: int | None = None) -> list[int]:
         """Choose ids of ``count`` views: as many as the option ``views``, or else ``most``; None: all."""
         return pick_views(count, self.views or most or count)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return GIF_FPS if self.output.suffix.lower() == GIF else FPS
+
+    def resize(self, cameras: Cameras) -> Cameras:
+        """Give cameras the size of the pictures: they show what fills it."""
+        if self.size is not None:
+            return fill_cameras(cameras, *self.size)
+        return shrink_cameras(cameras, GIF_SIDE) if self.output.suffix.lower() == GIF else cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +105,7 @@ class DrawnScenes:
     """Scenes to draw together, and the scene whose frame and views they share."""
 
     scenes: list[tuple[Path, Gaussians]]
+    sizes: list[int]  # Bytes of their files
     notes: list[str]
     load: Loaded  # The scene whose frame it is
 
@@ -99,25 +114,35 @@ class DrawnScenes:
         return {str(path): len(gaussians) for path, gaussians in self.scenes}
 
     def draw(
-        self, cameras: Cameras, options: DrawOptions, threads: int, near: float = 0.01
+        self,
+        cameras: Cameras,
+        options: DrawOptions,
+        threads: int,
+        near: float = 0.01,
+        places: Sequence[Sequence[int]] | None = None,
     ) -> Iterator[tuple[Picture, ...]]:
-        """Yield the 8-bit pictures of all scenes for each camera; memory holds one view per thread."""
-        grey, antialiased = options.background, options.antialiased
+        """Yield the 8-bit pictures of all scenes for each camera; memory holds one view per thread.
+
+        Of each camera's pictures at least the columns between ``places``, one more than there are scenes, are drawn.
+        """
+        how: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
             render_in_turn(
-                gaussians, cameras, grey, at_once=threads, antialiased=antialiased, near=near, convert=to_picture
+                gaussians,
+                cameras,
+                options.background,
+                columns=None if places is None else [(row[i], row[i + 1]) for row in places],
+                **how,
             )
-            for _, gaussians in self.scenes
+            for i, (_, gaussians) in enumerate(self.scenes)
         )
         return zip(*drawn, strict=True)
 
 
-def frame_files(files: SceneFiles, source: Path | None, cameras: Path | None, images: Path | None) -> SceneFiles:
-    """Find the files of the scene that gives the cameras' frame: ``source``, else the scene it was compacted from."""
+def frame_files(files: SceneFiles, cameras: Path | None, images: Path | None) -> SceneFiles:
+    """Find the files of the scene that gives the cameras' frame: what a scene was compacted from, or itself."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
-    if source is None and match is not None and (beside := files.ply.with_name(f"{match[1]}.ply")).is_file():
-        source = beside
-    if source is None:
+    if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
         return files
     like = find_scene_files(source, cameras=cameras, images=images)
     return like if like.cameras is not None else replace(like, cameras=files.cameras)
@@ -127,55 +152,68 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     """Prepare one picture of photo, before, after, ... with a row for each of some views and one from outside."""
     group = _read(options, photos=True)
     used = list(group.load.views.used)
-    cameras, photos = group.load.views.cameras[used], group.load.views.images
+    cameras, photos = options.resize(group.load.views.cameras[used]), group.load.views.images
     ids = options.choose(len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
         parts = [(path.name, gaussians) for path, gaussians in group.scenes]
-        view_photos = photos[used] if len(photos) else None
-        how = {"background": options.background, "antialiased": options.antialiased}
-        rows = view_pictures(parts, cameras, view_photos, max_views=len(ids), **how)
-        yield contact_sheet([*rows, outside_pictures(parts, cameras, photos=len(photos) > 0, **how)])
+        shown = [photos[[used[i]]][0] for i in ids] if len(photos) else None
+        if shown and options.size:
+            shown = [fill_photo(photo, *options.size) for photo in shown]
+        rows = view_pictures(parts, cameras[ids], shown, ids, background=options.background)
+        outside = outside_pictures(parts, cameras, photos=len(photos) > 0, background=options.background)
+        yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(photos) > 0, "notes": group.notes}
     return Drawing([options.output], facts, draw)
 
 
 def prepare_pictures(options: DrawOptions) -> Drawing:
-    """Prepare one picture for each camera."""
+    """Prepare one picture for each camera, of several scenes side by side."""
     group = _read(options, photos=False)
     ids = options.choose(len(group.load.views.cameras))
-    views, stems = group.load.views.cameras[ids], picture_stems(group.load.views.names)
-    size = {"width": views.width, "height": views.height}
-    return Drawing(
-        [options.output / f"{stems[i]}.png" for i in ids],
-        {**size, "num_gaussians": len(group.scenes[0][1]), "views": ids, "notes": group.notes},
-        lambda threads: (picture for (picture,) in group.draw(views, options, threads)),
-    )
-
-
-def prepare_frames(options: DrawOptions) -> Drawing:
-    """Prepare a video, or its frames as pictures, of the scenes side by side along a camera path."""
-    group, cameras, near, ids = _path_cameras(options)
-    labels = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
+    views, stems = options.resize(group.load.views.cameras[ids]), picture_stems(group.load.views.names)
+    names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
-        for drawn in group.draw(cameras, options, threads, near):
-            yield contact_sheet([list(zip(labels, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
+        for drawn in group.draw(views, options, threads):
+            yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
+
+    facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
+    return Drawing([options.output / f"{stems[i]}.png" for i in ids], facts, draw)
+
+
+def prepare_clip(options: DrawOptions) -> Drawing:
+    """Prepare a clip, or its frames as pictures, of the scenes along a path, with lines that move between them."""
+    group, cameras, near, ids = _path_cameras(options)
+    cameras = options.resize(cameras)
+    texts = [
+        (path.absolute().name, f"{len(gaussians):,} Gaussians, {human_bytes(size)}")
+        for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
+    ]
+
+    def draw(threads: int) -> Iterator[Picture]:
+        captions = make_captions(texts, cameras.width, cameras.height)
+        places = swipe_places(len(texts), len(cameras), options.fps, cameras.width)
+        for drawn, row in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
+            yield draw_swipe(drawn, row, captions) if len(drawn) > 1 else drawn[0]
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
-    if is_video(options.output):
-        _check_frame(options.output, len(labels) * cameras.width, cameras.height)
-        return Drawing([options.output], facts | {"fps": options.fps or FPS}, draw)
-    return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
+    if options.output.suffix.lower() not in SUFFIXES:
+        return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
+    _check_frames(options.output, cameras.width, cameras.height, len(cameras))
+    return Drawing([options.output], facts | {"fps": options.fps}, draw)
 
 
-def _check_frame(output: Path, width: int, height: int) -> None:
-    """Raise SceneError if the frames of a video would take too much memory to encode."""
+def _check_frames(output: Path, width: int, height: int, count: int) -> None:
+    """Raise SceneError if the frames of a clip would take too much memory to encode."""
     if width * height > MAX_VIDEO_PIXELS:
         problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels a frame of a video, found {width} x {height}"
         raise SceneError(output, problem, FOLDER)
+    if output.suffix.lower() == GIF and count * width * height > MAX_GIF_PIXELS:
+        problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in all of a GIF, found {count} x {width} x {height}"
+        raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
 
 
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
@@ -195,9 +233,16 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
     cameras = cameras[ids]
     depth = viewing_depth(cameras if file is None else placed, group.scenes[0][1].means)
     if path is not None:
+        if path.kind == "turntable" and (turn := turned_degrees(cameras, depth)) < HALF_TURN:
+            group.notes.append(
+                f"the photos stand within {turn:.0f} degrees about the scene's middle, and a turntable also shows it"
+                " from where none is; --path orbit stays among them"
+            )
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            cameras = sample_path(path, cameras, depth, options.frames or max(PATH_FRAMES, least))
+            cameras = sample_path(
+                path, cameras, depth, options.frames or max(round(SECONDS[path.kind] * options.fps), least)
+            )
         except ValueError as error:
             raise UsageError(str(error)) from error
     return group, cameras, NEAR * depth, ids
@@ -210,32 +255,7 @@ def _place_file(file: Path, load: Loaded) -> Cameras:
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
-def prepare_superpixels(options: DrawOptions) -> Drawing:
-    """Prepare pictures of each photo's superpixels: borders, mean colours, and saliency."""
-    load, cut = load_files(options.files, opacity=options.opacity, hints=options.hints), options.segmentation
-    assert cut is not None
-    scene = load.pixel_scene()
-    ids, stems = options.choose(len(scene)), picture_stems(scene.names)
-    counts = [count_for(cut, scene.cameras.height, scene.cameras.width)] * len(ids)
-
-    def draw(_: int) -> Iterator[Picture]:
-        images = scene_pictures(scene)
-        images = images[ids] if len(ids) < len(images) else images  # all of them without a copy
-        groups = segment(images, cut)
-        counts[:] = groups.counts
-        for image, labels in zip(images, groups.labels, strict=True):
-            yield from (draw_borders(image, labels), draw_means(image, labels), draw_heat(saliency(image)))
-
-    facts = {"superpixels": counts, "options": vars(cut), "views": ids, "notes": load.notes}
-    return Drawing([options.output / f"{stems[i]}.{kind}.png" for i in ids for kind in KINDS], facts, draw)
-
-
-DRAWINGS = {
-    "panel": prepare_panel,
-    "views": prepare_pictures,
-    "path": prepare_frames,
-    "superpixels": prepare_superpixels,
-}
+DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_clip}
 
 
 def _lacks_cameras(files: SceneFiles) -> bool:
@@ -254,7 +274,8 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
-    return DrawnScenes(list(zip(paths, scenes, strict=True)), named if plys else list(notes[0]), load)
+    sizes = [file.info.file_bytes for file in (first, *plys)]
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, named if plys else list(notes[0]), load)
 
 
 def _with_views(load: Loaded) -> Loaded:
@@ -283,13 +304,17 @@ def picture_stems(names: Sequence[str]) -> list[str]:
     return stems
 
 
-def drawing_document(drawing: Drawing, output: Path, *, dry_run: bool) -> dict[str, Any]:
+def drawing_document(drawing: Drawing, output: Path) -> dict[str, Any]:
     """Return the report of a drawing as plain JSON types."""
-    head = {**document_head(), "dry_run": dry_run, "output": str(output)}
-    return {**head, "pictures": [str(path) for path in drawing.paths], **drawing.facts}
+    return {
+        **document_head(),
+        "output": str(output),
+        "pictures": [str(path) for path in drawing.paths],
+        **drawing.facts,
+    }
 
 
-def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, progress: Progress) -> dict[str, Any]:
+def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:
     """Draw the pictures and write them, making folders as needed; return facts known only after drawing."""
     total, fps = drawing.facts.get("frames", len(drawing.paths)), drawing.facts.get("fps")
 
@@ -298,10 +323,10 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, threads: int | None, pro
             yield picture
             progress("render", done, total)
 
-    with use_threads(threads) as at_once:
+    with use_threads() as at_once:
         pictures = count(drawing.draw(at_once))
         if fps is not None:
-            return {"encoding": write_video(drawing.paths[0], pictures, fps, overwrite=overwrite)}
+            return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
         for path, picture in zip(drawing.paths, pictures, strict=True):
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -322,7 +347,4 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         less_played = document["encoding"] != H264 and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
         return f"{line}, {document['encoding']}{hint}"
-    line = f"{len(document['pictures'])} picture(s) of {len(document['views'])} views"
-    if "superpixels" in document:
-        line += f", {min(document['superpixels'])} to {max(document['superpixels'])} superpixels per view"
-    return line
+    return f"{len(document['pictures'])} picture(s) of {len(document['views'])} views"

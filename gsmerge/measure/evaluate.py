@@ -229,11 +229,11 @@ def evaluate(
         named = {INPUT: inputs, **results} if options.own else results
         fogs = options.fog and bool(results)
         fog = measure_fog(inputs, results, scene.cameras, renderer.near, progress) if fogs else {}
-        num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count()
+        num_pictures, numbers = len(named) * sum(len(split.views) for split in splits.values()), count(1)
 
         def keep(name: str, kind: str, view: int, image: np.ndarray) -> None:
-            progress(f"evaluate: {name}", next(numbers), num_pictures)
             on_image(name, kind, view, image)
+            progress(f"evaluate: {name}", next(numbers), num_pictures)
 
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
         for name, gaussians in named.items():

@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.measure.evaluate import Evaluation, Pair, Quality, ResultScores
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE
-from gsmerge.report import csv_text, document_head, text_table
+from gsmerge.report import csv_text, document_head, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes
 
 Row = Sequence[str]
@@ -21,6 +21,7 @@ ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {"fog_near": "near fog", "fog_far": "far fog", "holes": "holes"}  # fields of Fog
+LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after")  # what a narrow terminal leaves out
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
 COVERED = "_covered"  # and over those that the input covers
 CSV_COLUMNS = (
@@ -36,18 +37,25 @@ def evaluation_document(
 
     ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
     null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other sizes
-    than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is true.
-    Within one schema version keys are only added.
+    than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is true,
+    ``lpips_views`` if LPIPS was measured on fewer views of some split. Within one schema version keys are only added.
     """
     return {
         **document_head(),
         "reference": evaluation.reference,
         **({"photo_side": evaluation.options.photo_side} if evaluation.options.photo_side else {}),
         **({"antialiased": True} if evaluation.options.antialiased else {}),
+        **({"lpips_views": evaluation.options.lpips_views} if _some_lpips(evaluation) else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         "notes": [*notes, *evaluation.notes],
     }
+
+
+def _some_lpips(evaluation: Evaluation) -> bool:
+    """Return whether LPIPS was measured on a part of the views."""
+    most = evaluation.options.lpips_views
+    return bool(evaluation.options.lpips and most and most < max(evaluation.num_views.values()))
 
 
 def _result(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -132,6 +140,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     )
     how = ", rendered antialiased" if document.get("antialiased") else ""
     how += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
+    how += f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else ""
     seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
     means = [(result["name"], split, mean) for result in results for split, mean in result["mean"].items()]
     yield (
@@ -200,15 +209,19 @@ def filled_tables(document: Mapping[str, Any]) -> Iterator[Table]:
             yield heading, [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
-def evaluation_lines(document: Mapping[str, Any]) -> list[str]:
-    """Write the tables of an evaluation as lines for a terminal."""
-    tables = filled_tables(document)
-    return [line for heading, head, rows in tables for line in (heading, *text_table([head, *rows], "  "))]
+def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) -> list[str]:
+    """Write the tables of an evaluation as lines for a terminal of so many ``columns``; None: of any width."""
+    lines = list[str]()
+    for heading, head, rows in filled_tables(document):
+        least = [head.index(name) for name in LEAST if name in head]
+        table = text_table([head, *rows], "  ", columns=columns, least=least)
+        lines += [*wrap_line(heading, columns, 2), *table]
+    return lines
 
 
 def evaluation_markdown(document: Mapping[str, Any]) -> str:
     """Write the tables and notes of an evaluation in Markdown."""
-    lines = [f"# {_plain(page_title(document))}", ""]
+    lines = [f"# {_plain(page_title(document))}", f"<!-- gsmerge {document['tool']['version']} -->", ""]
     for title, head, rows in filled_tables(document):
         lines += [f"## {title}", "", _line(head), _line(["---", *["---:"] * (len(head) - 1)]), *map(_line, rows), ""]
     lines += [f"- {_plain(note)}" for note in page_notes(document)]
@@ -216,7 +229,7 @@ def evaluation_markdown(document: Mapping[str, Any]) -> str:
 
 
 def page_title(document: Mapping[str, Any]) -> str:
-    """Make the title of a page: the scene's name and its results."""
+    """Make the title of a document: the scene's name and its results."""
     first, *others = document["results"]
     path = Path(first.get("path", first["name"]))
     return "/".join(path.parts[-2:]) + (": before and after" if others else "")

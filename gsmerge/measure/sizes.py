@@ -30,6 +30,27 @@ def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
     return zoom_cameras(cameras, side / long_side) if 0 < side < long_side else cameras
 
 
+def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
+    """Resize the cameras' images until they fill ``[height,width]``, and cut off what is beyond, evenly."""
+    wide, high = _filling_size(cameras.width, cameras.height, width, height)
+    resized = resize_cameras(cameras, wide, high)
+    Ks = resized.Ks.astype(np.float64)
+    Ks[:, :2, 2] -= (wide - width) // 2, (high - height) // 2
+    return replace(resized, Ks=Ks, width=width, height=height)
+
+
+def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize and cut a photo ``[h,w,3]`` as :func:`fill_cameras` does its camera."""
+    wide, high = _filling_size(photo.shape[1], photo.shape[0], width, height)
+    top, left = (high - height) // 2, (wide - width) // 2
+    return resize_photo(photo, wide, high)[top : top + height, left : left + width]
+
+
+def _filling_size(old_width: int, old_height: int, width: int, height: int) -> tuple[int, int]:
+    scale = max(width / old_width, height / old_height)
+    return max(width, round(scale * old_width)), max(height, round(scale * old_height))
+
+
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
     """Shrink photos and cameras together to at most ``side`` pixels on the longer side; 0: leave them."""
     cameras = shrink_cameras(views.cameras, side)

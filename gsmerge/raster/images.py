@@ -97,16 +97,17 @@ def render_in_turn(
     background: float | Sequence[float] = 0.0,
     *,
     at_once: int,
-    antialiased: bool = False,
     near: float = 0.01,
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    columns: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[np.ndarray]:
     """Yield the images ``[h,w,3]`` of :func:`render`, bit for bit, each changed pixel by pixel by ``convert``.
 
-    At most ``at_once`` images are in memory; large images are drawn and converted in bands.
+    At most ``at_once`` images are in memory; large images are drawn and converted in bands. Of each image at least
+    its ``columns`` of pixels, first and last + 1, are drawn; the background is in the others.
     """
     under = background_color(background)
-    tile_one = _tiler(gaussians, cameras, {"antialiased": antialiased, "near": near})
+    tile_one = _tiler(gaussians, cameras, {"near": near}, columns)
     lines, tall = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > tall:
         bands = [(first, min(first + tall, lines)) for first in range(0, lines, tall)]
@@ -120,12 +121,19 @@ def render_in_turn(
         yield from map(convert, draw_views(tile_one, shape, under, with_depths=False, first=first).images)
 
 
-def _tiler(gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any]) -> Callable[..., TiledView]:
+def _tiler(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: Mapping[str, Any],
+    columns: Sequence[tuple[int, int]] | None = None,
+) -> Callable[..., TiledView]:
     """Prepare the Gaussians for cameras, and return what tiles each view by its number, or a band of it."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)
+    spans = None if columns is None else [(left // TILE, -(-right // TILE)) for left, right in columns]  # of tiles
 
     def tile_one(view: int, band: tuple[int, int] | None = None) -> TiledView:
-        return tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, band=band, **options)
+        camera = viewmats[view], Ks[view], cameras.width, cameras.height
+        return tile_view(splats, *camera, band=band, columns=None if spans is None else spans[view], **options)
 
     return tile_one
 

@@ -254,6 +254,7 @@ def tile_view(
     keep: Array | None = None,
     tiles: Array | None = None,
     band: tuple[int, int] | None = None,
+    columns: tuple[int, int] | None = None,
 ) -> TiledView:
     """Project Gaussians into one view, sort them by depth and bin them into tiles.
 
@@ -262,7 +263,8 @@ def tile_view(
     ``antialiased`` lowers the opacity by what the dilation adds to a Gaussian (Mip-Splatting's
     2D filter). ``opacities [n]`` replace the Gaussians' own, where ``keep [n]`` is False they are
     left out, and only ``tiles [tile_height,tile_width]`` of 16 x 16 pixels have to be complete.
-    Of a ``band`` only these lines of tiles, first and last + 1, are tiled, as a picture of their own.
+    Of a ``band`` only these lines of tiles, first and last + 1, are tiled, as a picture of their own; of
+    ``columns`` only these columns of tiles, and nothing is in the others.
     The size of the result goes with what is visible, not with n. Raises ValueError if a size or a
     number is out of range.
     """
@@ -279,15 +281,17 @@ def tile_view(
     local[:3, 3] += matmul(local[:3, :3], splats.origin)
     camera = camera_numbers(local, K, width, height, eps2d, antialiased, near, far)
     tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
-    first, last = band or (0, tile_height)
-    if band is not None:
-        lines = np.arange(tile_height)[:, None]
-        tiles = ((first <= lines) & (lines < last)).repeat(tile_width, 1)
+    (first, last), (left, right) = band or (0, tile_height), columns or (0, tile_width)
+    is_part = band is not None or columns is not None
+    if is_part:
+        tiles = np.zeros((tile_height, tile_width), bool)
+        tiles[first:last, left:right] = True
     wanted = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
     with use_threads() as threads:
         ids = _visible(splats, opacities, keep, wanted, camera, threads)
         conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
-        if band is not None:
+        if is_part:
+            boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(first, last)
         order = depth_order(depths.view(np.uint32))
         flatten_ids, isect_offsets = _bin(order, boxes, conics, tile_height, tile_width, threads)

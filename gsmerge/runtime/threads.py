@@ -20,6 +20,9 @@ from typing import TypeVar
 
 import cv2
 
+from gsmerge.errors import UsageError
+
+THREADS = "GSMERGE_THREADS"  # of the environment: how many where nobody says so
 T = TypeVar("T")
 R = TypeVar("R")
 AT_ONCE = 12  # results of in_turn that are in memory together
@@ -70,7 +73,15 @@ _local, _libraries = _Local(), _Libraries()
 
 
 def available_threads() -> int:
-    """Return the number of processors available to this process."""
+    """Return the number in the environment's ``GSMERGE_THREADS``, else of the processors that this process may use.
+
+    UsageError if the variable holds no number.
+    """
+    text = os.environ.get(THREADS)
+    if text is not None:
+        if not text.isdecimal() or int(text) < 1:
+            raise UsageError(f"{THREADS}: expected a number from 1, got {text!r}")
+        return int(text)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

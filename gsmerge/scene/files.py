@@ -151,6 +151,11 @@ def _depths_cameras(path: Path) -> Path:
     return path.parent.parent / POSES if is_frame(path) else path
 
 
+def scene_title(ply: Path) -> str:
+    """Name a scene for a page: by its file, or by its folder where the file has the usual name."""
+    return ply.parent.absolute().name if ply.stem == "scene" else ply.stem
+
+
 def result_cameras(ply: Path) -> Path | None:
     """Find the cameras that ``compact`` wrote into or beside a result; None without them."""
     beside = viewer_cameras_path(ply)

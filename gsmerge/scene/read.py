@@ -130,12 +130,11 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place, each in a frame of its own, which are joined with it
-            in its frame (docs/guide/sharp.md).
+        *more: Other scenes of the same place, which are joined with it in its frame (docs/guide/sharp.md).
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
-        masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
-            the photos. Where a photo is transparent, it does not count either.
+        masks: Folder of images named as the photos, dark where a photo does not count; None: ``masks`` beside the
+            photos, and where these are transparent.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.

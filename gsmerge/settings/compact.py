@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
-from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of
+from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting, settings_of
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -59,7 +59,7 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
-    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/guide/baselines.md "
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/internals/plugins.md "
         "lists them.",
         "Packages add methods by entry points (`gsmerge.compaction.methods.Method`); for all but `gsmerge` the number "
         "of Gaussians has to be settled beforehand.", choices=method_names, metavar="NAME")  # fmt: skip
@@ -125,15 +125,8 @@ class CompactOptions(Settings):
 
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """Change settings by flat name (``k=2``), on top of a recipe's; raise ValueError for unknown names."""
-        all_settings, changes = flat_settings(CompactOptions), dict[str, Any]()
-        settings = {**RECIPES.get(str(settings.get("recipe")), {}), **settings}
-        for name, declared in settings_of(CompactOptions).items():
-            if declared.is_group:
-                chosen = {inner: settings[inner] for inner in flat_settings(declared.kind) if inner in settings}
-                changes[name] = replace(getattr(self, name), **chosen)
-            elif name in settings:
-                changes[name] = settings[name]
+        all_settings = flat_settings(CompactOptions)
         unknown = sorted(settings.keys() - all_settings.keys())
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(all_settings))}")
-        return replace(self, **changes)
+        return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})

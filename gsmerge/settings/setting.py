@@ -6,15 +6,16 @@ package loads neither NumPy nor torch, so that ``--help`` can read it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from inspect import cleandoc
 from math import inf
 from numbers import Integral, Real
 from operator import ge, gt, le, lt
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+T = TypeVar("T")
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
@@ -179,6 +180,18 @@ def flat_settings(options: type) -> dict[str, Setting]:
         if not declared.internal:
             flat |= flat_settings(declared.kind) if declared.is_group else {name: declared}
     return flat
+
+
+def change_settings(options: T, values: Mapping[str, Any]) -> T:
+    """Change settings by flat name, those of stages too."""
+    changes: dict[str, Any] = {}
+    for name, declared in settings_of(type(options)).items():
+        names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
+        chosen = {name: values[name] for name in names if name in values}
+        if chosen:
+            changes[name] = change_settings(getattr(options, name), chosen) if declared.is_group else values[name]
+    changed: T = replace(options, **changes)  # type: ignore[type-var]
+    return changed
 
 
 def join_words(words: Iterable[str]) -> str:

@@ -22,7 +22,7 @@ AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
 USUAL_K = 1  # what "auto" is unless there are reasons for more
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
 CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
 CROP_FILES = (".json", ".toml")  # endings of files that hold a crop, which the command line reads
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
@@ -218,15 +218,15 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 class Engine(Settings):
     """Place where the blocks of a scene are compacted; the result does not depend on it."""
 
-    name: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
-        "Ray cluster, gsmerge[ray].", name="engine", choices=("local", "ray"))  # fmt: skip
+    engine: str = setting("local", "Where scenes, or the blocks of one, are compacted. local: on this machine; ray: a "
+        "Ray cluster, gsmerge[ray].", choices=("local", "ray"))  # fmt: skip
     address: str | None = setting(None, "Address of the Ray cluster, such as auto or HOST:PORT.",
         shown="one of this machine")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.address is not None and self.name != "ray":
-            raise ValueError(f"address: expected engine ray, got {self.name}")
+        if self.address is not None and self.engine != "ray":
+            raise ValueError(f"address: expected engine ray, got {self.engine}")
 
 
 @dataclass(frozen=True)

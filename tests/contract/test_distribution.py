@@ -62,8 +62,8 @@ def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     assert packed(built / "source") - names == set()
     for name in (
-        "view/vendor/spark-three.js.gz",
-        "view/templates/view.html",
+        "pages/vendor/spark-three.js.gz",
+        "pages/templates/view.html",
         "networks/shipped.safetensors",
         "py.typed",
     ):

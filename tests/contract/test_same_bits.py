@@ -28,8 +28,9 @@ REFUSED = {
 }
 # What computes no result: pages and pictures for people, research.
 OTHERS = (
-    "view/",
+    "pages/",
     "research/",
+    "measure/clip.py",
     "measure/lpips.py",
     "measure/preview.py",
     "networks/tensors.py",

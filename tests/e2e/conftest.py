@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from shared import make_once
 from gsmerge.cli import main
 
 CHART_TARGETS = ("--targets", "{parent}/targets/transforms.json")
-CHART_FAST = ("--budgets", "1%,2%", "--fit", "none", "--proxy-views", "0", "--lpips", "none")
+CHART_FAST = ("--grid", "budget=1%,2%", "--set", "fit=none", "--set", "lpips=none")
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,9 @@ def compacted_scene(made_scene: Path, shared: Path) -> Path:
 
     def make(place: Path) -> None:
         place.mkdir()
-        words = ("compact", made_scene, "-o", place / "small.ply", "--report", place / "run.json", "-q")
-        assert main([str(word) for word in words]) == 0
+        words = ("compact", made_scene, "-o", place / "small.ply", "--json")
+        with open(place / "run.json", "w", encoding="utf-8") as report, redirect_stdout(report):
+            assert main([str(word) for word in words]) == 0
 
     return make_once(shared / "compacted", make)
 
@@ -64,7 +66,18 @@ def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
 
     def make(place: Path) -> None:
         scene = make_scene(place / "room", num_views=3, width=64, height=48)
-        words = ("chart", scene, "--output", place / "out", *CHART_TARGETS, *CHART_FAST, "--proxy-views", "1", "-q")
+        words = (
+            "lab",
+            "chart",
+            scene,
+            "-o",
+            place / "out",
+            *CHART_TARGETS,
+            *CHART_FAST,
+            "--set",
+            "proxy_views=1",
+            "-q",
+        )
         assert main([str(word) for word in words]) == 0
 
     return make_once(shared / "charted", make)
@@ -74,7 +87,9 @@ def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
 def server(smallest_scene: Path) -> Iterator[CommandServer]:
     """A process that has imported what the commands need."""
     ply = smallest_scene / "scene.ply"
-    with CommandServer([("compact", smallest_scene, "--dry-run"), ("check", ply), ("inspect", ply)]) as server:
+    with CommandServer(
+        [("compact", smallest_scene, "--dry-run"), ("inspect", ply), ("inspect", ply, smallest_scene)]
+    ) as server:
         yield server
 
 

@@ -69,7 +69,7 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
 def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
     small = tmp_path / "small.ply"
     run("compact", bare, "-o", small, "--effort", "draft", code=0)
-    quick = ("--superpixels", "40", "--checkpoint", "none")
+    quick = ("--set", "superpixels=40", "--set", "checkpoint=none")
     for words in (
         ("compact", bare, "--dry-run"), ("inspect", bare), ("render", bare, small, "-o", tmp_path / "p.png"),
         ("render", bare, "--path", "orbit", "--frames", "2", "-o", tmp_path / "frames"),
@@ -83,7 +83,7 @@ def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
     folder.mkdir(parents=True)
     shutil.copy(bare, folder)
     run("batch", tmp_path / "scenes", "-o", tmp_path / "out", "--effort", "draft", code=0)
-    run("check", bare, code=0)
+    run("inspect", bare, code=0)
 
 
 def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_path: Path, run: Any) -> None:

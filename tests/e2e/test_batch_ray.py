@@ -45,7 +45,7 @@ def strike():
     cluster.remove_node(other, allow_graceful=False)
 
 threading.Thread(target=strike, daemon=True).start()
-code = main(["batch", rooms, "--output", out, "--engine", "ray", "--address", cluster.address, *told])
+code = main(["batch", rooms, "--output", out, "--engine", "ray", "--set", f"address={cluster.address}", *told])
 print("nodes:", len(cluster.list_all_nodes()))
 cluster.shutdown()
 sys.exit(code)
@@ -67,7 +67,7 @@ def test_a_lost_node_is_survived(rooms: Path, tmp_path: Path, root: Path, undist
 
 @needs_ray
 def test_no_cluster_at_the_address_is_one_line(rooms: Path, tmp_path: Path) -> None:
-    process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--address", "127.0.0.1:1", "-q")
+    process = start(rooms, "--output", tmp_path / "out", *FAST, "--engine", "ray", "--set", "address=127.0.0.1:1", "-q")
     errors = process.communicate()[1]
     assert process.returncode == 3
     assert names(errors, "127.0.0.1:1", "Ray")

@@ -38,26 +38,26 @@ def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(IN_PACKAGE["shipped"], folder / "networks.safetensors")
     cameras = gsmerge.read_cameras(folder / "transforms.json")
     np.savez(folder / "views.npz", extrinsics=cameras.viewmats[:, :3], intrinsics=cameras.Ks)
-    small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+    small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
     assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
     return folder
 
 
 def test_sound_files(sound: Path, run: Run) -> None:
     before = listing(sound)
-    done = run("check", *(sound / name for name in (*FORMATS, *OTHERS)), code=0)
+    done = run("inspect", *(sound / name for name in (*FORMATS, *OTHERS)), code=0)
     assert [line.split(": ")[0] for line in done.out.splitlines()] == [
         f"ok     {sound / name}" for name in (*FORMATS, *OTHERS)
     ]
     assert "scene.ply: 7,680 Gaussians, 17-column export" in done.out
     assert ", state, " in done.out
     assert "views.npz: 5 cameras" in done.out
-    assert run("check", sound / "a.spz", "-q", code=0).out == ""
+    assert run("inspect", sound / "a.spz", "-q", code=0).out == ""
     assert listing(sound) == before
 
 
 def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
-    done = run("check", sound / "scene.ply", tmp_path / "none.spz", "--json")
+    done = run("inspect", sound / "scene.ply", tmp_path / "none.spz", "--json")
     assert done.code == 3
     document = json.loads(done.out)
     first, second = document["files"]
@@ -155,8 +155,8 @@ def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
     name, spoil, place, *found = WRONG[case]
     path = Path(shutil.copy(sound / name, tmp_path / name))
     spoil(path)
-    assert_refused(run("check", path, "-q"), 3, f"{path}{place and ': '}{place}", *found)
-    assert run("check", path).out.startswith(f"wrong  {path}: ")
+    assert_refused(run("inspect", path, "-q"), 3, f"{path}{place and ': '}{place}", *found)
+    assert run("inspect", path).out.startswith(f"wrong  {path}: ")
 
 
 def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) -> None:
@@ -164,5 +164,5 @@ def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) ->
     header = entry(path)[1]
     del header["checksums"]
     with_text(json.dumps(header))(path)
-    done = run("check", path, code=0)
+    done = run("inspect", path, code=0)
     assert says(done.err, f"note: {path}", "checksums")

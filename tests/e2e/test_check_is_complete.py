@@ -78,7 +78,7 @@ def colmap(suffix: str) -> Callable[[Path], None]:
 def extended(*batches: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
         scenes = [str(folder / batch) for batch in batches]
-        small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+        small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
         assert main(["extend", str(folder / "a.gsm"), *scenes, *small]) == 0
 
     return make
@@ -144,7 +144,7 @@ def test_what_a_command_refuses_check_refuses(
     kind.make(folder)
     words = placed(kind.words, folder)
     assert server.run(words, LIMITS).code == 0
-    assert server.run(["check", words[-1]], LIMITS).code == 0
+    assert server.run(["inspect", words[-1]], LIMITS).code == 0
     num_refused = 0
     for _ in range(count):
         path = rng.choice(sorted(folder.glob(kind.pattern)))
@@ -154,7 +154,7 @@ def test_what_a_command_refuses_check_refuses(
         assert refusal.code in (0, 3), refusal
         if refusal.code == 3:
             num_refused += 1
-            refused_by_check(refusal, server.run(["check", words[-1]], LIMITS))
+            refused_by_check(refusal, server.run(["inspect", words[-1]], LIMITS))
         path.write_bytes(sound)
     assert num_refused or count < MANY
 

@@ -114,7 +114,7 @@ def test_failures_while_writing_leave_nothing(
         Path(path).write_bytes(b"ply\n")
         raise OSError(28, "No space left on device")
 
-    quick, state = ("--superpixels", 40), scene_copy / "kept.gsm"
+    quick, state = ("--set", "superpixels=40"), scene_copy / "kept.gsm"
     words, name = {
         "compact": (("compact", scene_copy, *quick, "--fit", "none"), "scene.compact.ply"),
         "extend": (("extend", scene_copy / "new.gsm", scene_copy, *quick), "new.gsm"),
@@ -132,11 +132,11 @@ def test_failures_while_writing_leave_nothing(
     assert listing(scene_copy) == before
 
 
-@pytest.mark.parametrize("more", [("--report", "none/report.json"), ("--levels", 2), ("--report", "report.json")])
+@pytest.mark.parametrize("more", [("--levels", 2), ()])
 def test_several_outputs_are_all_there_or_none(
     more: tuple[object, ...], scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A report that cannot be written, a disk that is full at the second level, or at the end."""
+    """A disk that is full at the second level, or at the end."""
     from gsmerge.io import write_gaussians
 
     calls = itertools.count()
@@ -153,7 +153,7 @@ def test_several_outputs_are_all_there_or_none(
     monkeypatch.setattr("gsmerge.compaction.files.to_json", no_room)
     before = listing(scene_copy)
     where = [scene_copy / word if isinstance(word, str) and word.endswith("json") else word for word in more]
-    quick = ("--superpixels", 40, "--fit", "none")
+    quick = ("--set", "superpixels=40", "--fit", "none")
     outcome = run("compact", scene_copy, "-o", scene_copy / "out.ply", *quick, *where, "--quiet")
     assert (outcome.code, outcome.err.count("\n")) == (3, 1), outcome.err
     assert listing(scene_copy) == before
@@ -241,7 +241,7 @@ def in_shell(command: str, cwd: Path, root: Path, **environment: str) -> subproc
     return subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=cwd, env=values, check=False)
 
 
-QUICK = "--superpixels 40 --fit none --checkpoint none"
+QUICK = "--set superpixels=40 --fit none --set checkpoint=none"
 ODD_PLACES = {
     "output is full": (f"$G compact . -o a.ply {QUICK} --json -q >/dev/full", 3, "printed"),
     "help is full": ("$G --help >/dev/full", 3, "printed"),

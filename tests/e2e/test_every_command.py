@@ -19,8 +19,8 @@ from .conftest import Run, assert_refused, listing
 
 VIEWS = 5
 WRITERS: dict[str, tuple[str, ...]] = {
-    "compact": ("small.ply", "--superpixels", "100", "--fit", "none"),
-    "render --as superpixels": ("overlays", "--superpixels", "100"),
+    "compact": ("small.ply", "--set", "superpixels=100", "--fit", "none"),
+    "render --as superpixels": ("overlays", "--set", "superpixels=100"),
     "render --as views": ("renders",),
     "render --as panel": ("sheet.png", "--views", "1"),
     "render --path orbit": ("walk.mp4", "--frames", "2"),
@@ -29,7 +29,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
 }
 OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
     "compact a state": ("decoded.ply",),
-    "extend": ("state.gsm", "--superpixels", "100"),
+    "extend": ("state.gsm", "--set", "superpixels=100"),
     "generate": ("made", "--scenes", "1", "--views", "3", "--size", "48x36"),
 }
 COMMANDS = ("inspect", "evaluate", *WRITERS)
@@ -52,13 +52,13 @@ def call(command: str, scene: Path) -> list[object]:
     output, *rest = (WRITERS | OTHERS)[command]
     if command == "compact a state":
         if not (scene / "kept.gsm").exists():
-            small = ["--superpixels", "60", "--set", "replay=0", "--quiet"]
+            small = ["--set", "superpixels=60", "--set", "replay=0", "--quiet"]
             assert main(["extend", str(scene / "kept.gsm"), str(scene), *small]) == 0
         return ["compact", scene / "kept.gsm", "-o", scene / output]
     if command == "extend":
         return [command, scene / output, scene, *rest]
     if command == "generate":
-        return [command, "-o", scene / output, *rest]
+        return ["lab", command, "-o", scene / output, *rest]
     more = [scene / "scene.ply", *targets] if command == "view" else []
     return [*command.split(), scene, *more, "-o", scene / output, *rest]
 
@@ -94,7 +94,7 @@ def test_quiet_says_nothing(command: str, small_copy: Path, run: Run) -> None:
     assert (outcome.code, outcome.out, outcome.err) == (0, "", "")
 
 
-@pytest.mark.parametrize("command", [*WRITERS, "compact a state", "generate"])
+@pytest.mark.parametrize("command", [*WRITERS, "compact a state"])
 def test_a_dry_run_writes_nothing(command: str, small_copy: Path, run: Run) -> None:
     words = call(command, small_copy)
     before = listing(small_copy)
@@ -110,7 +110,7 @@ def test_a_dry_run_writes_nothing(command: str, small_copy: Path, run: Run) -> N
     [(("--budget", "auto"), 3072), (("--budget", "2%"), 614), (("--budget", "20KB"), 287)],
 )
 def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, made_scene: Path, run: Run) -> None:
-    arguments = ["compact", made_scene, "--superpixels", 200, *wish, "--dry-run"]
+    arguments = ["compact", made_scene, "--set", "superpixels=200", *wish, "--dry-run"]
     plan = json.loads(run(*arguments, "--json").out)["compact"]
     assert plan["num_gaussians"] == most
     assert plan["superpixels_per_view"] is None

@@ -31,7 +31,7 @@ from gsmerge.states.state_file import load_state
 
 from .conftest import Outcome, Run, assert_refused, listing
 
-SMALL = ("--superpixels", 60, "--checkpoint", "none")
+SMALL = ("--set", "superpixels=60", "--set", "checkpoint=none")
 PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
@@ -70,7 +70,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
-    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL, "--threads", 1)
+    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
     assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
     first, second = outcome.out.splitlines()
     assert "state.gsm: batch 1, 3 views, 4,608 Gaussians ->" in first
@@ -104,7 +104,19 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
 
 def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
-    said = (*SMALL, "--set", "fit_colors=false", "--set", "tolerance=0", "--max-k", 2, "--set", "replay=2", "--seed", 5)
+    said = (
+        *SMALL,
+        "--set",
+        "fit_colors=false",
+        "--set",
+        "tolerance=0",
+        "--set",
+        "max_k=2",
+        "--set",
+        "replay=2",
+        "--set",
+        "seed=5",
+    )
     assert run("extend", state, walks[0], *said).code == 0
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]
@@ -170,7 +182,9 @@ def test_a_dry_run_knows_the_most(states: list[Path], tmp_path: Path, run: Run) 
 def latents(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The state after two batches with the paper's networks. Read only."""
     path = tmp_path_factory.mktemp("latents") / "state.gsm"
-    assert main(["extend", str(path), str(walks[0]), "--recipe", "paper", "--superpixels", "60", "--quiet"]) == 0
+    assert (
+        main(["extend", str(path), str(walks[0]), "--set", "recipe=paper", "--set", "superpixels=60", "--quiet"]) == 0
+    )
     assert main(["extend", str(path), str(walks[1]), "--quiet"]) == 0
     return path
 
@@ -184,7 +198,7 @@ def test_the_heads_run_when_they_are_asked(latents: Path, tmp_path: Path, run: R
         assert json.loads(outcome.out)["fit"] is None  # no photos are stored
         counts.append(len(gsmerge.read_ply(tmp_path / f"{k}.ply").gaussians))
     assert counts[0] < counts[1] < counts[2] <= 4 * len(state)
-    assert run("check", latents, code=0).out.startswith("ok ")
+    assert run("inspect", latents, code=0).out.startswith("ok ")
 
 
 def test_the_papers_online_experiment(
@@ -219,7 +233,7 @@ def test_the_papers_online_experiment(
 
 def test_networks_of_another_state(latents: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = Path(shutil.copy(latents, tmp_path / "state.gsm"))
-    outcome = run("extend", state, walks[0], "--checkpoint", "shipped")
+    outcome = run("extend", state, walks[0], "--set", "checkpoint=shipped")
     assert_refused(outcome, 2, "checkpoint shipped", "(paper)", "state")
     assert state.read_bytes() == latents.read_bytes()
 

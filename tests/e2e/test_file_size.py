@@ -20,11 +20,11 @@ def file_bytes(folder: Path) -> int:
 
 @sweep("name", FORMATS, often=3)
 def test_compact_meets_it(name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
-    out, report = tmp_path / "out", tmp_path / "report.json"
-    run("compact", made_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--report", report, code=0)
+    out = tmp_path / "out"
+    done = run("compact", made_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--json", code=0)
     size = 40_000
     assert 0.97 * size <= file_bytes(out) <= size
-    document = json.loads(report.read_text())
+    document = json.loads(done.out)
     levels = [document["output"], *document["levels"]] if name == "lod-meta.json" else [document["output"]]
     assert sum(level["bytes"] for level in levels) == file_bytes(out)
 
@@ -50,7 +50,7 @@ def test_harmonics_count(tmp_path: Path, made_scene: Path, run: Run) -> None:
 
 @sweep(("name", "size"), [("a.spz", 24_000), ("a.ply", 27_000), ("a.sog", 20_000)])
 def test_states_and_batch_meet_it(name: str, size: int, made_scene: Path, tmp_path: Path, run: Run) -> None:
-    few, bare = ("--superpixels", "2%", "--checkpoint", "none", "-q"), ("--fit", "none", "-q")
+    few, bare = ("--set", "superpixels=2%", "--set", "checkpoint=none", "-q"), ("--fit", "none", "-q")
     run("extend", tmp_path / "a.gsm", made_scene, *few, code=0)
     run("compact", tmp_path / "a.gsm", "-o", tmp_path / "out" / name, "--budget", f"{size}B", *bare, code=0)
     assert 0.97 * size <= file_bytes(tmp_path / "out") <= size

@@ -101,7 +101,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, se
     assert names(outcome.err, *case.says), outcome.err
     if outcome.code == 3 and name not in FOR_OTHER_REASONS and not OPTIONS & {*arguments}:
         files = [argument for argument in arguments if argument != "--cameras"]
-        check = server.run(["check", "--quiet", "--", *files], limits(num_bytes))
+        check = server.run(["inspect", "--quiet", "--", *files], limits(num_bytes))
         within_budget(check, num_bytes)
         refused_by_check(outcome, check)
 

@@ -41,7 +41,9 @@ def test_every_method_writes_a_ply(
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
     out, settings = tmp_path / "small.ply", ["--set", "fit_steps=8"] if method == "unmerged-fit" else []
-    said = run("compact", made_scene, "-o", out, "--method", method, "--budget", 400, *settings, "--json", code=0)
+    said = run(
+        "compact", made_scene, "-o", out, "--set", f"method={method}", "--budget", 400, *settings, "--json", code=0
+    )
     document, total = json.loads(said.out), 5 * 96 * 64
     count = len(read_ply(out).gaussians)
     assert document["options"]["method"] == method
@@ -65,7 +67,7 @@ def test_the_program_may_be_on_the_path(
     monkeypatch.delenv("GSMERGE_SPLAT_TRANSFORM", raising=False)
     monkeypatch.setenv("PATH", str(program(tmp_path, FAKE).parent))
     out = tmp_path / "small.ply"
-    said = run("compact", made_scene, "-o", out, "--method", "splat-transform", "--budget", 50, "--json", code=0)
+    said = run("compact", made_scene, "-o", out, "--set", "method=splat-transform", "--budget", 50, "--json", code=0)
     assert len(read_ply(out).gaussians) == 50
     assert "reduce" in json.loads(said.out)["seconds"]
 
@@ -77,7 +79,7 @@ def test_a_missing_program_is_one_line(
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
     before = listing(small_copy)
-    said = run("compact", small_copy, "--method", "splat-transform")
+    said = run("compact", small_copy, "--set", "method=splat-transform")
     found = f"GSMERGE_SPLAT_TRANSFORM={named}" if named else "GSMERGE_SPLAT_TRANSFORM"
     assert_refused(said, 2, "method splat-transform", found, "npm install -g @playcanvas/splat-transform")
     assert listing(small_copy) == before
@@ -92,13 +94,13 @@ def test_a_failing_program_is_one_line(
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, text)))
     before = listing(small_copy)
-    assert_refused(run("compact", small_copy, "--method", "splat-transform", "--quiet"), 1, "", found)
+    assert_refused(run("compact", small_copy, "--set", "method=splat-transform", "--quiet"), 1, "", found)
     assert listing(small_copy) == before
 
 
 def test_missing_photos_are_one_line(small_copy: Path, run: Run) -> None:
     shutil.rmtree(small_copy / "images")
-    said = run("compact", small_copy, "--method", "unmerged-fit", "--hint", "order=none", "--quiet")
+    said = run("compact", small_copy, "--set", "method=unmerged-fit", "--hint", "order=none", "--quiet")
     assert_refused(said, 2, "method unmerged-fit", "photos", "--images")
 
 
@@ -107,10 +109,10 @@ def test_a_plan_names_the_method(
     method: str, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", str(program(tmp_path, FAKE)))
-    said = run("compact", small_scene, "--method", method, "--dry-run", "--budget", 400, code=0)
+    said = run("compact", small_scene, "--set", f"method={method}", "--dry-run", "--budget", 400, code=0)
     assert (f"method     {method}; fit" in said.out) == (method != "gsmerge")
     assert ("merging" in said.out) == (method == "gsmerge")
-    document = json.loads(run("compact", small_scene, "--method", method, "--dry-run", "--json").out)
+    document = json.loads(run("compact", small_scene, "--set", f"method={method}", "--dry-run", "--json").out)
     assert document["compact"]["method"] == method
     assert document["compact"]["seconds"] > 0
     assert document["notes"] == []

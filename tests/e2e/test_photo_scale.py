@@ -53,7 +53,7 @@ def test_larger_photos_make_the_result_sharper(
     documents, values = [], []
     for name, options in (("own", ("--set", "photo_scale=1")), ("large", ())):
         out = tmp_path / f"{name}.ply"
-        done = run("compact", folder, "-o", out, "--superpixels", SUPERPIXELS, "--json", *options, code=0)
+        done = run("compact", folder, "-o", out, "--set", f"superpixels={SUPERPIXELS}", "--json", *options, code=0)
         documents.append(json.loads(done.out))
         values.append(scores(folder, out))
     own, large = documents

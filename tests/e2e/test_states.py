@@ -19,7 +19,7 @@ import gsmerge
 
 from .conftest import Run, assert_refused
 
-SMALL = ("--superpixels", 120)
+SMALL = ("--set", "superpixels=120")
 
 
 PLAIN = ("--fit", "none")
@@ -42,7 +42,7 @@ def test_it_is_compacted_as_its_scene_is(recipe: bool, state: Path, made_scene: 
     if recipe:
         options = replace(TINY, outputs="absolute", geometry="carried", merger_start="first", group_numbers=False)
         checkpoint = written(tmp_path / "small.safetensors", noisy(options, 0.05))
-        wish, state = ("--recipe", "paper", "--checkpoint", checkpoint), tmp_path / "scene.gsm"
+        wish, state = ("--set", "recipe=paper", "--set", f"checkpoint={checkpoint}"), tmp_path / "scene.gsm"
         assert run("extend", state, made_scene, *SMALL, *wish).code == 0
     sizes = set[int]()
     for k in (1, 2, 4, "mixed"):
@@ -64,7 +64,13 @@ def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, 
 
 @sweep(
     "wish",
-    [("--budget", 700, "--k", 2), ("--k", "mixed"), ("--budget", "auto"), ("--recipe", "paper"), ("--budget", "3%")],
+    [
+        ("--budget", 700, "--k", 2),
+        ("--k", "mixed"),
+        ("--budget", "auto"),
+        ("--set", "recipe=paper"),
+        ("--budget", "3%"),
+    ],
     ids=str,
     often=3,
 )
@@ -145,7 +151,7 @@ def test_comments_of_the_source_are_copied_as_by_compact(state: Path, tmp_path: 
     with_about(source={"comments": [*long, *cameras, "SplatRenderMode: mip"]})(path)
     run("compact", path, *PLAIN, "-o", out, code=0)
     assert gsmerge.read_ply(out).info.comments == ("gsmerge result", "SplatRenderMode: mip")
-    run("check", out, code=0)
+    run("inspect", out, code=0)
 
 
 @sweep("ending", [".compressed.ply", ".spz", ".sog", ".splat", ".glb"], often=2)

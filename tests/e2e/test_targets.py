@@ -26,7 +26,18 @@ def scene() -> Scene:
 def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "chain.ply"
     said = run(
-        "compact", made_scene, "-o", out, "--levels", 3, "--set", "fit_steps=20", "--superpixels", 300, "--json", code=0
+        "compact",
+        made_scene,
+        "-o",
+        out,
+        "--levels",
+        3,
+        "--set",
+        "fit_steps=20",
+        "--set",
+        "superpixels=300",
+        "--json",
+        code=0,
     )
     document = json.loads(said.out)
     paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]

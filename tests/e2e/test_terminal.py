@@ -72,7 +72,7 @@ def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[
 
 def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
-    code, output = in_terminal("compact", small_copy, "-o", out, "--superpixels", 200, "--set", "fit_steps=20")
+    code, output = in_terminal("compact", small_copy, "-o", out, "--set", "superpixels=200", "--set", "fit_steps=20")
     lines = screen(output)
     assert code == 0
     first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
@@ -88,7 +88,16 @@ def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("foreground")
 def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
-    words = ("compact", small_copy, "-o", tmp_path / "small.ply", "--superpixels", 200, "--set", "fit_steps=100000")
+    words = (
+        "compact",
+        small_copy,
+        "-o",
+        tmp_path / "small.ply",
+        "--set",
+        "superpixels=200",
+        "--set",
+        "fit_steps=100000",
+    )
     code, output = in_terminal(*words, interrupt_at=b"photos")
     assert code == 130
     lines = screen(output)
@@ -125,7 +134,7 @@ def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_copy: Path, tmp_pa
 
 def test_a_compact_scene_is_known_again(small_copy: Path, tmp_path: Path, run: Run) -> None:
     out, again = tmp_path / "small.ply", tmp_path / "smaller.ply"
-    words = ("--fit", "none", "--superpixels", 200)
+    words = ("--fit", "none", "--set", "superpixels=200")
     first = run("compact", small_copy, "-o", out, *words)
     assert "already" not in first.err
     views = ("--cameras", small_copy / "transforms.json", "--images", small_copy / "images")

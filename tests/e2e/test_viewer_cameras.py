@@ -18,7 +18,7 @@ import gsmerge
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 
 Run = Callable[..., Any]
-QUICK = ("--superpixels", 40, "--fit", "none", "--checkpoint", "none")
+QUICK = ("--set", "superpixels=40", "--fit", "none", "--set", "checkpoint=none")
 
 
 def test_the_views_are_written_and_named(small_copy: Path, run: Run) -> None:

@@ -16,8 +16,12 @@ from gsmerge.facts.row_colors import NO_PHOTOS, ROW_COLORS
 
 from .conftest import Run
 
-QUICK = ("--superpixels", 200, "--set", "fit_steps=40", "--threads", 1)
-UNFITTED = [("--fit", "none"), ("--recipe", "paper"), ("--blocks", 2)]  # of blocks, each block says how it was
+QUICK = ("--set", "superpixels=200", "--set", "fit_steps=40", "--threads", 1)
+UNFITTED = [
+    ("--fit", "none"),
+    ("--set", "recipe=paper"),
+    ("--set", "blocks=2"),
+]  # of blocks, each block says how it was
 CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours that are the photos'
 
 
@@ -33,9 +37,9 @@ def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     "options",
     [
         ("--effort", "draft"), ("--effort", "fast", "--k", 2), ("--fit", "none"), ("--budget", "5%"),
-        ("--budget", "20KB"), ("--budget", "auto"), ("--quality", "15dB"), ("--quality", "-1dB"), ("--blocks", 2),
-        ("--recipe", "paper"), ("--drop", "sky"), ("--exposure", "per-photo"), ("--set", "poses=free"),
-        ("--method", "unmerged-fit"), ("--levels", 2),
+        ("--budget", "20KB"), ("--budget", "auto"), ("--quality", "15dB"), ("--quality", "-1dB"), ("--set", "blocks=2"),
+        ("--set", "recipe=paper"), ("--drop", "sky"), ("--set", "exposure=per-photo"), ("--set", "poses=free"),
+        ("--set", "method=unmerged-fit"), ("--levels", 2),
     ],
     ids=lambda options: " ".join(map(str, options)), often=4)  # fmt: skip
 def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: Path, run: Run) -> None:
@@ -62,9 +66,9 @@ def test_as_good_as_with_photos(
 
 
 def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
-    out, report = tmp_path / "small.ply", tmp_path / "report.json"
-    said = run("compact", bare, "-o", out, *QUICK, "--report", report, code=0)
-    psnr = json.loads(report.read_text())["psnr_input_views"]
+    out = tmp_path / "small.ply"
+    psnr = json.loads(run("compact", bare, "-o", out, *QUICK, "--json", code=0).out)["psnr_input_views"]
+    said = run("compact", bare, "-o", out, *QUICK, "--overwrite", code=0)
     assert psnr["after"] > psnr["before"] + 1
     assert f"dB against {ROW_COLORS}" in said.out
     assert NO_PHOTOS in said.err
@@ -79,7 +83,7 @@ def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_pa
 
 def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
     state, out = tmp_path / "state.gsm", tmp_path / "small.ply"
-    run("extend", state, bare, "--superpixels", 200, code=0)
+    run("extend", state, bare, "--set", "superpixels=200", code=0)
     document = json.loads(run("compact", state, "-o", out, "--json", code=0).out)
     assert document["fit"]["method"] == "full"
 

@@ -21,10 +21,10 @@ from gsmerge.errors import TORCH_INSTALL
 from gsmerge.measure import lpips
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
-FEW = ("--superpixels", "60")
+FEW = ("--set", "superpixels=60")
 COMMANDS = {
     "compact": ("compact", "scene", *FEW, "-o", "new.ply"),
-    "compact with networks": ("compact", "scene", *FEW, "--recipe", "paper", "-o", "new.ply"),
+    "compact with networks": ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"),
     "compact to a curve": ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.ply"),
     "batch": ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
     "compact a state": ("compact", "scene.gsm", "-o", "new.ply"),
@@ -33,8 +33,8 @@ COMMANDS = {
     "view": ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
     "evaluate": ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.html"),
     "render": ("render", "scene", "small.ply", "-o", "new.png"),
-    "chart": ("chart", "scene", "--budgets", "5%", "--fit", "none", "--proxy-views", "1", "-o", "new"),
-    "generate": ("generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
+    "chart": ("lab", "chart", "scene", "--grid", "budget=5%", "--set", "fit=none", "-o", "new"),
+    "generate": ("lab", "generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
 }
 OFTEN = ("compact with networks",)  # the others are in the sweep
 
@@ -118,7 +118,7 @@ def test_lpips_needs_no_torch(call: Call, tmp_path: Path) -> None:
 
 
 def test_training_says_how_to_install_it(call: Call) -> None:
-    done = call("-m", "gsmerge", "train", "--data", "scene", "-o", "run")
+    done = call("-m", "gsmerge", "lab", "train", "--data", "scene", "-o", "run")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert TORCH_INSTALL in done.stderr
 

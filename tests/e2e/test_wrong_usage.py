@@ -18,12 +18,19 @@ from .conftest import Run, assert_refused, listing
 # without photos: the place that the error line names, none for some, and values in it, with * between them
 USAGE = {
     "compact room --k 9": "k*9",
-    "compact room --superpixels 1537": "superpixels*1536*1537",
-    "compact room --superpixels 0%": "superpixels*'0%'",
+    "compact room --set superpixels=1537": "superpixels*1536*1537",
+    "compact room --set superpixels=0%": "superpixels*'0%'",
     "compact room --set segmentation=magic": "segmentation*rdseg*'magic'",
     "compact room --set match=magic": "--set match*overlap*'magic'",
     "compact room --magic": "*--magic",
-    "compact room --set pose=free": "--set pose*unknown*poses*docs/reference/settings.md",
+    "compact room --up y": "*--up*gsmerge convert",
+    "compact room --report a.json": "*--report*--json",
+    "compact room --superpixels 3%": "*--superpixels*--set superpixels=VALUE",
+    "inspect room --seed 1": "*--seed*GSMERGE_SEED",
+    "inspect room alone.ply --cameras room": "--cameras and --images*one scene",
+    "chart room": "*chart*gsmerge lab chart",
+    "check room": "*check*gsmerge inspect",
+    "compact room --set pose=free": "--set pose*unknown*poses*--set help",
     "compact room --set poses": "--set*NAME=VALUE*'poses'",
     "compact room --set overlap=much": "--set overlap*'much'",
     "compact room --k 2 --set k=2": "--set k*--k too",
@@ -36,21 +43,19 @@ USAGE = {
     "compact room -o a.sog --set spz_version=4": "spz_version 4*.spz*.sog",
     "compact room --set photo_scale=0.5": "photo_scale*0.5",
     "compact room --set photo_scale=small": "--set photo_scale*'small'",
-    "compact room --checkpoint none --set require_checkpoint=true": 'require_checkpoint*"none"',
-    "compact room --method magic": "--method*'magic'*'voxel'",
-    "compact room --method voxel --budget auto": "method voxel*budget auto",
-    "compact room --method voxel --levels 2": "method voxel*levels",
-    "compact room --method voxel --quality 20dB": "method voxel*quality 20dB",
-    "compact room --method blocks --hint order=none": "method blocks*unaligned*--method",
-    "compact alone.ply --hint order=none --save-cameras a.json": "--save-cameras a.json*cameras*none",
+    "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
+    "compact room --set method=magic": "method*voxel*'magic'",
+    "compact room --set method=voxel --budget auto": "method voxel*budget auto",
+    "compact room --set method=voxel --levels 2": "method voxel*levels",
+    "compact room --set method=voxel --quality 20dB": "method voxel*quality 20dB",
+    "compact room --set method=blocks --hint order=none": "method blocks*unaligned*method",
     "compact room --budget 0.02": "budget*'0.02'*\"2%\"",
     "compact room --ratio 0.1": "*--ratio*--budget*--k",
     "evaluate room --ratio 0.1": "*--ratio",
     "compact room out.ply": "out.ply*-o",
-    "inspect room out.ply": "*(out.ply)",
     "compress room": "*'compress'*'compact'",
     "metrics room": "*'metrics'*'evaluate'",
-    "batch room -o out --fit none --quality 30": "quality*'30'",
+    "batch room -o out --set fit=none --quality 30": "quality*'30'",
     "batch room -o out --set method=voxel --budget auto": "method voxel*budget auto",
     "batch room -o out --set require_checkpoint=true --set checkpoint=none": 'require_checkpoint*"none"',
     "batch room -o out --jobs many": "--jobs*auto*'many'",
@@ -79,9 +84,7 @@ USAGE = {
     "compact room.gsm room": "room.gsm*alone*2",
     "compact room room.gsm": "room.gsm*alone*2",
     "compact room.gsm --cameras room/transforms.json": "--cameras*room.gsm",
-    "compact room.gsm --superpixels 3%": "--superpixels*room.gsm",
     "compact room.gsm --set superpixels=3%": "--set superpixels*unknown",
-    "compact room.gsm --save-cameras a.json": "--save-cameras*room.gsm",
     "compact room.gsm --strict": "--strict*room.gsm",
     "compact state.gsm --k 8": "k*1 to 4*8",
     "compact state.gsm --k 2 --budget 900": "*k*budget*both",
@@ -90,10 +93,10 @@ USAGE = {
     "extend state.gsm": "*'SCENE'",
     "extend state.gsm room --fit full": "*--fit*fit=VALUE",
     "extend state.gsm room --set tolerance=2": "tolerance*2",
-    "extend state.gsm room --max-k 9": "--max-k*8",
+    "extend state.gsm room --set max_k=9": "max_k*8",
     "extend state.gsm room --set replay=-1": "replay*-1",
-    "extend state.gsm room --superpixels 0%": "superpixels*'0%'",
-    "extend state.gsm room --budget many": "budget*'many'",
+    "extend state.gsm room --set superpixels=0%": "superpixels*'0%'",
+    "extend state.gsm room --set budget=many": "budget*'many'",
     "extend state.gsm room --hint exporter=nobody": "exporter*'nobody'",
     "extend room/scene.ply room": "room/scene.ply*input",
     "extend state.gsm room room --cameras a --images b": "--cameras and --images*several",
@@ -127,27 +130,26 @@ USAGE = {
     "evaluate room --lpips none -o a.md -o a.md": "a.md*twice",
     "evaluate room alone.ply alone.ply": "*alone.ply*twice",
     "evaluate room --targets room/targets -o room/targets/transforms.json --overwrite": "targets/transforms.json*input",
-    "stress room --targets room/targets --report room/targets/transforms.json --overwrite": "transforms.json*input",
-    "stress room --cases hail": "cases*unchanged*'hail'",
-    "chart -o out": "*scenes*--draw-only",
-    "chart -o out --draw-only --dry-run": "--dry-run*--draw-only",
-    "chart -o out --draw-only": "out*finished*none",
-    "chart -o out room --k 9": "k*1 to 8*9",
-    "chart -o out room --views 0": "views*0",
-    "chart -o out room --targets {{room}}/none.json": "*{{scene}}*{{room}}/none.json",
-    "chart -o out room --lpips some": "--lpips*'some'",
-    "chart -o room/scene.ply room": "--output*room/scene.ply",
-    "chart -o room room": "room*results",
-    "generate -o out --views many": "--views*4-10*'many'",
-    "generate -o out --size large": "--size*320x240*'large'",
-    "generate -o out --size 9x9": "width*16 to 2048*9",
-    "generate -o out --style castle": "style*mixed*'castle'",
-    "generate -o out --path spiral": "path*arc*'spiral'",
-    "generate -o out --style building --path orbit": "path*walk*'orbit'",
-    "train -o out": "*'--data'",
+    "lab stress room --cases hail": "cases*unchanged*'hail'",
+    "lab chart -o out": "out*finished*none",
+    "lab chart -o out room --grid k=9": "k*1 to 8*9",
+    "lab chart -o out room --grid views=0": "views*0",
+    "lab chart -o out room --grid kk=1": "--grid kk*method*views",
+    "lab chart -o out --dry-run": "--dry-run*scenes",
+    "lab chart -o out room --targets {{room}}/none.json": "*{{scene}}*{{room}}/none.json",
+    "lab chart -o out room --set lpips=some": "lpips*'some'",
+    "lab chart -o room/scene.ply room": "--output*room/scene.ply",
+    "lab chart -o room room": "room*results",
+    "lab generate -o out --views many": "--views*4-10*'many'",
+    "lab generate -o out --size large": "--size*320x240*'large'",
+    "lab generate -o out --size 9x9": "width*16 to 2048*9",
+    "lab generate -o out --set style=castle": "style*mixed*'castle'",
+    "lab generate -o out --set path=spiral": "path*arc*'spiral'",
+    "lab generate -o out --set style=building --set path=orbit": "path*walk*'orbit'",
+    "lab train -o out": "*'--data'",
 }
 PLACES = {
-    "compact room --set require_checkpoint=true --checkpoint gone": "gone*checkpoint",
+    "compact room --set require_checkpoint=true --set checkpoint=gone": "gone*checkpoint",
     "batch gone -o out": "gone*no such",
     "batch room -o alone.ply/out --quiet": "alone.ply/out*Not a directory*--output",
     "extend alone.ply/state.gsm room": "alone.ply/state.gsm*Not a directory",
@@ -155,26 +157,26 @@ PLACES = {
     "extend /proc/self/state.gsm room": "/proc/self/state.gsm*No such file",
     "extend new.gsm gone": "gone*no such",
     "render room --as views -o alone.ply/pictures": "alone.ply/pictures*work/alone.ply*--output",
-    "render room --path room/scene.ply -o a.mp4": "room/scene.ply*compact --embed-cameras",
+    "render room --path room/scene.ply -o a.mp4": "room/scene.ply*cameras inside",
     "evaluate room --lpips none --targets nowhere.json": "nowhere.json*cameras*nothing",
     "evaluate room --lpips none --targets room/transforms.json": "room/transforms.json*views*none",
     "evaluate room alone.ply --lpips none --merge-seconds room/transforms.json": "room/transforms.json*(total_seconds)",
     "evaluate room alone.ply --lpips none --merge-seconds alone.ply": "alone.ply*text*'utf-8'",
     "evaluate alone.ply --hint order=none --targets room/targets": "alone.ply*none*--cameras",
-    "stress alone.ply --hint order=none --targets room/targets": "alone.ply*none*--cameras",
-    "chart -o out nowhere": "nowhere*no such",
-    "chart -o out room --targets {{scene}}/none.json": "room/none.json*cameras*nothing",
-    "generate -o out --ranges nowhere.toml": "nowhere.toml*no such",
-    "generate -o alone.ply": "alone.ply*folder*file",
-    "train --data nowhere -o out": "nowhere*no such",
+    "lab stress alone.ply --set targets=room/targets": "alone.ply*none*--cameras",
+    "lab chart -o out nowhere": "nowhere*no such",
+    "lab chart -o out room --targets {{scene}}/none.json": "room/none.json*cameras*nothing",
+    "lab generate -o out --set ranges=nowhere.toml": "nowhere.toml*no such",
+    "lab generate -o alone.ply": "alone.ply*folder*file",
+    "lab train --data nowhere -o out": "nowhere*no such",
 }
 
 
 NEED_THE_SCENE = {  # to be known as wrong: refused by the plan, all others before any work
-    "compact room --superpixels 1537",
+    "compact room --set superpixels=1537",
     "compact room --budget 5B",
-    "compact room --method blocks --hint order=none",
-    "compact room --set require_checkpoint=true --checkpoint gone",
+    "compact room --set method=blocks --hint order=none",
+    "compact room --set require_checkpoint=true --set checkpoint=gone",
 }
 
 
@@ -187,7 +189,7 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "run.json").write_text('{"total_seconds": 2}')
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
-    small = ["--superpixels", "60", "--checkpoint", "none", "--quiet"]
+    small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
     bare = ["--set", "replay=0"]
     assert main(["extend", str(folder / "room.gsm"), str(small_scene), *small, *bare]) == 0
     assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
@@ -201,7 +203,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     def work(*_: object, **__: object) -> None:
         raise AssertionError("wrong usage is refused before the work")
 
-    for name in ("compaction.files.compact", "view.data.evaluate") if words not in NEED_THE_SCENE else ():
+    for name in ("compaction.files.compact", "pages.data.evaluate") if words not in NEED_THE_SCENE else ():
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)

@@ -25,7 +25,10 @@ RESULTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "without pixels, no fit": ("rows", ("compact {scene} -o {out} --fit none",)),
     "a file alone": ("alone", ("compact {scene} -o {out} --effort fast",)),
     "nothing known": ("unknown", ("compact {scene} -o {out}",)),
-    "decoded": ("exact", ("extend {out}.gsm {scene} --superpixels 2%", "compact {out}.gsm -o {out} --k 2 --fit none")),
+    "decoded": (
+        "exact",
+        ("extend {out}.gsm {scene} --set superpixels=2%", "compact {out}.gsm -o {out} --k 2 --fit none"),
+    ),
 }
 
 

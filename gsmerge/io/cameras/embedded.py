@@ -42,8 +42,8 @@ def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
     packed = base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")
     if len(packed) > MAX_CHARS:
         raise UsageError(
-            f"--embed-cameras: expected at most {MAX_CHARS:,} characters in the header, got {len(packed):,} of"
-            f" {len(names):,} views; write them to a file with --save-cameras"
+            f"cameras in the header: expected at most {MAX_CHARS:,} characters in the header, got {len(packed):,} of"
+            f" {len(names):,} views"
         )
     return [PREFIX + line for line in textwrap.wrap(packed, LINE)]
 

@@ -58,6 +58,8 @@ LEVELS = Format(
     3, each=_SOG,
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
+SITE = Format("index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3)
+SITE_SCENE = "scene.sog"
 FILES = (  # of endings that end alike the longest first
     Format(
         ".compressed.ply", "ranges for every 256 neighbours; rows in another order", ply.read_rows,
@@ -151,11 +153,11 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model, which needs cameras, is allowed.
+    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a web site, which have cameras.
     ValueError for an unknown version of ``.spz``.
     """
-    rows = [row for row in FORMATS if row.names(path) and row.max_degree >= 0]
-    if (rows == [LEVELS] and not levels) or (rows == [COLMAP] and not cameras):
+    rows = [row for row in (*FORMATS, SITE) if row.names(path) and row.max_degree >= 0]
+    if (rows == [LEVELS] and not levels) or (rows in ([COLMAP], [SITE]) and not cameras):
         rows = []
     if not rows and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
@@ -163,7 +165,7 @@ def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, 
     if not rows:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder named {FOLDER}" if cameras else ""
+        folder = f", a new folder for a web site, or one named {FOLDER}" if cameras else ""
         raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
     chosen = next((row for row in rows if row.version in (None, spz_version)), None)
     if chosen is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsmerge.pages.page import PICTURES, data_uri, render_template
 from gsmerge.report import csv_text
 from gsmerge.research.charts.figures import Figure
 from gsmerge.research.charts.lines import (
@@ -21,7 +22,6 @@ from gsmerge.research.charts.lines import (
 from gsmerge.research.charts.measure_run import INPUT, MAX_ERROR, SCORES, RunRecord, picture_path
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.settings.compact import OURS
-from gsmerge.view.page import PICTURES, data_uri, render_template
 
 MAX_SCENES = 6  # with pictures on the page
 MAX_RESULTS = 5  # pictures of a view in addition to the photo and the input

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +13,6 @@ from typing import Any, Literal
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
 from gsmerge.batch.jobs import Job
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.bounds import read_table
 from gsmerge.io.cameras.read import find_cameras, is_colmap
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
@@ -25,15 +23,13 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.settings.setting import Settings, setting, settings_of
+from gsmerge.settings.setting import Settings, join_words, setting, settings_of
 
 ALL = "all"  # word for all views
-OWN_OPTIONS = {"method": "--methods", "seed": "--seed", "threads": "--threads"}  # that set the same
 FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
-NUMBERS = ("k", "budgets", "superpixels", "views")  # lists whose values may be numbers
-# Settings whose lists are multiplied, and the lists' names:
-SETTINGS = {"k": "k", "segmentation": "segmentations", "fit": "fit", "effort": "efforts", "match": "matches"}
-SIZES = {"budget": "budgets", "superpixels": "superpixels"}  # whose lists stand next to each other
+NUMBERS = ("k", "budget", "superpixels", "views")  # lists whose values may be numbers
+SETTINGS = ("k", "segmentation", "fit", "effort", "match")  # whose lists are multiplied
+SIZES = ("budget", "superpixels")  # whose lists stand next to each other
 MAX_NAME = 100  # characters of a run in names of files
 
 
@@ -41,72 +37,44 @@ MAX_NAME = 100  # characters of a run in names of files
 class Grid(Settings):
     """Lists of values for settings; every combination is run. What has no list is as usual, or as a recipe says."""
 
-    methods: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
+    method: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
     k: tuple[int, ...] = setting((), "Gaussians per superpixel: 1 to 8.", unique=True)
-    budgets: tuple[int | str, ...] = setting((), "Gaussians in the result, such as 0.5%,2%,40000,auto.", unique=True)
+    budget: tuple[int | str, ...] = setting((), "Gaussians in the result, such as 0.5%,2%,40000,auto.", unique=True)
     superpixels: tuple[int | str, ...] = setting((), "Superpixels per view, such as 3000,4.4%, next to the budgets.",
         unique=True)  # fmt: skip
-    segmentations: tuple[str, ...] = setting((), "Superpixel methods.", unique=True)
+    segmentation: tuple[str, ...] = setting((), "Superpixel methods.", unique=True)
     fit: tuple[str, ...] = setting((), "What is fitted: full, none.", unique=True)
-    efforts: tuple[str, ...] = setting((), "Amount of work: draft, fast, default, best.", unique=True)
-    matches: tuple[str, ...] = setting((), "Merging across views: overlap, aabb, none.", unique=True)
+    effort: tuple[str, ...] = setting((), "Amount of work: draft, fast, default, best.", unique=True)
+    match: tuple[str, ...] = setting((), "Merging across views: overlap, aabb, none.", unique=True)
     views: tuple[int | Literal["all"], ...] = setting((ALL,), "Numbers of input views, evenly spread; all for all.",
         least=1, filled=True, unique=True)  # fmt: skip
-    fixed: tuple[str, ...] = setting((), "Any other setting of compact for all runs of gsmerge, each NAME=VALUE.")
+    fixed: Mapping[str, Any] = field(default_factory=dict)  # other settings of compact for all runs of gsmerge
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Settings that all runs share, by name; UsageError if one is not "name=value" or is decided elsewhere."""
-        settings, lists = dict[str, Any](), SETTINGS | SIZES
-        decided = OWN_OPTIONS | {name: f"--{lists[name]}" for name in lists if getattr(self, lists[name])}
-        for text in self.fixed:
-            name, sign, value = str(text).partition("=")
-            if not (name and sign):
-                raise UsageError(f"fixed: expected NAME=VALUE, got {text!r}")
-            if name in decided:
-                raise UsageError(f"fixed: expected another setting, got {name}; use {decided[name]}")
-            if name in settings:
-                raise UsageError(f"fixed: expected every setting once, got {name} twice")
-            try:
-                settings[name] = json.loads(value)
-            except ValueError:  # a word
-                settings[name] = value
-            if isinstance(settings[name], list | dict) or settings[name] != settings[name]:
-                raise UsageError(f"fixed: expected a word or a number for {name}, got {value}")
-        return settings
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in (*SETTINGS, *SIZES, "method"):
+            if name in self.fixed and (name == "method" or getattr(self, name)):
+                raise UsageError(f"--set {name}: expected another setting, use --grid {name}=A,B")
 
 
-def parse_grid(lists: Mapping[str, str | None], base: Grid | None = None) -> Grid:
-    """Make a grid from comma-separated lists; None keeps the list of ``base``. UsageError for impossible values."""
+def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> Grid:
+    """Make a grid of pairs NAME=A,B, the names those of :class:`Grid`; UsageError for impossible values."""
     values: dict[str, tuple[Any, ...]] = {}
-    for name, text in lists.items():
-        if text is not None:
-            parts = [part.strip() for part in text.split(",") if part.strip()]
-            if not parts:
-                raise UsageError(f"{name}: expected at least one value, got none")
-            values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        names = settings_of(Grid)
+        if name not in names:
+            raise UsageError(f"--grid {name}: expected {join_words(names)} before =, and values with commas between")
+        if name in values:
+            raise UsageError(f"--grid {name}: expected it once, got it twice")
+        parts = [part.strip() for part in text.split(",") if part.strip()]
+        if not parts:
+            raise UsageError(f"--grid {name}: expected at least one value, got none")
+        values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
     try:
-        return replace(base or Grid(), **values)
+        return Grid(**values, fixed=fixed or {})
     except ValueError as error:
         raise UsageError(str(error)) from error
-
-
-def read_grid(path: Path) -> Grid:
-    """Read a grid from a small TOML or JSON file whose keys are the fields of :class:`Grid`.
-
-    SceneError if the file cannot be read, or has any other content.
-    """
-    values, names = read_table(path), settings_of(Grid).keys()
-    if values.keys() - names:
-        odd = ", ".join(sorted(values.keys() - names))
-        raise SceneError(path, f"expected lists named {', '.join(sorted(names))}, found {odd}")
-    try:
-        grid = Grid(**{name: tuple(value) if isinstance(value, list) else (value,) for name, value in values.items()})
-    except (TypeError, ValueError) as error:
-        raise SceneError(path, str(error)) from error
-    if not all(isinstance(method, str) for method in grid.methods):
-        raise SceneError(path, f"methods: expected names, found {grid.methods}")
-    return grid
 
 
 def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
@@ -115,13 +83,13 @@ def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[st
     Only settings that differ from the defaults are set; for ours these are a fixed recipe's, and the lists go before.
     Baselines do not have most settings and run once per size, or once where they keep all Gaussians.
     """
-    sizes: list[dict[str, Any]] = [{name: size} for name, sizes in SIZES.items() for size in getattr(grid, sizes)]
-    lists, fixed = [getattr(grid, name) or (None,) for name in SETTINGS.values()], grid.settings
+    sizes: list[dict[str, Any]] = [{name: size} for name in SIZES for size in getattr(grid, name)]
+    lists, fixed = [getattr(grid, name) or (None,) for name in SETTINGS], grid.fixed
     defaults = CompactOptions().to_dict()
     ours = {**defaults, **RECIPES.get(str(fixed.get("recipe")), {})}
     runs = {describe(INPUT, {}, None): (INPUT, dict[str, Any]())}
     repeated = 0
-    for method, *values, size in product(grid.methods, *lists, sizes or [{}]):
+    for method, *values, size in product(grid.method, *lists, sizes or [{}]):
         names, usual = (SETTINGS, ours) if method == OURS else (FITTED.get(method, ()), defaults)
         settings = {} if method in (INPUT, *ONE_SIZE) else dict(size)
         chosen = zip(SETTINGS, values, strict=True)

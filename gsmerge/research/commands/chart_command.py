@@ -1,12 +1,11 @@
-"""``gsmerge chart``: a grid of runs, charts of them and a page."""
+"""``gsmerge lab chart``: a grid of runs, charts of them and a page."""
 
 from __future__ import annotations
 
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
-from inspect import Parameter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,67 +15,54 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.evaluate import NETS
+from gsmerge.settings.setting import Settings, flat_settings, setting
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
-GRID = "Grid: comma-separated lists, whose product is run"
-LISTS = ("methods", "k", "budgets", "superpixels", "segmentations", "fit", "efforts", "matches", "views")
 CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # in the folder
 
 
-def _list(name: str, help: str, wording: str) -> Parameter:
-    return opt.option(name, str, help, wording=wording, metavar="LIST")
+@dataclass(frozen=True)
+class ChartOptions(Settings):
+    """Settings of a grid's measurements."""
+
+    target_images: str | None = setting(None, "Folder of the held-out photos, as `--targets` names their cameras.")
+    photo_side: int = setting(0, "Resize larger photos to so many pixels on the longer side; 0: not.", least=0)
+    lpips: str | None = setting(None, "Networks of LPIPS; by default those installed.", choices=("both", *NETS, "none"))
+    lpips_views: int = setting(2, "Measure LPIPS on at most so many views of each split.", least=1)
+    proxy_views: int = setting(2, "Photos per scene on which superpixels alone are measured.", least=0)
+    rerun: bool = setting(False, "Repeat runs that are done.")
 
 
 @opt.command(
     opt.argument("scenes", list[str] | None, "[SCENE]...", "Folders to search for scenes, patterns, .ply files, or "
-                 "text files with one of these per line.", default=None),
+                 "text files with one of these per line. None: draw the results in the folder.", default=None),
     *opt.panel(
-        GRID,
-        _list("methods", "Methods: gsmerge and baselines.", "gsmerge"),
-        _list("k", "Gaussians per superpixel: 1 to 8.", "1"),
-        _list("budgets", "Gaussians in the result, such as 0.5%,2%,40000,auto.", "as superpixels and K say"),
-        _list("superpixels", "Superpixels per view, such as 3000,4.4%, next to the budgets.", "4.4%"),
-        _list("segmentations", "Superpixel methods.", "rdseg"),
-        _list("fit", "What is fitted: full, none.", "full"),
-        _list("efforts", "Amount of work: fast, default, best.", "default"),
-        _list("matches", "Merging across views: overlap, aabb, none.", "overlap"),
-        _list("views", "Numbers of input views, evenly spread; all for all.", "all"),
-        opt.option("fixed", list[str], "Any other setting of compact for all runs of gsmerge; may be repeated.",
-                   metavar="NAME=VALUE"),
-        opt.option("grid", Path, "TOML or JSON file with these lists; options win."),
+        "Runs",
+        opt.option("grid", list[str], "Values to run, in every combination, such as budget=1%,4% or "
+                   "method=gsmerge,voxel; also of k, superpixels, segmentation, fit, effort, match and views; may be "
+                   "repeated.", metavar="NAME=A,B"),
     ),
-    "hint",
+    opt.settings_option(CompactOptions, ChartOptions, example="lpips=none"),
     *opt.panel(
         opt.INPUT,
         opt.option("targets", str, "Cameras of held-out photos: one file, or with {scene}, {parent} and {stem} of each "
                    "scene in it."),
-        opt.option("target_images", str, "Folder of those photos, in the same way."),
-    ),
-    "photo_side lpips",
-    opt.changed("lpips_views", 2, show_default=True),
-    *opt.panel(
-        opt.MEASURING, opt.option("proxy_views", int, "Photos per scene to measure superpixels on.", default=2, min=0)
     ),
     opt.output("Folder for the results; runs that it holds are not repeated.", default=Path("charts")),
-    *opt.panel(
-        opt.OUTPUT,
-        opt.switch("rerun", "Repeat runs that are done."),
-        opt.switch("draw_only", "Draw the results in the folder; run nothing."),
-    ),
-    f"dry_run {opt.RUN}",
+    "dry_run",
 )  # fmt: skip
 def chart(args: opt.Args) -> None:
-    """Run a grid of settings over scenes, resumable, and draw charts and a page of all results in the folder."""
+    """Run settings over scenes, and draw charts and a page of all results; a second call goes on where one ended."""
     scenes, out = args.scenes or [], args.output
-    if args.draw_only == bool(scenes):
-        raise UsageError("expected scenes to run, or --draw-only without any")
-    if args.draw_only and args.dry_run:
-        raise UsageError("--dry-run: expected something to run, got --draw-only")
     if os.path.lexists(out) and not out.is_dir():
         raise UsageError(f"--output: expected a folder, found the file {out}")
-    if args.draw_only:
+    if not scenes:
+        if args.dry_run:
+            raise UsageError("--dry-run: expected scenes to run, got none")
         _draw(args, [], 0)
         return
     from gsmerge.batch.workload import pending_jobs
@@ -102,28 +88,26 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     """Make the jobs of the grid, the options of their batch, and notes."""
     from gsmerge.batch import BatchOptions
     from gsmerge.measure.evaluate import EvaluateOptions
-    from gsmerge.research.charts.grid import Grid, find_sources, make_jobs, parse_grid, read_grid
-    from gsmerge.settings.compact import CompactOptions
+    from gsmerge.research.charts.grid import find_sources, make_jobs, parse_grid
 
-    nets, notes = lpips_networks(args.lpips)
-    base = Grid() if args.grid is None else read_grid(args.grid)
-    base = replace(base, fixed=tuple(args.fixed)) if args.fixed else base
-    grid = parse_grid({name: getattr(args, name) for name in LISTS}, base)
+    fixed = args.values(CompactOptions, ChartOptions)
     with opt.usage_errors():
-        measured = EvaluateOptions(nets, args.lpips_views, **args.given(("photo_side",)))
-        settings = CompactOptions().with_settings(args.given(("seed", "threads")))
-        options = BatchOptions(settings, jobs=1, overwrite=args.rerun)  # so that no run slows another
-    sources = find_sources(scenes, args.output, args.targets, args.target_images)
-    # the command line that does the same, without options at their defaults
-    words = ["gsmerge", "chart", *scenes, "--output", str(args.output)]
-    names = [*LISTS, "fixed", "grid", "targets", "target_images", "hint"]
-    names += ["photo_side", "lpips", "lpips_views", "proxy_views"]
-    for name, value in args.given([*names, "seed", "threads"]).items():
+        own = ChartOptions(**{name: fixed.pop(name) for name in flat_settings(ChartOptions) if name in fixed})
+    run: dict[str, Any] = {name: fixed.pop(name) for name in ("seed", "threads") if name in fixed}
+    nets, notes = lpips_networks(own.lpips, NETS)
+    grid = parse_grid(args.grid or (), fixed)
+    with opt.usage_errors():
+        measured = EvaluateOptions(nets, own.lpips_views, photo_side=own.photo_side)
+        settings = CompactOptions().with_settings(run)
+        options = BatchOptions(settings, jobs=1, overwrite=own.rerun)  # so that no run slows another
+    sources = find_sources(scenes, args.output, args.targets, own.target_images)
+    words = ["gsmerge", "lab", "chart", *scenes, "--output", str(args.output)]  # the command line that does the same
+    for name, value in args.given(("grid", "set", "targets")).items():
         for element in value if isinstance(value, list) else [value]:
-            words += [f"--{name.replace('_', '-')}", str(element)]
-    more: dict[str, Any] = {"seed": settings.seed, "proxy_views": args.proxy_views, "command": shlex.join(words)}
-    more |= {"opacity": args.opacity, "hints": args.hints()}
-    jobs, left_out = make_jobs(sources, grid, measured, **more)
+            words += [f"--{name}", element]
+    jobs, left_out = make_jobs(
+        sources, grid, measured, seed=settings.seed, proxy_views=own.proxy_views, command=shlex.join(words)
+    )
     return jobs, options, [*notes, *left_out]
 
 
@@ -145,7 +129,7 @@ def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     say_notes(more, quiet=args.silent)
     figures = make_figures(Results(records))
     drawings = draw_figures(figures, out / CHARTS)
-    command = shlex.join(["gsmerge", "chart", "--draw-only", "--output", str(out)])
+    command = shlex.join(["gsmerge", "lab", "chart", "--output", str(out)])
     page = make_page(records, figures, drawings, out, command)
     write_texts({out / PAGE: page, out / TABLE: make_table(records)}, overwrite=True)
     failed = sum(record.error is not None for record in records)

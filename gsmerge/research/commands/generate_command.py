@@ -1,19 +1,33 @@
-"""``gsmerge generate``: synthetic scenes."""
+"""``gsmerge lab generate``: synthetic scenes."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
     from gsmerge.research.generate import GenerateOptions
+
+
+OPTIONS = LazyFunction("gsmerge.research.generate", "GenerateOptions")
+
+
+@dataclass(frozen=True)
+class SeriesOptions(Settings):
+    """Settings of a series of scenes."""
+
+    seed: int = setting(0, "Seed of all random numbers.", least=0)
+    ranges: str | None = setting(None, "TOML or JSON file with ranges of the errors; by default the built-in ones.")
+    overwrite: bool = setting(False, "Replace scenes that the folder holds.")
 
 
 @opt.command(
@@ -23,46 +37,33 @@ if TYPE_CHECKING:
         opt.option("views", str, "Views of a scene, or a range to draw their number from.", default="6",
                    metavar="N|N-M"),
         opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH"),
-        opt.option("style", str, "room, garden, mixed: these two in turn, or building: many rooms.", default="mixed"),
-        opt.option("path", str, "Cameras: arc, forward, walk, orbit, wide, or mixed: any; a walk in a building.",
-                   default="mixed"),
     ),
-    *opt.panel(
-        "Errors",
-        opt.option("noise", float, "Factor on the simulated errors of the network.", default=1.0, min=0.0, max=10.0),
-        opt.option("ranges", Path, "TOML or JSON file with ranges of the errors, as in docs/laboratory/generator.md.",
-                   wording="the built-in ones"),
-    ),
+    opt.settings_option(OPTIONS, SeriesOptions, example="style=room"),
     opt.output("Folder for the scenes: scene_0000 and on.", default=opt.REQUIRED),
-    f"overwrite dry_run {opt.RUN}",
 )  # fmt: skip
 def generate(args: opt.Args) -> None:
     """Make synthetic scenes to train and test with, as a feed-forward network would export them."""
-    options, out = _options(args), args.output
+    (options, series), out = _settings(args), args.output
     if out.exists() and not out.is_dir():
         raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
-    seed = args.seed or 0
     from gsmerge.report import document_head
     from gsmerge.research.generate import generate as generate_scenes
-    from gsmerge.research.generate import plan
 
-    where: dict[str, Any] = {"seed": seed, "overwrite": args.overwrite}
-    if args.dry_run:
-        scenes = plan(out, args.scenes, options, **where)
-    else:
-        with stage_progress(quiet=args.silent) as progress:
-            move = partial(progress, "generate")
-            scenes = generate_scenes(out, args.scenes, options, **where, threads=args.threads, progress=move)
-    document = {**document_head(), "options": options.to_dict(), "seed": seed, "dry_run": args.dry_run, "notes": []}
+    with stage_progress(quiet=args.silent) as progress:
+        scenes = generate_scenes(
+            out, args.scenes, options, seed=series.seed, overwrite=series.overwrite,
+            progress=partial(progress, "generate"),
+        )  # fmt: skip
+    document = {**document_head(), "options": options.to_dict(), "seed": series.seed, "notes": []}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
-    line = f"{out}: {'would write ' if args.dry_run else ''}{len(scenes) - kept} scenes"
+    line = f"{out}: {len(scenes) - kept} scenes"
     line += f", {kept} were there already" if kept else ""
     print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
-def _options(args: opt.Args) -> GenerateOptions:
-    """Parse the settings of the scenes."""
+def _settings(args: opt.Args) -> tuple[GenerateOptions, SeriesOptions]:
+    """Parse the settings of the scenes, and of their series."""
     from gsmerge.research.generate import GenerateOptions, read_ranges
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)
@@ -72,8 +73,6 @@ def _options(args: opt.Args) -> GenerateOptions:
     if sides is None:
         raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
     views, (width, height) = (int(counts[1]), int(counts[2] or counts[1])), map(int, sides.groups())
-    with opt.usage_errors():
-        options = GenerateOptions(
-            views=views, width=width, height=height, style=args.style, path=args.path, noise=args.noise
-        )
-    return options if args.ranges is None else replace(options, ranges=read_ranges(args.ranges))
+    options, series = args.make(GenerateOptions, SeriesOptions, views=views, width=width, height=height)
+    options = options if series.ranges is None else replace(options, ranges=read_ranges(Path(series.ranges)))
+    return options, series

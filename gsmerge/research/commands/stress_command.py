@@ -1,54 +1,63 @@
-"""``gsmerge stress``: a user's own scene under bad conditions."""
+"""``gsmerge lab stress``: a user's own scene under bad conditions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import held_out_views, require_views
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import TargetError
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
     from gsmerge.research.stress import StressOutcome
 
 
+@dataclass(frozen=True)
+class StressFiles(Settings):
+    """Files beside the scene of a stress test."""
+
+    cameras: str | None = setting(None, "Its cameras; by default those beside it.")
+    images: str | None = setting(None, "Folder of its photos; by default beside it.")
+    targets: str | None = setting(None, "Cameras of held-out photos.")
+    target_images: str | None = setting(None, "Folder of the held-out photos; by default beside their cameras.")
+
+
 @opt.command(
     opt.SCENE,
-    f"{opt.READING} {opt.TARGETS} set",
-    *opt.panel(opt.MEASURING, opt.option("cases", str, "Run only these cases.", wording="all", metavar="NAME,...")),
-    "report overwrite threads",
+    *opt.panel(opt.MEASURING, opt.option("cases", str, "Try only these.", wording="all", metavar="NAME,...")),
+    opt.settings_option(CompactOptions, StressFiles, example="targets=FILE"),
 )
 def stress(args: opt.Args) -> None:
     """Compact a scene under bad conditions, and say of each whether the result holds."""
-    hints = args.hints()
-    from gsmerge.report import document_head, to_json
+    from gsmerge.report import document_head
     from gsmerge.research.stress import stress as stress_scene
 
-    files = args.files(args.scene)
-    check_outputs([args.report], (*input_files(files), args.targets, args.target_images), overwrite=args.overwrite)
-    settings = args.settings()
-    load = args.load(files)
+    settings, places = args.make(CompactOptions, StressFiles)
+    found = {name: None if path is None else Path(path) for name, path in vars(places).items()}
+    args.cameras, args.images, args.hint = found["cameras"], found["images"], None
+    load = args.load(args.files(args.scene))
     require_views(load)
-    _, held_out, adapted = held_out_views(load, args.targets, args.target_images, None)
+    _, held_out, adapted = held_out_views(load, found["targets"], found["target_images"], None)
     notes = [*load.notes, *adapted]
     say_notes(notes, quiet=args.silent)
     names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]
     with stage_progress(quiet=args.silent) as progress:
-        outcomes = stress_scene(load, settings, targets=held_out, cases=names, hints=hints, progress=progress)
+        outcomes = stress_scene(load, settings, targets=held_out, cases=names, progress=progress)
     document = {
         **document_head(),
-        "input": str(files.ply),
+        "input": str(load.files.ply),
         "options": settings.to_dict(),
         "cases": [outcome.to_dict() for outcome in outcomes],
         "held": sum(outcome.passed is True for outcome in outcomes),
         "failed": sum(outcome.passed is False for outcome in outcomes),
         "notes": notes,
     }
-    if args.report is not None:
-        write_texts({args.report: to_json(document)}, overwrite=args.overwrite)
     print_document(document, _lines(outcomes), as_json=args.json, quiet=args.quiet)
     failed = [outcome.case for outcome in outcomes if outcome.passed is False]
     if failed:

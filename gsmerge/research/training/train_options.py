@@ -236,7 +236,7 @@ PAPER: Mapping[str, Any] = {
     "diversity_steps": 50_000,
 }
 # What the package ships is trained with. Encoder and merger gained nothing that validation showed; colour corrections
-# learnt the exposure of the training photos. docs/laboratory/networks.md has the figures.
+# learnt the exposure of the training photos. docs/internals/networks.md has the figures.
 SHIPPED: Mapping[str, Any] = {
     "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
     "recolor": True,

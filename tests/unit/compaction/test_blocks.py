@@ -150,7 +150,7 @@ def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> 
     ],
 )  # fmt: skip
 def test_what_needs_one_piece(scene: Scene, settings: dict[str, Any], problem: str) -> None:
-    with refuses(UsageError, "blocks 2", "--blocks none", problem):
+    with refuses(UsageError, "blocks 2", "--set blocks=none", problem):
         compact(scene, blocks=2, **settings)
 
 

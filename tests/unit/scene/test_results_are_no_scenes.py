@@ -41,7 +41,7 @@ def folder(tmp_path: Path, tiny: Tiny) -> Path:
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
 def test_results_of_commands_say_so(folder: Path, tmp_path: Path, ending: str) -> None:
     compact_files(find_scene_files(folder), PLAIN, Outputs(folder / f"x{ending}"))
-    assert main(["extend", str(tmp_path / "x.gsm"), str(folder), "--superpixels", "20%", "-q"]) == 0
+    assert main(["extend", str(tmp_path / "x.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     assert main(["compact", str(tmp_path / "x.gsm"), "--fit", "none", "-o", str(folder / f"y{ending}"), "-q"]) == 0
     results = [folder / f"x{ending}", folder / f"x.level1{ending}", folder / f"y{ending}"]
     assert sorted(folder.glob("*.ply")) == sorted([folder / "room.ply", *results])
@@ -85,7 +85,7 @@ def test_what_the_library_writes_may_be_a_scene(tmp_path: Path, tiny: Tiny) -> N
     tiny.save(tmp_path)
     assert header_content(tmp_path / "scene.ply") == "Gaussians"
     size = ["--scenes", "1", "--views", "2", "--size", "32x24"]
-    assert main(["generate", "-o", str(tmp_path / "made"), *size, "--quiet"]) == 0
+    assert main(["lab", "generate", "-o", str(tmp_path / "made"), *size, "--quiet"]) == 0
     assert header_content(tmp_path / "made/scene_0000/scene.ply") == "Gaussians"
 
 

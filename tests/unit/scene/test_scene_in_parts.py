@@ -97,7 +97,7 @@ def test_scenes_of_one_backbone_stay_apart(tmp_path: Path, tiny: Tiny) -> None:
 
 def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
-    assert main(["extend", str(folder / "scene.gsm"), str(folder), "--superpixels", "20%", "-q"]) == 0
+    assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     source = load_state(folder / "scene.gsm").about["source"]
     assert source["bytes"] == sum(path.stat().st_size for path in find_scene_files(folder).plys)
 

@@ -70,4 +70,4 @@ def test_they_are_compacted_and_checked(name: str, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     assert main(["compact", str(FOLDER / f"{name}.gsm"), "--k", "2", "--fit", "none", "-o", str(out), "-q"]) == 0
     assert (b"SplatRenderMode: mip" in out.read_bytes()) == (name == "encoded")
-    assert main(["check", str(FOLDER / f"{name}.gsm"), "-q"]) == 0
+    assert main(["inspect", str(FOLDER / f"{name}.gsm"), "-q"]) == 0

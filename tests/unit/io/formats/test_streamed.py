@@ -204,7 +204,7 @@ def test_what_splat_transform_writes_is_read(scene: Scene, tmp_path: Path, capsy
     actual = read_gaussians(index).gaussians
     assert len(actual) == len(gaussians) + len(gaussians[::50])
     assert len(read_level(index, 1).gaussians) == len(gaussians[::4])
-    assert main(["check", str(index)]) == 0
+    assert main(["inspect", str(index)]) == 0
     assert capsys.readouterr().out.startswith("ok ")
 
 
@@ -221,7 +221,7 @@ def test_places_that_cannot_be_told_apart_stay_together(tmp_path: Path, small: N
 
 def test_extremes_and_single_gaussians(tmp_path: Path) -> None:
     write_levels(tmp_path / "lod-meta.json", [corners(), corners()[:1]])
-    assert main(["check", str(tmp_path / "lod-meta.json"), "-q"]) == 0
+    assert main(["inspect", str(tmp_path / "lod-meta.json"), "-q"]) == 0
     for array in vars(read_gaussians(tmp_path / "lod-meta.json").gaussians).values():
         assert np.isfinite(array).all()
 
@@ -411,11 +411,10 @@ def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFix
     path.write_text(json.dumps(index))
     with pytest.raises(SceneError):
         read_gaussians(path)
-    for command in ("inspect", "check"):
-        assert main([command, str(path)]) == 3
-        captured = capsys.readouterr()
-        assert captured.err.count("\n") == 1, captured.err
-        assert "Traceback" not in captured.err
+    assert main(["inspect", str(path)]) == 3
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert "Traceback" not in captured.err
 
 
 @pytest.mark.parametrize(
@@ -440,12 +439,12 @@ def test_a_deep_tree_is_read(tmp_path: Path) -> None:
 
 def test_check_reads_all_levels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_levels(tmp_path / "lod-meta.json", [corners(), corners()[:1]])
-    assert main(["check", str(tmp_path / "lod-meta.json")]) == 0
+    assert main(["inspect", str(tmp_path / "lod-meta.json")]) == 0
     assert "3 + 1 Gaussians at 2 level(s)" in capsys.readouterr().out
     second = next(iter(streamed.read_index(tmp_path / "lod-meta.json").levels[1]))
     second.with_name("sh0.webp").unlink()
     assert len(read_gaussians(tmp_path / "lod-meta.json").gaussians) == 3
-    assert main(["check", str(tmp_path / "lod-meta.json")]) == 3
+    assert main(["inspect", str(tmp_path / "lod-meta.json")]) == 3
     assert f"{second.with_name('sh0.webp')}: no such file" in capsys.readouterr().err
 
 

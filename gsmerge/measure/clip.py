@@ -1,0 +1,233 @@
+"""Clips: scenes from the same cameras under a line that moves, with captions, as a video or a GIF."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from gsmerge.errors import SceneError
+from gsmerge.io import atomic_output
+from gsmerge.measure.preview import FACE, Picture, shorten_text
+from gsmerge.types import StrPath
+
+# Encoders by the ending of a name, the first that OpenCV has is used, with their names. Browsers play all but the last
+# of .mp4. VP8 takes a third of the time of VP9 and 1.6 times the space.
+ENCODERS = {
+    ".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")),
+    ".webm": (("VP80", "VP8"), ("VP90", "VP9")),
+}
+GIF = ".gif"
+SUFFIXES = (*ENCODERS, GIF)
+H264 = "H.264"  # of .mp4 where the program ffmpeg is at hand: nearly every program plays it
+MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
+MAX_GIF_PIXELS = 1 << 27  # of all frames: 400 MB of memory, and files that nobody sends
+GIF_SAMPLE = 1 << 20  # pixels that the palette of a GIF is made of
+OPENCV = "opencv-contrib-python-headless"
+FOLDER = "name a folder instead, for one picture a frame"
+SWIPE_SECONDS = 6  # in which the line goes to both sides and back
+SWAY = 0.9  # of the way to the neighbouring lines, or the border
+LINE = 480  # by which the width of a frame is divided for that of the line
+
+
+@dataclass(frozen=True, eq=False)
+class Caption:
+    """Text on a dark box in a frame."""
+
+    left: int
+    top: int
+    text: np.ndarray  # [h,w,1] how much of a pixel is text, 0 to 1
+
+    def draw(self, picture: Picture) -> None:
+        """Draw the caption into a picture."""
+        height, width = self.text.shape[:2]
+        box = picture[self.top : self.top + height, self.left : self.left + width]
+        box[:] = (0.35 * box * (1 - self.text) + 245 * self.text).round()
+
+
+def make_captions(texts: Sequence[Sequence[str]], width: int, height: int) -> list[Caption]:
+    """Place the captions, a few lines each, of scenes side by side at the bottom of a frame, from left to right."""
+    scale = max(0.45, height / 900)
+    thickness, line = max(1, round(1.5 * scale)), round(32 * scale)
+    margin, most = line // 2, width // len(texts) - 2 * line
+    made = []
+    for i, lines in enumerate(texts):
+        lines = [shorten_text(text, most, scale, thickness) for text in lines]
+        wide = max(cv2.getTextSize(text, FACE, scale, thickness)[0][0] for text in lines) + 2 * margin
+        box = np.zeros((line * len(lines) + margin, wide), np.uint8)
+        for row, text in enumerate(lines, 1):
+            cv2.putText(box, text, (margin, row * line - margin // 4), FACE, scale, 255, thickness, cv2.LINE_AA)
+        left = margin + (width - wide - 2 * margin) * i // max(len(texts) - 1, 1)
+        made.append(Caption(max(left, 0), max(height - margin - len(box), 0), box[..., None] / np.float32(255)))
+    return made
+
+
+def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[int]]:
+    """Place the columns ``[frames,count+1]`` between which each of ``count`` scenes shows, 0 and ``width`` among them.
+
+    They begin evenly spread, and move together to the right, to the left, and back.
+    """
+    rounds = max(1, round(frames / fps / SWIPE_SECONDS))
+    sways = SWAY * np.sin(2 * np.pi * rounds * np.arange(frames) / frames)
+    places = (np.arange(count + 1) + sways[:, None]) * width / count
+    places[:, 0], places[:, -1] = 0, width
+    return [list(map(int, row)) for row in places.round()]
+
+
+def draw_swipe(pictures: Sequence[Picture], places: Sequence[int], captions: Sequence[Caption]) -> Picture:
+    """Join the columns of scenes from the same camera in one frame, each with its caption, with lines between."""
+    frame = np.empty_like(pictures[0])
+    half = max(1, frame.shape[1] // (2 * LINE))
+    for picture, caption, left, right in zip(pictures, captions, places[:-1], places[1:], strict=True):
+        caption.draw(picture)
+        frame[:, left:right] = picture[:, left:right]
+    for place in places[1:-1]:
+        frame[:, max(place - 2 * half, 0) : place + 2 * half] //= 2
+        frame[:, max(place - half, 0) : place + half] = 255
+    return frame
+
+
+class FfmpegWriter:
+    """Write frames as H.264 with the program ffmpeg, by the calls of :class:`cv2.VideoWriter`."""
+
+    def __init__(self, program: str, path: Path, size: tuple[int, int], fps: float) -> None:
+        frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-")
+        colors = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")  # as players expect of large frames
+        encoding = ("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4")
+        command = (program, "-v", "quiet", "-y", *frames, *colors, *encoding, str(path))
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+
+    def write(self, frame: np.ndarray) -> None:
+        """Add a frame ``[h,w,3]`` in the order blue, green, red."""
+        assert self.process.stdin is not None
+        with suppress(BrokenPipeError):  # it has ended: the frames that are missing are counted later
+            self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
+
+    def release(self) -> None:
+        """Finish the file."""
+        with suppress(BrokenPipeError):
+            self.process.communicate()
+
+
+def find_ffmpeg() -> str | None:
+    """Find a program ffmpeg that encodes H.264 on the PATH; None if there is none."""
+    program = shutil.which("ffmpeg")
+    with suppress(OSError):
+        if program is not None:
+            listed = subprocess.run((program, "-hide_banner", "-encoders"), capture_output=True, check=False).stdout
+            return program if b" libx264 " in listed else None
+    return None
+
+
+def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrite: bool = False) -> str:
+    """Write pictures ``[h,w,3]`` of one size as a video or a GIF, and return the name of its encoding.
+
+    A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise the first encoding that OpenCV has is
+    used. All frames of a GIF share a palette, and are in memory together.
+
+    Of a video one frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since
+    encodings require even sides. SceneError if OpenCV has no encoder for the ending of the name, or the file cannot be
+    written completely.
+    """
+    path = Path(path)
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        if path.suffix.lower() == GIF:
+            _write_gif(temporary, list(frames), fps)
+            return "GIF"
+        even = map(_to_even, frames)
+        first = next(even)
+        writer, encoding = _open_writer(path, temporary, first, fps)
+        written: list[Future[None]] = []
+
+        def encode(frame: Picture) -> None:
+            writer.write(frame[..., ::-1])
+
+        try:
+            with ThreadPoolExecutor(1) as encoder:  # which takes one thread, while the next frame is drawn
+                for frame in chain([first], even):
+                    if written:
+                        written[-1].result()
+                    written.append(encoder.submit(encode, frame))
+        finally:
+            with _silent_stderr():
+                writer.release()
+        _check_frames(path, temporary, len(written))
+    return encoding
+
+
+def _write_gif(path: Path, frames: Sequence[Picture], fps: float) -> None:
+    """Write a GIF that plays again and again, with the colours of a sample of all frames."""
+    step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
+    sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
+    palette = Image.fromarray(sample[None]).quantize(256)
+    first, *others = (Image.fromarray(frame).quantize(palette=palette) for frame in frames)
+    first.save(path, "GIF", save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+
+
+def _to_even(picture: Picture) -> Picture:
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def _open_writer(path: Path, temporary: Path, first: Picture, fps: float) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
+    """Open a file with the first available encoder; also return the name of its encoding."""
+    height, width = first.shape[:2]
+    if path.suffix.lower() == ".mp4" and (program := find_ffmpeg()):
+        return FfmpegWriter(program, temporary, (width, height), fps), H264
+    encoders = ENCODERS[path.suffix.lower()]
+    for code, name in encoders:
+        with _silent_stderr():
+            fourcc = cv2.VideoWriter.fourcc(*code)
+            writer = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
+        if writer.isOpened():
+            return writer, name
+    os.stat(str(temporary))  # fails, and says why, where the folder has vanished meanwhile
+    names = " and ".join(name for _, name in encoders)
+    raise SceneError(
+        path, f"this OpenCV cannot write it: it has none of the encoders {names}", f"{FOLDER}, or install {OPENCV}"
+    )
+
+
+def _check_frames(path: Path, temporary: Path, count: int) -> None:
+    """Raise a SceneError if frames of a video are missing, since encoders do not report a full disk."""
+    with _silent_stderr():
+        reader = cv2.VideoCapture(str(temporary), cv2.CAP_FFMPEG)
+        readable = 0
+        while reader.grab():
+            readable += 1
+        reader.release()
+    if readable != count:
+        os.stat(str(temporary))  # as in _open_writer
+        problem = f"could not be written whole: {readable} of {count} frames can be read"
+        raise SceneError(path, problem, "free some space, or write elsewhere")
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Suppress what OpenCV and FFmpeg print about encoders, at the level of the process."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # closed: there is nothing to keep away
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        with suppress(OSError, ValueError, AttributeError):
+            sys.stderr.flush()
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(sink)
+        os.close(kept)

@@ -1,0 +1,340 @@
+"""Collect the content of the page of a scene before and after: stills, cameras, scores, Gaussians."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+
+import cv2
+import numpy as np
+
+from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
+from gsmerge.facts.views import even_views
+from gsmerge.geometry import middle_depth
+from gsmerge.io.formats import spz
+from gsmerge.io.photo_files import encode_indexed, photo_array
+from gsmerge.measure.camera_path import outside_camera
+from gsmerge.measure.evaluate import (
+    INPUT,
+    EvaluateOptions,
+    Evaluation,
+    OnImage,
+    Progress,
+    Quality,
+    ResultScores,
+    evaluate,
+    near_plane,
+)
+from gsmerge.measure.fog import ALL, Fog
+from gsmerge.measure.lpips import lpips_available
+from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
+from gsmerge.raster import render
+from gsmerge.raster.photos import WHOLE
+from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.superpixels import segment
+from gsmerge.types import Cameras, Gaussians, Scene, Views
+
+LPIPS = "alex"  # the network of LPIPS where its weights are installed: 0.05 s a picture, the other one takes 0.8 s
+MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
+WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
+OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
+OUTLINE_LEVELS = 6  # of each channel in their colours: with the transparent one they fit a byte
+OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
+MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
+MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
+MIN_OPACITY = 1 / 255  # what is fainter is not drawn
+Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
+FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of the comparison: the scene itself or a result."""
+
+    name: str
+    num_gaussians: int
+    file_bytes: int
+    mean: Quality  # over the views that count: the held-out ones where there are any
+    splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
+    sh_degree: int  # of the harmonics that the page has
+    file_sh_degree: int  # of those in the file
+    fog: Fog | None  # of a result
+    covered_share: float | None  # of the pixels of these views, covered by the input
+    covered: Quality  # over those
+
+
+@dataclass(frozen=True)
+class PageView:
+    """A view that the page can jump to."""
+
+    name: str
+    place: int  # among all views, the input views first
+    held_out: bool
+    camera: Cameras  # one, in the page's frame
+    distance: float  # of what it looks at, in units of that frame
+    photo: bytes | None  # WebP
+    stills: tuple[bytes, ...]  # WebP, one for each side
+    scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
+    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
+    outside: bool = False  # a camera where no photo is; it has no scores
+
+
+@dataclass(frozen=True)
+class ViewData:
+    """Content of a page: scenes, views, scores and notes."""
+
+    title: str  # name of the scene
+    sides: tuple[Side, ...]  # the scene itself, then its results
+    views: tuple[PageView, ...]  # the worst of the first result first, of the scene without one
+    outside: PageView  # the view from outside of the capture
+    num_views: int  # views that were measured, which may be more
+    reference: str  # words for the pictures that scores compare with
+    notes: tuple[str, ...]  # warnings and limits, one sentence each
+    num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
+    lacks_pixels: bool = False  # whether the scene itself covers less than the input views
+
+    @property
+    def shown(self) -> tuple[PageView, ...]:
+        """The views, followed by the one from outside."""
+        return (*self.views, self.outside)
+
+    @property
+    def start(self) -> int:
+        """Index of the view on which the page opens: the view of median score, or the first without scores.
+
+        It is a held-out view if there are any, as for the figures at the top.
+        """
+        held_out = [i for i, view in enumerate(self.views) if view.held_out]
+        counted = held_out or range(len(self.views))
+        return counted[(len(counted) - 1) // 2] if self.scored else counted[0]
+
+    @property
+    def scored(self) -> bool:
+        """Whether views have scores: there are photos, or several scenes to compare."""
+        return len(self.sides) > 1 or any(view.photo is not None for view in self.views)
+
+    @property
+    def held_out(self) -> bool:
+        """Whether the means are over held-out views."""
+        return any(view.held_out for view in self.views)
+
+
+def collect(
+    title: str,
+    scene: Scene,
+    results: Mapping[str, Gaussians],
+    file_bytes: Sequence[int],
+    held_out: Views | None = None,
+    *,
+    cameras: Mapping[str, Cameras] | None = None,
+    segmentation: SegmentOptions | None = None,
+    threads: int | None = None,
+    progress: Progress = lambda *_: None,
+) -> ViewData:
+    """Draw and score a scene with at least one view, and its results, if any, in all views.
+
+    ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
+    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own.
+    """
+    stills: Stills = {}
+    nets = (LPIPS,) if lpips_available(LPIPS) else ()
+    options = EvaluateOptions(nets, threads=threads)
+    evaluation = evaluate(
+        scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
+    )
+    progress("superpixels and the view from outside", 0, 0)
+    with use_threads(threads):
+        return page_data(title, scene, results, file_bytes, held_out, evaluation, stills, segmentation)
+
+
+def still_keeper(stills: Stills) -> OnImage:
+    """Make a function for ``on_image`` of :func:`gsmerge.evaluate` that adds what is drawn to ``stills``."""
+
+    def keep(result: str, split: str, view: int, image: np.ndarray) -> None:
+        stills[result, split, view] = encode_still(to_picture(image))
+
+    return keep
+
+
+def page_data(
+    title: str,
+    scene: Scene,
+    results: Mapping[str, Gaussians],
+    file_bytes: Sequence[int],
+    held_out: Views | None,
+    evaluation: Evaluation,
+    stills: Stills,
+    segmentation: SegmentOptions | None = None,
+) -> ViewData:
+    """Make the content of a page of what was measured: see :func:`collect`."""
+    pictures = photo_array(with_row_colors(scene).images)
+    splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
+    splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
+    frame = scene_frame(scene)
+    named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    sides = [
+        _side(result, frame.enter(named[result.name]), size, "context" if held_out is None else "target")
+        for result, size in zip(evaluation.results, file_bytes, strict=True)
+    ]
+    means = frame.enter(named[evaluation.results[:2][-1].name]).means
+    views: list[PageView] = []
+    for split, (places, photos, names) in splits.items():
+        if split not in evaluation.num_views:  # only held-out views were measured
+            continue
+        encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
+        encoded = encoded or [None] * len(names)
+        for i, name in enumerate(short_names(names)):
+            camera = frame.enter_cameras(places[[i]])
+            views.append(PageView(
+                name=name,
+                place=len(views),
+                held_out=split == "target",
+                camera=camera,
+                distance=middle_depth(means, camera),
+                photo=encoded[i],
+                stills=tuple(stills[result.name, split, i] for result in evaluation.results),
+                scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
+            ))  # fmt: skip
+    outside = _outside_view(scene, named, frame, len(views))
+    shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
+    measured = evaluation.notes if results else ()  # which are about what was fitted
+    notes = (*measured, *_limits(sides, len(shown), len(views)))
+    share, _ = evaluation.results[0].mean_covered("context")
+    lacks_pixels = share is not None and share < WHOLE
+    return ViewData(
+        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes, num_superpixels, lacks_pixels
+    )
+
+
+def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
+    """Draw Gaussians of a scene's world from outside of its capture."""
+    camera, distance = outside_camera(scene.cameras.numpy(), scene.file_gaussians.means)
+    renders = (render(gaussians, camera, near=near_plane(scene)) for gaussians in named.values())
+    return PageView(
+        name=OUTSIDE,
+        place=place,
+        held_out=False,
+        camera=frame.enter_cameras(camera),
+        distance=distance / frame.unit,
+        photo=None,
+        stills=tuple(encode_still(to_picture(drawing.images[0])) for drawing in renders),
+        scores=(),
+        outside=True,
+    )
+
+
+def with_outlines(
+    views: Sequence[PageView], photos: np.ndarray, options: SegmentOptions
+) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
+    """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
+    places = [i for i, view in enumerate(views) if view.photo and not view.held_out]
+    if not places:
+        return tuple(views), None
+    pictures = photos[[views[i].place for i in places]]
+    groups = segment(pictures, options)
+    made = list(views)
+    for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
+        made[i] = replace(views[i], outlines=encode_outlines(picture, labels))
+    return tuple(made), (min(groups.counts), max(groups.counts))
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Shorten photo names by folders and endings, where the short names still differ."""
+    stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
+    return stems if len(set(stems)) == len(stems) else list(names)
+
+
+def encode_still(picture: Picture) -> bytes:
+    """Encode a picture as WebP."""
+    _, data = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, WEBP_QUALITY])
+    return bytes(data.tobytes())
+
+
+def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
+    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
+
+    Each border has the mean colour of its superpixel in ``photo [h,w,3]``, slightly lighter or, for light colours,
+    darker.
+    """
+    factor = max(1, OUTLINE_SIDE // max(labels.shape))
+    enlarged = labels.repeat(factor, 0).repeat(factor, 1)
+    means = mean_colors(photo, labels)
+    light = means.mean(1, keepdims=True) > 0.5
+    shifted = means + OUTLINE_SHIFT * (np.where(light, 0.0, 1.0) - means)
+    levels = np.round((OUTLINE_LEVELS - 1) * shifted).astype(np.uint8)
+    steps = np.array([OUTLINE_LEVELS**2, OUTLINE_LEVELS, 1], np.uint8)
+    ids = 1 + (levels * steps).sum(1, dtype=np.uint8)
+    every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
+    colors = np.concatenate([np.zeros((1, 3)), every]).astype(np.uint8)
+    return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0).astype(np.uint8), colors)
+
+
+def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
+    splats, degree = pack_splats(gaussians)
+    mean, highest = result.mean(split)[1], highest_degree(gaussians.shN)
+    fog = result.fog.get(ALL)
+    covered = result.mean_covered(split)
+    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest, fog, *covered)
+
+
+def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
+    """Choose at most ``MAX_VIEWS`` views and the worst one, sorted by the scores of the first result, worst first."""
+
+    def quality(view: PageView) -> float:
+        score = view.scores[:2][-1].psnr
+        return np.inf if score is None else score
+
+    ids = set(even_views(len(views), min(len(views), MAX_VIEWS)))
+    ids.add(min(range(len(views)), key=lambda i: quality(views[i])))
+    return tuple(sorted((views[i] for i in sorted(ids)), key=quality))
+
+
+def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
+    """List what the page leaves out: Gaussians, harmonics and views."""
+    notes = []
+    for side in sides:
+        if side.splats is None:
+            notes.append(
+                f"{side.name}: {side.num_gaussians:,} Gaussians are too many for a page, which takes"
+                f" {MAX_GAUSSIANS:,}: stills only"
+            )
+        elif side.sh_degree < side.file_sh_degree:
+            notes.append(f"{side.name}: in 3D with harmonics up to degree {side.sh_degree} of {side.file_sh_degree}")
+    if num_shown < num_views:
+        notes.append(f"{num_shown} of {num_views} views are shown, the worst among them; means are over all")
+    return notes
+
+
+def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
+    """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
+
+    Neighbouring rows are similar, so the bytes of a ``.spz`` are stored as differences from the row before, column by
+    column, in 60 % of its size. The gzip stream has the header of an uncompressed ``.spz`` of version 3, the checksum
+    of its whole content (CRC-32, little-endian), and the columns; the page's script restores the ``.spz``.
+    ``gaussians`` are in the page's frame, where the scene is about 1 large: browsers keep means in 16 bits.
+    """
+    drawn = gaussians.opacities >= MIN_OPACITY
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
+        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
+    count = int(drawn.sum())
+    if count > MAX_GAUSSIANS:
+        return None, 0
+    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREES[3])
+    degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
+    columns = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
+    header = columns.header(3)
+    checksum = zlib.crc32(header)
+    for part in columns.parts:
+        checksum = zlib.crc32(part.tobytes(), checksum)
+    planes = [np.diff(part, axis=0, prepend=part[:1] & 0).T.tobytes() for part in columns.parts]
+    return gzip.compress(b"".join([header, checksum.to_bytes(4, "little"), *planes]), mtime=0), degree
+
+
+def highest_degree(harmonics: np.ndarray) -> int:
+    """Return the highest degree at which harmonics ``[n,k-1,3]`` are not all zero."""
+    used = np.flatnonzero(harmonics.any((0, 2)))
+    return int(np.sqrt(used[-1] + 1)) if len(used) else 0

@@ -1,0 +1,236 @@
+"""Fill the templates of pages; everything that a page shows is in its one file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmerge import __version__
+from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.pages.data import PageView, ViewData
+from gsmerge.runtime.memory import human_bytes
+from gsmerge.types import Cameras
+
+if TYPE_CHECKING:
+    import jinja2
+
+# What a page may load and run: its own scripts and styles, which the policy names by their hashes
+PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
+# Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
+SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
+POLICY = "{policy}"  # stands for it in the templates until the hashes are known
+NONE = "-"  # in place of a figure
+ENGINE = "vendor/spark-three.js.gz"
+
+
+def view_page(data: ViewData) -> str:
+    """Make the HTML page of a scene and its results."""
+    photos = any(view.photo is not None for view in data.views)
+    picture = "own colours" if data.reference == ROW_COLORS else "photo"
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if photos else []
+    sources += [
+        {"name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians}
+        for i, side in enumerate(data.sides)
+    ]
+    right = min(int(photos) + 1, len(sources) - 1)
+    left = max(right - 1, 0)
+    stills = [
+        [None if still is None else data_uri(still, "image/webp") for still in (view.photo, *view.stills)[not photos :]]
+        for view in data.shown
+    ]
+    opened = stills[data.start]
+    first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
+    opened[left] = opened[right] = None
+    splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
+    engine = files("gsmerge.pages").joinpath(ENGINE).read_bytes() if splats else None
+    places = range(min(len(data.sides) - 1, 1), len(data.sides))
+    results = [(_unbroken(headline(data, place)), figures(data, place)) for place in places]
+    return render_template(
+        "view.html",
+        policy=SOLID,
+        data=data,
+        results=results,
+        table=results_table(data),
+        sources=sources,
+        left=left,
+        right=right,
+        first=first,
+        json_data={
+            "sources": sources,
+            "photos": photos,
+            "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
+            "start": data.start,
+            "results": [
+                {"headline": line, "figures": [[figure.new, figure.better] for figure in row]} for line, row in results
+            ],
+            "views": [_view(view) for view in data.shown],
+        },
+        stills=stills,
+        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.shown],
+        splats=splats,
+        engine=engine and base64_text(engine),
+    )
+
+
+def headline(data: ViewData, place: int = 1) -> str:
+    """Write the headline of a result: share of Gaussians and change of quality; for one scene alone its size."""
+    before = data.sides[0]
+    if len(data.sides) == 1:
+        quality = before.mean.psnr
+        has_quality = quality is not None and np.isfinite(quality)
+        return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
+    after, reference = data.sides[place], PHOTOS if data.held_out else data.reference
+    old, new = before.mean.psnr, after.mean.psnr
+    share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
+    said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
+    if new is None or old is None or not np.isfinite(new):
+        return said
+    if not np.isfinite(old):  # the input itself is the reference
+        return f"{said}, {new:.1f} dB from the input's own renders"
+    words = ROW_COLORS if reference == ROW_COLORS else "the photos"
+    return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure at the top of the page, of the scene itself and of a result."""
+
+    label: str
+    old: str
+    new: str
+    better: bool  # than the scene's own
+
+
+def figures(data: ViewData, place: int) -> list[Figure]:
+    """Collect the figures at the top for one side: size and mean quality."""
+    before, after = data.sides[0], data.sides[place]
+    sizes = [
+        Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", False),
+        Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
+    ]
+    views = "held-out photos" if data.held_out else "input photos" if data.reference == PHOTOS else data.reference
+    qualities = [
+        (f"PSNR, {views}", "psnr", before.mean, after.mean),
+        (f"SSIM, {views}", "ssim", before.mean, after.mean),
+    ]
+    if data.lacks_pixels:
+        label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
+        qualities.append((label, "psnr", before.covered, after.covered))
+    made = []
+    for label, name, *pair in qualities:
+        digits, unit = (2, " dB") if name == "psnr" else (3, "")
+        old, new = (getattr(quality, name) for quality in pair)
+        if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
+            better = place > 0 and old is not None and new is not None and old < new
+            made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, better))
+    return sizes + (made if data.scored else [])
+
+
+def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
+    """Make the table over all results: head and rows, without columns that have no figure."""
+    first = data.sides[0]
+    columns: dict[str, list[str]] = {
+        "": [side.name for side in data.sides],
+        "Gaussians": [f"{side.num_gaussians:,}" for side in data.sides],
+        "Share": [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides],
+        "File": [human_bytes(side.file_bytes) for side in data.sides],
+    }
+    for head, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips_alex", 3)):
+        columns[head] = [_number(getattr(side.mean, name), digits) for side in data.sides]
+    if data.lacks_pixels:
+        columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
+    for head, name in (("Near fog", "fog_near"), ("Far fog", "fog_far"), ("Holes", "holes")):
+        columns[head] = [_number(getattr(side.fog, name, None), 3) for side in data.sides]
+    filled = {head: cells for head, cells in columns.items() if set(cells) != {NONE}}
+    return list(filled), [list(row) for row in zip(*filled.values(), strict=True)]
+
+
+def _unbroken(text: str) -> str:
+    """Prevent line breaks between numbers and their units."""
+    return text.replace(" dB", "\u00a0dB").replace(" %", "\u00a0%")
+
+
+def _number(value: float | None, digits: int) -> str:
+    """Format a number; a missing one and the infinite PSNR of equal pictures are written as none."""
+    return NONE if value is None or value == float("inf") else f"{value:.{digits}f}"
+
+
+def _view(view: PageView) -> dict[str, Any]:
+    """Convert a view for the page's script."""
+    return {
+        "name": view.name,
+        "held_out": view.held_out,
+        "outside": view.outside,
+        **camera_numbers(view.camera, view.distance),
+        "scores": [[_finite(score.psnr), _finite(score.ssim), _finite(score.lpips_alex)] for score in view.scores],
+    }
+
+
+def camera_numbers(camera: Cameras, distance: float) -> dict[str, Any]:
+    """Describe a camera for a page's script: row-major world to camera, intrinsics in pixels, distance of the scene."""
+    return {
+        "viewmat": camera.viewmats[0].reshape(-1).tolist(),
+        "K": [float(camera.Ks[0, row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))],
+        "width": camera.width,
+        "height": camera.height,
+        "distance": distance,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    """Round a number for JSON, where the infinite PSNR of equal pictures has no value."""
+    return None if value is None or value == float("inf") else round(value, 4)
+
+
+def data_uri(content: bytes, kind: str) -> str:
+    """Encode content as a ``data:`` address."""
+    return f"data:{kind};base64,{base64_text(content)}"
+
+
+def base64_text(content: bytes) -> str:
+    """Encode bytes in base64."""
+    return base64.b64encode(content).decode("ascii")
+
+
+def render_template(name: str, policy: str, **values: Any) -> str:
+    """Fill a template with values, escaped except where the template says otherwise.
+
+    ``policy`` is what the page may load; hashes of its elements take the places of ``{script}`` and
+    ``{style}``.
+    """
+    text = _environment().get_template(name).render(version=__version__, **values)
+    text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may hold halves of characters
+    hashes = {kind: " ".join(_hashes(text, kind)) for kind in ("script", "style")}
+    return text.replace(POLICY, html.escape(policy.format(**hashes)), 1)
+
+
+def _hashes(page: str, kind: str) -> list[str]:
+    """Return the hashes of a page's own scripts or styles, as a content security policy names them.
+
+    Elements of another type are data, which a browser does not run.
+    """
+    contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
+    digests = [hashlib.sha256(content.encode()).digest() for content in contents]
+    return [f"'sha256-{base64_text(digest)}'" for digest in dict.fromkeys(digests)]
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    import jinja2
+
+    loader = jinja2.PackageLoader("gsmerge.pages")
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    made.filters |= {"bytes": human_bytes, "number": _number}
+    made.policies["json.dumps_function"] = lambda value, **_: json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return made

@@ -1,0 +1,277 @@
+"use strict";
+// What is shown, and where. Results (results.js) and gestures (gestures.js) change it; 3D (scene.js), which may never
+// come, draws it.
+
+const id = (name) => document.getElementById(name);
+const data = JSON.parse(id("data").textContent);
+const stage = id("stage");
+const state = {
+  view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
+  order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0, scheme: "",
+  result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
+};
+const BLINK = 700; // milliseconds
+const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
+const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
+const OUTLINES = 0.8; // opacity of superpixels' outlines
+const NARROW = 640; // pixels of the stage, below which sides go one above the other
+let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
+let outlines = []; // per view the borders of its superpixels, where there are any
+let solid = null; // the 3D view, once it is there
+let blinking = 0; // the timer
+let chosen = false; // whether the reader has chosen stills or 3D
+
+const clamp = (value, least, most) => Math.max(least, Math.min(most, value));
+const view = () => data.views[state.view];
+const inSolid = (source) => Boolean(state.solid && solid && solid.has(source));
+
+function stillOf(source) {
+  return stills ? stills[state.view][source] : null;
+}
+
+// Which of the sides are seen, and where: shares of the stage from its top left corner.
+function panes() {
+  const whole = [0, 0, 1, 1];
+  const { left, right, at } = state;
+  if (state.mode === "side") {
+    const boxes = stage.classList.contains("stacked") ? [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] : [[0, 0, 0.5, 1], [0.5, 0, 0.5, 1]];
+    return [left, right].map((source, i) => ({ source, box: boxes[i], clip: boxes[i] }));
+  }
+  if (state.mode === "blink" || state.other) {
+    return [{ source: state.other ? right : left, box: whole, clip: whole }];
+  }
+  const clips = state.mode === "swipe" ? [[0, 0, at, 1], [at, 0, 1 - at, 1]] : [whole, whole];
+  return [left, right].map((source, i) => ({ source, box: whole, clip: clips[i] }));
+}
+
+function frame() {
+  const box = stage.getBoundingClientRect();
+  const scale = window.devicePixelRatio || 1;
+  let [width, height] = [box.width * scale, box.height * scale];
+  if (state.pixels === "photo") {
+    const side = state.mode === "side";
+    const stacked = stage.classList.contains("stacked");
+    [width, height] = [view().width * (side && !stacked ? 2 : 1), view().height * (side && stacked ? 2 : 1)];
+  }
+  const { background, shape } = state;
+  return {
+    width: Math.round(width), height: Math.round(height), panes: panes(), difference: state.mode === "difference" && !state.other,
+    background, shape, frustums: Boolean(state.frustums), shown: Boolean(state.solid), exact: state.pixels === "photo",
+  };
+}
+
+// As large as the window allows from where the stage begins, so that its lower edge is seen without scrolling.
+function fitStage() {
+  const { width, height } = view();
+  const side = state.mode === "side";
+  stage.classList.toggle("stacked", side && stage.parentElement.clientWidth < NARROW && width > height);
+  const stacked = stage.classList.contains("stacked");
+  const above = stage.getBoundingClientRect().top + (document.fullscreenElement ? 0 : window.scrollY);
+  stage.style.setProperty("--ratio", ((side && !stacked ? 2 : 1) * width) / ((stacked ? 2 : 1) * height));
+  stage.style.setProperty("--above", `${Math.ceil(above)}px`);
+}
+
+// Stills only: 3D goes nearer instead.
+function showZoom() {
+  const zoom = state.solid ? 1 : state.zoom;
+  const [x, y] = state.centre.map((at) => `${100 * (0.5 - zoom * at)}%`);
+  const pane = panes()[0].box[2] * stage.clientWidth;
+  stage.classList.toggle("zoomed", zoom > 1);
+  stage.classList.toggle("squares", (zoom * pane) / view().width >= PIXELS);
+  for (const [name, value] of [["--x", x], ["--y", y], ["--zoom", zoom]]) stage.style.setProperty(name, value);
+  id("back").hidden = state.atCamera && zoom === 1;
+  id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
+}
+
+// Lays a picture over a side: the photo, or outlines.
+function lay(layer, address, opacity) {
+  layer.hidden = !address || opacity === 0;
+  if (layer.hidden) return;
+  if (layer.dataset.shown !== String(state.view)) layer.style.backgroundImage = `url("${address}")`;
+  layer.dataset.shown = state.view;
+  layer.style.opacity = opacity;
+}
+
+function show() {
+  stage.dataset.mode = state.other && state.mode !== "side" ? "blink" : state.mode;
+  stage.classList.toggle("solid", Boolean(state.solid));
+  stage.style.setProperty("--at", `${100 * state.at}%`);
+  fitStage();
+  showZoom();
+  const seen = panes().map((pane) => pane.source);
+  const twice = state.left === state.right;
+  const missing = [];
+  const plain = state.atCamera && state.mode !== "difference";
+  for (const side of ["left", "right"]) {
+    const source = state[side];
+    const here = seen.includes(source) && !(twice && seen.length === 1 && side === "right");
+    const drawn = inSolid(source);
+    const still = stillOf(source);
+    const picture = id(side);
+    picture.hidden = !here || drawn || !state.atCamera || (stills && !still);
+    if (!picture.hidden && still && picture.src !== still) picture.src = still;
+    picture.alt = data.sources[source].name;
+    const pane = id(`${side}-pane`);
+    pane.hidden = !here;
+    lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
+    lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
+    const tag = id(`${side}-tag`);
+    tag.hidden = !here;
+    tag.textContent = data.sources[source].name;
+    if (here && !drawn && ((state.solid && !state.atCamera) || (stills && !still))) missing.push(data.sources[source].name);
+  }
+  id("message").hidden = missing.length === 0;
+  id("message").textContent = `${[...new Set(missing)].join(" and ")}: at the photos' cameras only`;
+  id("handle").hidden = stage.dataset.mode !== "swipe";
+  id("handle").setAttribute("aria-valuenow", Math.round(100 * state.at));
+  for (const button of document.querySelectorAll("[data-set]")) {
+    button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
+  }
+  showLimits();
+  if (solid && state.solid) solid.request();
+}
+
+// Greys out what has no effect now, and says why.
+function showLimits() {
+  const away = !state.atCamera ? "From the photo's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
+  const none = solid ? "" : id("status").textContent || "3D is not there yet";
+  const flat = state.solid ? "" : none || "In 3D only";
+  const outside = view().outside ? "No photo is outside" : "";
+  const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
+  const reasons = { shape: flat, frustums: flat, background: flat, pixels: flat, outlines: bare || away };
+  for (const button of document.querySelectorAll("[data-set]")) {
+    const { set: name, value } = button.dataset;
+    grey(button, name === "solid" && value ? none : reasons[name]);
+  }
+  if (id("overlay-share")) grey(id("overlay-share"), outside || away);
+  grey(id("full"), document.fullscreenEnabled ? "" : "This browser has no full screen");
+}
+
+function grey(control, reason) {
+  control.disabled = Boolean(reason);
+  control.title = reason || "";
+}
+
+// To the camera of a view, exactly.
+function jump(index) {
+  state.view = clamp(index, 0, data.views.length - 1);
+  state.atCamera = true;
+  for (const card of id("strip").children) {
+    const current = Number(card.dataset.view) === state.view;
+    card.setAttribute("aria-current", String(current));
+    if (current && stills) {
+      const strip = id("strip").getBoundingClientRect();
+      const box = card.getBoundingClientRect();
+      if (box.left < strip.left || box.right > strip.right) id("strip").scrollLeft += box.left - strip.left - (strip.width - box.width) / 2;
+    }
+  }
+  if (solid) solid.look(state.view);
+  showNumbers();
+  show();
+}
+
+function stepBack() {
+  jump(data.views.findIndex((one) => one.outside));
+}
+
+function set(name, value) {
+  state[name] = value;
+  if (name === "solid") chosen = true;
+  if (name === "mode") state.other = false;
+  if (name === "order") orderStrip();
+  if (name === "scheme") document.documentElement.className = value;
+  if (name === "left" || name === "right") {
+    const result = [state.right, state.left].find((source) => source >= FIRST_RESULT);
+    if (result !== undefined && result !== state.result) showResult(result);
+    if (solid) load(solid).then(show);
+  }
+  show();
+}
+
+function swipeTo(share) {
+  state.at = clamp(share, 0, 1);
+  show();
+}
+
+function toggleFull() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else if (document.fullscreenEnabled) stage.parentElement.requestFullscreen().catch((error) => say(error.message));
+}
+
+// The strip, when the stills have come.
+function startStrip() {
+  stills = JSON.parse(id("stills").textContent);
+  outlines = JSON.parse(id("outline-pictures").textContent);
+  stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
+  const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
+  for (const card of id("strip").children) {
+    const still = stills[card.dataset.view].find((one, i) => one && i >= shown);
+    if (still) card.querySelector("img").src = still;
+  }
+  jump(data.start);
+}
+
+function say(words) {
+  id("status").textContent = words;
+  showLimits();
+}
+
+// Takes in what the sides show; without a GPU nothing that would take minutes for a frame.
+async function load(made) {
+  for (const source of [state.left, state.right]) {
+    const { splats, count } = data.sources[source];
+    const drawable = splats && !(made.software && count > SOFTWARE_MOST);
+    if (drawable && !made.has(source) && id(splats)) await made.add(source, await unpackSplats(takeBytes(splats)));
+  }
+}
+
+async function startScene() {
+  const probe = document.createElement("canvas");
+  if (!id("engine")) return say("Stills only: too many Gaussians for a page");
+  if (!window.DecompressionStream || !probe.getContext("webgl2")) return say("Stills only: this browser has no WebGL 2");
+  say("3D loads …");
+  const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
+  await painted().then(painted); // the first still comes first
+  try {
+    await loadVendor(takeBytes("engine"));
+    const moved = () => {
+      if (state.atCamera) {
+        state.atCamera = false;
+        show();
+      }
+    };
+    const settle = (settled) => stage.setAttribute("aria-busy", String(!settled));
+    const made = new SplatView(id("canvas"), data.views, frame, moved, settle);
+    made.look(state.view);
+    await load(made);
+    if (!made.software) await made.prepare();
+    solid = made;
+    if (solid.current !== state.view) solid.look(state.view);
+    id("canvas").addEventListener("webglcontextlost", () => {
+      [solid, state.solid] = [null, ""];
+      jump(state.view);
+      say("3D was lost: reload the page");
+    });
+    if (!chosen && !solid.software) state.solid = "1";
+    say(solid.software ? "no GPU: 3D is slow and coarse, and shows small scenes only" : "");
+    show();
+  } catch (error) {
+    [solid, state.solid] = [null, ""];
+    say(`Stills only: ${error.message}`);
+    show();
+  }
+}
+
+const inPage = new Map();
+
+function start() {
+  for (const side of ["left", "right"]) {
+    state[side] = Number(id(`${side}-source`).value);
+    inPage.set(state[side], id(side).getAttribute("src"));
+  }
+  state.result = Math.max(state.right, FIRST_RESULT);
+  listen();
+  show();
+  showNumbers();
+  markResult();
+}

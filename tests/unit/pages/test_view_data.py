@@ -1,0 +1,273 @@
+"""What a page shows: pictures, cameras, numbers, Gaussians."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from dataclasses import replace
+from operator import attrgetter
+
+import cv2
+import motions
+import numpy as np
+import pytest
+import scenes
+from messages import noted
+
+from gsmerge import Gaussians, Scene, evaluate, render
+from gsmerge.facts.prepare import scene_frame
+from gsmerge.facts.row_colors import ROW_COLORS
+from gsmerge.io.formats.spz import spz_bytes
+from gsmerge.measure.camera_path import outside_camera
+from gsmerge.measure.evaluate import EvaluateOptions, near_plane
+from gsmerge.measure.lpips import lpips_available
+from gsmerge.measure.preview import to_picture
+from gsmerge.pages import data
+from gsmerge.pages.data import ViewData, collect, encode_still, pack_splats, short_names
+from gsmerge.raster.metrics import psnr
+from gsmerge.stages.segment import SegmentOptions, segment
+from gsmerge.types import Views
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120), noise=0.05)
+
+
+@pytest.fixture(scope="module")
+def half(scene: Scene) -> Gaussians:
+    return scene.gaussians[::2]
+
+
+@pytest.fixture(scope="module")
+def small() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.05)
+
+
+@pytest.fixture(scope="module")
+def held_out() -> Views:
+    other = scenes.make_scene(scenes.room(), scenes.arc(2, 180, 108))
+    return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
+
+
+@pytest.fixture(scope="module")
+def actual(scene: Scene, half: Gaussians, held_out: Views) -> ViewData:
+    return collect("room", scene, {"half": half, "all": scene.gaussians}, (300, 200, 100), held_out)
+
+
+def decoded(still: bytes | None) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(still, np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(image[..., ::-1], np.float32) / 255
+
+
+def unpacked(packed: bytes | None) -> bytes:
+    """The uncompressed .spz of what the page holds: sums down every column."""
+    raw = gzip.decompress(packed)
+    count, degree = struct.unpack_from("<IB", raw, 8)
+    columns, at = [], 20
+    for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
+        planes = np.frombuffer(raw, np.uint8, width * count, at).reshape(width, count)
+        columns.append(np.cumsum(planes, axis=1, dtype=np.uint8).T.tobytes())
+        at += width * count
+    content = raw[:16] + b"".join(columns)
+    assert (len(raw), zlib.crc32(content)) == (at, struct.unpack_from("<I", raw, 16)[0])
+    return content
+
+
+def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+    nets = (data.LPIPS,) if lpips_available(data.LPIPS) else ()
+    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets))
+    by_place = sorted(actual.views, key=lambda view: view.place)
+    for side, result in enumerate(expected.results):
+        assert [view.scores[side] for view in by_place] == [score.masked for score in result.scores]
+        assert actual.sides[side].mean == result.mean("target")[1]
+        assert actual.sides[side].fog == result.fog.get("all")
+    assert [side.name for side in actual.sides] == ["input", "half", "all"]
+    assert [side.file_bytes for side in actual.sides] == [300, 200, 100]
+    assert [view.held_out for view in by_place] == [False, False, False, True, True]
+
+
+def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
+    """Of those that the figures at the top are of: the held-out ones, otherwise the inputs."""
+    inputs = replace(actual, views=tuple(view for view in actual.views if not view.held_out))
+    values = [view.scores[1].psnr or 0 for view in inputs.views]
+    assert values[inputs.start] == np.median(values)
+    assert replace(inputs, views=inputs.views[:1]).start == 0
+    assert actual.start == next(place for place, view in enumerate(actual.views) if view.held_out)
+    best = max((view for view in actual.views if view.held_out), key=lambda view: view.scores[1].psnr or 0)
+    assert replace(actual, views=(*inputs.views, best)).start == 3
+
+
+def test_one_scene_alone(small: Scene) -> None:
+    alone = collect("room", small, {}, (300,))
+    assert [side.name for side in alone.sides] == ["input"]
+    assert alone.notes == ()
+    values = [view.scores[0].psnr or 0 for view in alone.views]
+    assert values == sorted(values)
+    assert alone.scored
+    assert not collect("room", replace(small, images=None, pixel_ids=None), {}, (300,)).scored
+
+
+def test_the_worst_view_comes_first(actual: ViewData) -> None:
+    values = [view.scores[1].psnr for view in actual.views]
+    assert len(values) == actual.num_views == 5
+    assert values == sorted(values, key=lambda value: value or 0)
+
+
+def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
+    for view in actual.views:
+        split, i = (held_out, view.place - 3) if view.held_out else (scene, view.place)
+        renders = [
+            render(some, split.cameras[[i]], near=near_plane(scene)).images[0].clip(0, 1)
+            for some in (scene.gaussians, half)
+        ]
+        for still, picture in zip((view.photo, *view.stills), (split.images[i], *renders), strict=False):
+            assert psnr(decoded(still), picture) > 34  # 41 where pictures are not as small and colourful
+
+
+def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) -> None:
+    camera, distance = outside_camera(scene.cameras, scene.gaussians.means)
+    for some, still in zip((scene.gaussians, half), actual.outside.stills, strict=False):
+        assert psnr(decoded(still), render(some, camera, near=near_plane(scene)).images[0].clip(0, 1)) > 30
+    frame = scene_frame(scene)
+    assert actual.outside.distance == pytest.approx(distance / frame.unit)
+    np.testing.assert_allclose(actual.outside.camera.viewmats, frame.enter_cameras(camera).viewmats)
+    assert (actual.outside.photo, actual.outside.scores, actual.outside.outlines) == (None, (), None)
+    assert actual.outside not in actual.views
+
+
+def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
+    """What a view sees in the world it sees in the page's frame."""
+    raw = unpacked(actual.sides[1].splats)
+    count, _, fraction = struct.unpack_from("<IBB", raw, 8)
+    drawn = half.means[half.opacities >= data.MIN_OPACITY]
+    assert count == len(drawn)
+    triples = np.frombuffer(raw, np.uint8, 9 * count, 16).reshape(-1, 3)
+    fixed = np.pad(triples, ((0, 0), (0, 1))).view("<i4")[:, 0]
+    means = ((fixed + 2**23) % 2**24 - 2**23).reshape(-1, 3) / 2.0**fraction
+    view = next(view for view in actual.views if view.place == 1)
+    ours = means @ view.camera.viewmats[0, :3, :3].T + view.camera.viewmats[0, :3, 3]
+    world = drawn @ scene.cameras.viewmats[1, :3, :3].T + scene.cameras.viewmats[1, :3, 3]
+    assert np.allclose(ours[:, :2] / ours[:, 2:], world[:, :2] / world[:, 2:], atol=1e-3)
+    assert view.distance == pytest.approx(np.median(ours[:, 2]), rel=0.3)
+
+
+def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    half = small.gaussians[::2]
+    monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
+    actual = collect("room", small, {"half": half}, (2, 1))
+    assert actual.sides[0].splats is None
+    assert actual.sides[1].splats is not None
+    assert noted(actual.notes, "stills")
+
+
+def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    curved = replace(half, shN=np.full((len(half), 15, 3), 0.1, np.float32))
+    assert pack_splats(curved)[1] == 3
+    monkeypatch.setattr(data, "MAX_SPZ_BYTES", 45 * len(half))
+    content, degree = pack_splats(curved)
+    assert degree == 2
+    assert len(unpacked(content)) < 45 * len(half)
+
+
+def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
+    half = small.gaussians[::2]
+    flat = np.zeros((len(half), 15, 3), np.float32)
+    flat[:, :3] = 0.1
+    assert pack_splats(replace(half, shN=flat))[1] == 1
+    assert pack_splats(replace(half, shN=0 * flat)) == pack_splats(half)
+    actual = collect("room", small, {"half": replace(half, shN=flat)}, (2, 1))
+    assert not any("harmonics" in note for note in actual.notes)
+
+
+def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
+    packed, _ = pack_splats(scene.gaussians)
+    assert len(packed) < 0.8 * len(spz_bytes(scene.gaussians))
+
+
+def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
+    means, opacities = half.means.copy(), half.opacities.copy()
+    means[0, 1], opacities[1] = np.nan, 0.003
+    content, _ = pack_splats(replace(half, means=means, opacities=opacities))
+    whole, _ = pack_splats(half)
+    counts = [struct.unpack_from("<I", unpacked(one), 8)[0] for one in (content, whole)]
+    assert counts[0] == counts[1] - 2
+
+
+def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
+    assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
+    assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
+    view = next(view for view in actual.views if view.place == 1)
+    labels = segment(scene.images, SegmentOptions()).labels[1]
+    picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
+    factor = 1280 // 160
+    assert picture.shape == (120 * factor, 160 * factor, 4)
+    lines = picture[..., 3] > 0
+    enlarged = labels.repeat(factor, 0).repeat(factor, 1)[lines]
+    counts = np.bincount(labels.reshape(-1))[:, None]
+    sums = [np.bincount(labels.reshape(-1), channel) for channel in scene.images[1].reshape(-1, 3).T]
+    away = picture[lines][:, 2::-1] / 255 - (np.stack(sums, 1) / counts)[enlarged]
+    assert np.abs(away).max() < 0.5  # a third of the way to black or white, in steps of a fifth
+    assert 0.1 < np.abs(away).mean() < 0.35
+    right, below = lines[factor // 2 :: factor, ::factor], lines[::factor, factor // 2 :: factor]
+    np.testing.assert_array_equal(right[:, 1:], labels[:, 1:] != labels[:, :-1])
+    np.testing.assert_array_equal(below[1:], labels[1:] != labels[:-1])
+    assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
+
+
+def test_superpixels_as_asked_for(small: Scene) -> None:
+    asked = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), segmentation=SegmentOptions(superpixels=50))
+    assert asked.num_superpixels == (50, 50)
+    none = collect("room", replace(small, images=None, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
+    assert none.num_superpixels is None
+    assert {view.outlines for view in none.views} == {None}
+
+
+def test_many_views_are_thinned(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(data, "MAX_VIEWS", 1)
+    actual = collect("room", small, {"half": small.gaussians[::2]}, (2, 1))
+    everything = evaluate(small, {"half": small.gaussians[::2]}, None, EvaluateOptions(lpips=())).results[1].scores
+    assert 1 <= len(actual.views) <= 2
+    assert actual.views[0].scores[1].psnr == min(score.masked.psnr or 0 for score in everything)
+    assert noted(actual.notes, f"{len(actual.views)} of 3")
+
+
+def test_without_photos_results_are_compared_with_the_input(small: Scene) -> None:
+    bare = replace(small, images=None)
+    actual = collect("room", replace(bare, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
+    assert [view.photo for view in actual.views] == [None] * 3
+    assert actual.reference == "renders of the input"
+    colored = collect("room", bare, {"half": small.gaussians[::2]}, (2, 1))
+    assert all(view.photo is not None for view in colored.views)
+    assert colored.reference == ROW_COLORS
+
+
+@pytest.mark.parametrize(
+    ("names", "short"),
+    [
+        (("images/a.png", "images/b.png"), ["a", "b"]),
+        (("left\\0.png", "right\\0.png"), ["left\\0.png", "right\\0.png"]),
+        (("a.png", "a.jpg"), ["a.png", "a.jpg"]),
+        ((), []),
+    ],
+)
+def test_short_names(names: tuple[str, ...], short: list[str]) -> None:
+    assert short_names(names) == short
+
+
+def test_a_still_keeps_red_red() -> None:
+    red = np.zeros((16, 16, 3), np.float32)
+    red[..., 0] = 1
+    assert psnr(decoded(encode_still(to_picture(red))), red) > 30
+
+
+def test_stills_of_a_result_are_from_its_own_cameras(small: Scene) -> None:
+    own = replace(small.cameras, viewmats=motions.random_motions(len(small), 2.0, 0.1) @ small.cameras.viewmats)
+    given, moved = (
+        collect("room", small, {"half": small.gaussians[::2]}, (2, 1), cameras=one) for one in (None, {"half": own})
+    )
+    for before, after in zip(*(sorted(one.views, key=attrgetter("place")) for one in (given, moved)), strict=True):
+        assert before.stills[0] == after.stills[0]
+        assert before.stills[1] != after.stills[1]
+        np.testing.assert_array_equal(before.camera.viewmats, after.camera.viewmats)

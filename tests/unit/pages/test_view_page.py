@@ -1,0 +1,322 @@
+"""The page: complete in one file, and nothing in it that a name could have put there."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from dataclasses import replace
+from importlib.resources import files
+
+import pytest
+import scenes
+from page_policy import check_policy
+
+from gsmerge.measure.evaluate import EvaluateOptions, Quality, evaluate
+from gsmerge.measure.fog import Fog
+from gsmerge.measure.preview import view_pictures
+from gsmerge.measure.scores import evaluation_document
+from gsmerge.pages.data import ViewData, collect
+from gsmerge.pages.page import headline, report_page, results_table, view_page
+
+EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
+WEBP = "data:image/webp;base64,"
+NAMES = ("images/<i>0</i>.png", "images/1.png", EVIL)
+
+
+@pytest.fixture(scope="module")
+def data() -> ViewData:
+    scene = replace(scenes.make_scene(scenes.room(), scenes.arc(3)), names=NAMES)
+    return collect(EVIL, scene, {EVIL: scene.gaussians[::2]}, (2_000_000, 1000))
+
+
+@pytest.fixture(scope="module")
+def page(data: ViewData) -> str:
+    return view_page(data)
+
+
+def block(page: str, name: str) -> str:
+    found = re.search(rf'<script type="[a-z/]+" id="{name}">(.*?)</script>', page, re.DOTALL)
+    return found[1]
+
+
+def test_it_loads_nothing(page: str) -> None:
+    addresses = re.findall(r"""(?:src|href)=["']([^"']+)["']|url\(([^)]+)\)""", _written(page))
+    assert len(addresses) >= 3
+    assert all(one.startswith(("data:", '"${')) for pair in addresses for one in pair if one)
+    assert re.findall(r"https?:|[\"']//", _written(page)) == []
+    assert "Content-Security-Policy" in page
+    assert "default-src &#x27;none&#x27;" in page
+
+
+@pytest.mark.parametrize("name", ["page", "report"])
+def test_its_own_scripts_and_styles_alone_may_run(name: str, request: pytest.FixtureRequest) -> None:
+    """The policy names them by their hashes, and nothing needs more: no attribute holds a style or a script."""
+    text: str = request.getfixturevalue(name)
+    check_policy(text)
+
+
+def _written(page: str) -> str:
+    """The page without what is in base64: pictures and programs."""
+    return re.sub(r'(<script type="text/plain" id="[\w-]+">)[^<]*', r"\1", re.sub(r"base64,[\w+/=]+", "base64,", page))
+
+
+def test_names_are_escaped(page: str) -> None:
+    text = _written(page)
+    assert "<b onload" not in text
+    assert "<i>" not in text
+    assert text.count("&lt;/script&gt;&lt;b onload=&#34;x&#34;&gt;&amp;{{ 7 * 7 }}") >= 3
+    assert text.count("<script") == text.count("</script>")
+
+
+def test_what_the_script_reads(page: str, data: ViewData) -> None:
+    read = json.loads(block(page, "data"))
+    assert [source["name"] for source in read["sources"]] == ["photo", "input", EVIL]
+    assert [view["name"] for view in read["views"]] == [view.name for view in data.shown]
+    first = read["views"][0]
+    assert len(first["viewmat"]) == 16
+    assert (first["width"], first["height"]) == (data.views[0].camera.width, data.views[0].camera.height)
+    stills = json.loads(block(page, "stills"))
+    assert read["start"] == data.start == 1
+    assert stills[1][1:] == [None, None]  # those are in the page itself
+    assert all(None not in stills[view] for view in (0, 2))
+    shown = re.findall(r'<img id="(?:left|right)"[^>]* src="([^"]*)"', page)
+    for address, still in ((shown[0], 1), (shown[1], 0)):
+        assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
+    assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
+    outlines = json.loads(block(page, "outline-pictures"))
+    assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
+        view.outlines for view in data.shown
+    ]
+    assert page.index("data:image/webp") < page.index("<script")
+    for i, side in enumerate(data.sides):
+        assert base64.b64decode(block(page, f"splats-{i}")) == side.splats
+    assert b"SparkRenderer" in gzip.decompress(base64.b64decode(block(page, "engine")))
+
+
+def with_three_results(data: ViewData) -> ViewData:
+    """The scene with results of a half, a tenth and a hundredth; the second is worse than it."""
+    scene, half = (replace(side, num_gaussians=1000, mean=Quality(20.0, 0.5)) for side in data.sides)
+    half = replace(half, name="half", num_gaussians=500, file_bytes=2_000, mean=Quality(25.0, 0.75))
+    tenth = replace(half, name="tenth", num_gaussians=100, file_bytes=400, mean=Quality(19.0, 0.5, lpips_alex=0.25))
+    return replace(data, sides=(scene, half, tenth, replace(tenth, name="least", num_gaussians=10)))
+
+
+def test_a_table_over_all_results(data: ViewData) -> None:
+    three = with_three_results(data)
+    three = replace(
+        three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:])
+    )
+    head, rows = results_table(three)
+    assert head == ["", "Gaussians", "Share", "File", "PSNR (dB)", "SSIM", "LPIPS", "Near fog", "Far fog", "Holes"]
+    assert rows[0] == ["input", "1,000", "100.0 %", "2.0 MB", "20.00", "0.500", "-", "-", "-", "-"]
+    assert rows[1][:8] == ["half", "500", "50.0 %", "2.0 kB", "25.00", "0.750", "-", "0.250"]
+    assert rows[1][-1] == "0.013"
+    assert [row[:3] + row[6:7] for row in rows[2:]] == [
+        ["tenth", "100", "10.0 %", "0.250"],
+        ["least", "10", "1.0 %", "0.250"],
+    ]
+    page = view_page(three)
+    assert re.findall(r'<tr data-result="(\d)">', page) == ["2", "3", "4"]
+    assert page.count('<button class="link"') == 3
+
+
+def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
+    sides = tuple(replace(side, mean=Quality(), fog=None) for side in data.sides)
+    assert results_table(replace(data, sides=sides))[0] == ["", "Gaussians", "Share", "File"]
+
+
+def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
+    page = view_page(with_three_results(data))
+    half, tenth, least = json.loads(block(page, "data"))["results"]
+    assert half["figures"] == [["500", False], ["2.0 kB", False], ["25.00 dB", True], ["0.750", True]]
+    assert tenth["figures"][2:] == [["19.00 dB", False], ["0.500", False]]
+    assert [one["headline"].split("\u00a0")[0] for one in (half, tenth, least)] == ["50.0", "10.0", "1.0"]
+    assert "farther" in tenth["headline"]
+    choice = re.findall('<select id="result".*?</select>', page, re.DOTALL)[0]
+    assert re.findall('value="(.)">(.*?)<', choice) == [("2", "half"), ("3", "tenth"), ("4", "least")]
+    assert '<select id="result"' not in view_page(data)
+
+
+def test_colours_are_readable_in_both_schemes(page: str) -> None:
+    """Contrast of at least 4.5 of text on what it stands on."""
+    style = re.findall("<style>(.*?)</style>", page, re.DOTALL)[0]
+    light = dict(re.findall(r"--([\w-]+): (#\w+)", style.split(".top")[0].split("prefers-color-scheme")[0]))
+    dark = light | dict(re.findall(r"--([\w-]+): (#\w+)", re.findall(r":root\.dark \{(.*?)\}", style)[0]))
+    pairs = [(ink, ground) for ink in ("ink", "muted", "ours", "baseline", "good") for ground in ("page", "soft")]
+    pairs += [("held-ink", "held"), ("worst-ink", "worst"), ("page", "ink")]
+    for colors in (light, dark):
+        assert [pair for pair in pairs if contrast(*(colors[name] for name in pair)) < 4.5] == []
+    assert dark["page"] != light["page"]
+
+
+def contrast(*colors: str) -> float:
+    """The ratio of two colours' luminances, as WCAG 2 has it."""
+
+    def luminance(color: str) -> float:
+        digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
+        values = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+        linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in values]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    low, high = sorted(map(luminance, colors))
+    return (high + 0.05) / (low + 0.05)
+
+
+def test_what_the_input_covers_stands_beside_all_pixels(data: ViewData) -> None:
+    """Where the scene itself lacks pixels."""
+    before, after = (replace(side, covered_share=0.79, covered=Quality(26.1)) for side in data.sides[:2])
+    lacking = replace(data, sides=(before, after, *data.sides[2:]))
+    assert "79 %" in view_page(replace(lacking, lacks_pixels=True))
+    assert "79 %" not in view_page(lacking)
+
+
+def test_the_view_from_outside_has_neither_photo_nor_score(page: str, data: ViewData) -> None:
+    *views, outside = json.loads(block(page, "data"))["views"]
+    assert [view["outside"] for view in views] == [False] * len(data.views)
+    assert (outside["outside"], outside["held_out"], outside["scores"]) == (True, False, [])
+    photo, *renders = json.loads(block(page, "stills"))[-1]
+    assert photo is None
+    assert [base64.b64decode(one.removeprefix(WEBP)) for one in renders] == list(data.outside.stills)
+    cards = re.findall('<button class="card".*?</button>', page, re.DOTALL)
+    assert ["from outside" in card for card in cards] == [False] * len(data.views) + [True]
+    assert ["dB" in card for card in cards] == [True] * len(data.views) + [False]
+
+
+def test_without_gaussians_there_is_no_3d(data: ViewData) -> None:
+    page = view_page(replace(data, sides=tuple(replace(side, splats=None) for side in data.sides)))
+    assert 'id="engine"' not in page
+    assert "class SplatView" not in page
+    assert len(page) < 200_000
+
+
+def test_without_photos(data: ViewData) -> None:
+    page = view_page(replace(data, views=tuple(replace(view, photo=None) for view in data.views)))
+    assert [source["name"] for source in json.loads(block(page, "data"))["sources"]] == ["input", EVIL]
+    assert "overlay-share" not in re.sub(r"<script>.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_without_superpixels(data: ViewData, page: str) -> None:
+    bare = view_page(replace(data, num_superpixels=None))
+    for words in ('data-set="outlines"', "<kbd>O</kbd>", "Superpixels: "):
+        assert words in page
+        assert words not in bare
+
+
+@pytest.mark.parametrize(("counts", "words"), [((1234, 1234), "1,234 of each"), ((900, 1234), "900 to 1,234 of each")])
+def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int], words: str) -> None:
+    assert f"Superpixels: {words} input photo" in view_page(replace(data, num_superpixels=counts))
+
+
+@pytest.fixture(scope="module")
+def alone() -> ViewData:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    return collect("room", scene, {}, (2_000_000,))
+
+
+def test_one_scene_is_compared_with_its_photos(alone: ViewData) -> None:
+    page = view_page(alone)
+    read = json.loads(block(page, "data"))
+    assert [source["name"] for source in read["sources"]] == ["photo", "input"]
+    assert headline(alone).replace(" dB", "\u00a0dB") in page
+    assert re.findall('<option value="(.)" selected>(.*?)<', page) == [("0", "photo"), ("1", "input")]
+    assert "<span>→" not in page
+    check_policy(page)
+
+
+def test_one_scene_without_photos_is_compared_with_nothing(alone: ViewData) -> None:
+    views = tuple(replace(view, photo=None, outlines=None) for view in alone.views)
+    data = replace(alone, views=views, num_superpixels=None)
+    page = view_page(data)
+    assert (data.scored, data.start) == (False, 0)
+    assert json.loads(block(page, "stills"))[0] == [None]
+    seen = re.sub("<script.*?</script>", "", page, flags=re.DOTALL)
+    assert [words for words in ("PSNR</small>", 'data-set="mode"', "Worst first", "PSNR and") if words in seen] == []
+    assert view_page(alone).count('data-set="mode"') == 4
+
+
+def test_what_is_grey_says_why() -> None:
+    """Controls are disabled in one place, which gives the reason."""
+    script = files("gsmerge.pages").joinpath("templates", "view.js").read_text()
+    assert script.count(".disabled") == 1
+    assert re.search(r"control\.disabled = .*\n  control\.title = reason", script)
+
+
+def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
+    assert "odd?" in view_page(replace(data, title="odd\udcff"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (20.0, 25.04, "5.0 dB closer to the photos"),
+        (20.0, 19.0, "1.0 dB farther from the photos"),
+        (float("inf"), 30.0, "30.0 dB from the input's own renders"),
+        (None, None, "Gaussians"),
+        (float("inf"), float("inf"), "Gaussians"),
+    ],
+)
+def test_headline(before: float | None, after: float | None, words: str, data: ViewData) -> None:
+    sides = [replace(side, mean=Quality(psnr)) for side, psnr in zip(data.sides, (before, after), strict=True)]
+    line = headline(replace(data, sides=tuple(sides)))
+    assert headline(replace(data, sides=(sides[0],))).startswith(f"{sides[0].num_gaussians:,} Gaussians")
+    assert line.endswith(words)
+    assert line.startswith("50.0 % of the Gaussians")
+
+
+def test_the_renderer_is_the_one_that_was_vendored() -> None:
+    """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
+    vendor = files("gsmerge.pages").joinpath("vendor")
+    sources = json.loads(vendor.joinpath("SOURCES.json").read_text())
+    script = gzip.decompress(vendor.joinpath(sources["script"]["file"]).read_bytes())
+    assert hashlib.sha256(script).hexdigest() == sources["script"]["sha256"]
+    assert len(script) == sources["script"]["bytes"]
+    assert set(sources["packages"]) >= {"@sparkjsdev/spark", "three"}
+    for package in ("spark", "three", "fflate"):
+        assert "MIT" in vendor.joinpath(f"LICENSE.{package}").read_text()
+
+
+NAME = "a|b<i>"
+
+
+@pytest.fixture(scope="module")
+def report() -> str:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    half = scene.gaussians[::2]
+    sizes = {"input": {"path": "/home/me/rooms/in.ply", "bytes": 2000}, NAME: {"path": "out.ply", "bytes": 1000}}
+    evaluation = evaluate(scene, {NAME: half}, None, EvaluateOptions(lpips=()))
+    pictures = view_pictures([("in", scene.gaussians), (NAME, half)], scene.cameras, scene.images, max_views=2)
+    return report_page(evaluation_document(evaluation, sizes, ["first <note>", "/home/me/rooms/a.json: odd"]), pictures)
+
+
+def test_a_report_loads_nothing_and_escapes_names(report: str) -> None:
+    assert "a|b&lt;i&gt;" in report
+    assert "first &lt;note&gt;" in report
+    assert re.findall("<i>|<note>|https?:", report) == []
+    addresses = re.findall(r"""(?:src|href)=["']?([^"'> ]*)""", report)
+    assert len(addresses) >= 6
+    assert all(address.startswith("data:") for address in addresses)
+
+
+def test_a_report_shows_no_folders_of_the_machine(report: str) -> None:
+    assert "/home" not in report
+    assert "rooms/in.ply: before and after" in report
+    assert "rooms/a.json: odd" in report
+
+
+def test_in_a_report_the_headline_comes_first_then_pictures(report: str) -> None:
+    places = [
+        report.index(words) for words in ("50.0\u00a0% of the Gaussians", "2.0 kB", "data:image/webp", "<h2>Size</h2>")
+    ]
+    assert places == sorted(places)
+    assert report.count('class="compare"') == 2
+    assert report.count("<img") == 2 * 3
+
+
+def test_columns_of_a_report_without_a_figure_are_left_out(report: str) -> None:
+    assert "LPIPS" not in report
+    assert "earned back after" not in report
+    assert "PSNR (dB)" in report
+    assert "2.0 x" in report
