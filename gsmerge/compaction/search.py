@@ -134,8 +134,8 @@ class CountSearch:
             return []
         kept, target = f"{count:,} of {limits.num_input:,} Gaussians", self.plan.target_psnr
         if count > MOSTLY * limits.num_input:
-            return [f"the scene is compact already: kept {kept}, as fewer would be under {target} dB from it"]
-        return [f"kept {kept}, so that the result is {target} dB from the input; --budget asks for fewer"]
+            return [f"the scene is compact already: kept {kept}, since fewer would be below {target:g} dB from it"]
+        return [f"kept {kept}, about the fewest that are {target:g} dB from the input or better"]
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
