@@ -47,6 +47,9 @@ CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
 MAX_RUNS = 6
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
+FAR = (
+    6.0  # dB above a target from which on a count says little about the slope there: all of the input are without loss
+)
 MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
 
 
@@ -272,9 +275,13 @@ def next_count(
         if above <= below * CLOSE:
             return above
         inner = float(log(above / below))
-        rise = (tried[above] - tried[below]) / inner
+        rise = (min(tried[above], target + FAR) - tried[below]) / inner
         step = (target - tried[below]) / rise if rise > 0 else inner / 2
         return round(below * float(exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner))))
+    if above is None and len(tried) > 1:
+        first, last = sorted(tried)[-2:]
+        measured = (tried[last] - tried[first]) / float(log(last / first) / log(2.0))
+        slope = min(max(measured, slope / 3), slope)
     edge = below if above is None else above
     assert edge is not None  # one count has been tried
     doublings = (target - tried[edge]) / slope
