@@ -47,9 +47,7 @@ CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
 MAX_RUNS = 6
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
-FAR = (
-    6.0  # dB above a target from which on a count says little about the slope there: all of the input are without loss
-)
+FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
 MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
 
 
