@@ -112,8 +112,8 @@ class Plan:
 
     @property
     def keeps_psnr(self) -> bool:
-        """Whether the target is that of :func:`kept_psnr`, and no option asks for it."""
-        return self.target_psnr is not None and self.settings["quality"] is None and not self.auto_count
+        """Whether the target is that of :func:`kept_psnr`."""
+        return self.target_psnr is not None and self.settings["quality"] is None
 
     @property
     def limits(self) -> CountLimits:
@@ -159,9 +159,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
     tree = None
-    searches = (
-        target is not None or options.budget.max_drop is not None or options.budget.auto or options.budget.levels > 1
-    )
+    budget = options.budget
+    searches = target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
@@ -275,7 +274,7 @@ def kept_psnr(scene: SceneSize, options: CompactOptions) -> float | None:
     """Return the PSNR (dB) from the input that decides the count; None where options, photos or pixels decide it.
 
     A share of the Gaussians says little where they belong to no pixels: a scene that is compact already needs most of
-    its Gaussians, one of many small ones a few. Measurements are in docs/laboratory/notebook.md.
+    its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
     asked = budget.quality is not None or budget.budget not in (None, AUTO, *DEVICES)
@@ -288,9 +287,7 @@ def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
     if prepared.reference.name != RENDERS:
         return
     if options.budget.max_drop is not None:
-        problem = (
-            f'quality {options.budget.quality}: expected a PSNR from the input as "35dB" where there are no photos'
-        )
+        problem = f'quality {options.budget.quality}: expected a PSNR from the input as "35dB" without photos'
         raise UsageError(f"{problem}, since nothing shows the scene better than the input; or give --images")
     if "sky" in options.clean.drops and prepared.input_scene.images is None:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")

@@ -39,10 +39,7 @@ RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
 SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
 KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
-SLOPE, SLOPE_OF_RENDERS = (
-    1.0,
-    3.0,
-)  # dB per doubling of the count, until two counts have been tried; of photos, of renders
+SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
 MAX_RUNS = 6
@@ -74,14 +71,12 @@ class CountSearch:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
+        usual = self.plan.keeps_psnr and not self.plan.auto_count
+        least = min(limits.default, limits.max_count) if usual else limits.min_count
+        most = limits.max_count if self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
+        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, 0.0)
         while target is not None and len(self.candidates) < MAX_RUNS:
-            if self.rendered:
-                least = min(limits.default, limits.max_count) if self.plan.keeps_psnr else limits.min_count
-                count = next_count(self.tried, target, least, limits.max_count, SLOPE_OF_RENDERS, NEAR)
-            else:
-                count = next_count(
-                    self.tried, target, limits.min_count, min(limits.max_count, MAX_FACTOR * limits.default)
-                )
+            count = next_count(self.tried, target, least, most, *steps)
             if count in self.tried:
                 return
             yield count

@@ -178,7 +178,7 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
-    assert (kept.target_psnr, kept.keeps_psnr) == (KEPT_PSNR, settings.get("budget") != "auto")
+    assert (kept.target_psnr, kept.keeps_psnr) == (KEPT_PSNR, True)
     assert len(kept.scored_views) == len(rows)
     assert estimate(rows, options_of(**settings))["psnr_kept"] == KEPT_PSNR
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does

@@ -45,7 +45,10 @@ def make_plan(
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
-    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, keeps_psnr=keeps_psnr))
+    return cast(
+        "Plan",
+        SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, keeps_psnr=keeps_psnr, auto_count=False),
+    )
 
 
 @pytest.mark.parametrize(
