@@ -27,7 +27,6 @@ from gsmerge.cli.paths import (
     checkpoint_files,
     default_output,
     input_files,
-    is_camera_file,
     is_index,
     model_files,
     output_file,
@@ -122,7 +121,7 @@ def _compact(args: opt.Args) -> None:
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
-    beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
+    beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
     named = (out, *model, *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True, cameras=True)
@@ -155,7 +154,7 @@ def _compact(args: opt.Args) -> None:
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    if args.strict and document["psnr_input_views"]["before"] is None:
+    if args.strict and document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
     if document["worse"] and not args.strict:

@@ -19,8 +19,8 @@ from gsmerge.settings.stages import CleanOptions
 class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
-    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and whose names a "
-        "COLMAP model has.", metavar="PATH")  # fmt: skip
+    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and which a COLMAP "
+        "model links; for the latter `images` beside the cameras is found.", metavar="PATH")  # fmt: skip
 
 
 @opt.command(

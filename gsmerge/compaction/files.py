@@ -9,13 +9,12 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.placement import add_colmap, add_views, name_photos, other_cameras
+from gsmerge.compaction.placement import add_colmap, add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
@@ -70,11 +69,10 @@ def compact_files(
         check_colmap(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
-        cameras_path = outputs.viewer_cameras
+        cameras_path = outputs.viewer_cameras if len(load.scene) else None
         shared = cameras_path if cameras_path is not None and cameras_path.exists() else None
-        if shared is not None and not outputs.overwrite and list(read_cameras(shared).names) != names:
+        if shared is not None and not outputs.overwrite and named_cameras(shared, names) is None:
             raise other_cameras(shared)  # before the work
-        cameras_path = cameras_path if len(load.scene) else None
         read = perf_counter()
         result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:

@@ -40,7 +40,7 @@ _FILE_KEYS = (
     "opacity_encoding", "num_nonfinite", "num_clipped_scales", "num_zero_quats",
 )  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
-_REPEATED = ("read as: ", "the rows belong to no pixels")  # notes that repeat a line of their own
+_REPEATED = ("read as: ", "the Gaussians belong to no pixels")  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 

@@ -88,16 +88,21 @@ def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str]
         raise other_cameras(path)
 
 
-def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
-    """Return whether a file holds these cameras under these names, to within rounding."""
+def named_cameras(path: Path, names: Sequence[str]) -> Cameras | None:
+    """Read the cameras of a file if they have these names; None for any other file."""
     with suppress(SceneError):
         stored = read_cameras(path)
-        if list(stored.names) == list(names):
-            found, reach = to_cameras(stored), np.abs(cameras.viewmats[:, :3, 3]).max()
-            same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * max(reach, 1))
-            sizes = {(view.width, view.height) for view in (found, cameras)}
-            return same_place and len(sizes) == 1 and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
-    return False
+        return to_cameras(stored) if list(stored.names) == list(names) else None
+    return None
+
+
+def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
+    """Return whether a file holds these cameras under these names, to within rounding."""
+    found, reach = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+    if found is None or (found.width, found.height) != (cameras.width, cameras.height):
+        return False
+    same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * reach)
+    return same_place and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
 
 
 def other_cameras(path: Path) -> UsageError:

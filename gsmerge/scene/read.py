@@ -323,7 +323,7 @@ def _make_load(
 
 def _unaligned_note(hints: ReadHints) -> str:
     """Note that rows have no pixels, and which searches were not made."""
-    note = "the rows belong to no pixels that could be found: unaligned"
+    note = "the Gaussians belong to no pixels that could be found: unaligned"
     if hints.exporter == "auto":
         return note
     return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
@@ -377,7 +377,7 @@ def _place_rows(
         gaussians = ply.gaussians
         keep = ply.valid & ~find_padding(gaussians)
         count = int(ply.valid.sum()) - int(keep.sum())
-        notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
+        notes = [f"{count:,} Gaussians that only fill the file up are left out"] if count else []
         return ply.gaussians[keep], None, None, notes
     grid = len(result.views), result.cameras.height, result.cameras.width
     size, ids = int(np.prod(grid)), result.pixel_ids
