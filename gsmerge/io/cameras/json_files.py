@@ -342,11 +342,6 @@ def transforms_document(cameras: Cameras, names: Sequence[str], *, digits: int =
     return {"camera_model": "PINHOLE", "frames": frames}
 
 
-def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras as nerfstudio's ``transforms.json``, with all intrinsics; :func:`read_transforms` reads it."""
-    path.write_text(json.dumps(transforms_document(cameras, names), indent=1) + "\n", encoding="utf-8")
-
-
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     """Return the text of cameras as INRIA's ``cameras.json``, for SuperSplat and other viewers.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
-from gsmerge.io.cameras.json_files import write_transforms
+from gsmerge.io.cameras.json_files import transforms_document
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -28,6 +29,10 @@ NAMES = ("a", "b", "c")
 @pytest.fixture(scope="module")
 def large() -> Tiny:
     return make_tiny(200, 140)
+
+
+def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    path.write_text(json.dumps(transforms_document(cameras, names)))
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:
