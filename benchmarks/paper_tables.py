@@ -100,7 +100,7 @@ def views_section(bench: Bench) -> str:
             cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
             rows.append((f"printed: {way.name}", kept, *cells, mean, ""))
     names = [f"{count} views ({captures(bench.runs(WHOLE, Case(views=count)))})" for count in bench.counts]
-    head = ("", "kept", *names, "mean", "PSNR less K = 1 (95 %)")
+    head = ("", "kept", *names, "mean", "PSNR less K = 1 (95%)")
     text = """Mean: of each capture over the numbers of views that it has, then over the captures. Our depth was always
     predicted from all input views, the paper's from those of the column. Printed: with Depth Anything 3."""
     return section("By number of views", text, make_table(head, rows))
@@ -148,7 +148,7 @@ def ablation_section(bench: Bench) -> str:
         kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f}%"
         gain = "" if runs is base else words(difference(runs, base))
         rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
-    names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95 %)")
+    names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95%)")
     text = "All views, K = 1."
     return section("Without a part", text, make_table(("", *names, "printed: AnySplat"), rows))
 

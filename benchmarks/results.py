@@ -123,7 +123,7 @@ def quality(records: Sequence[RunRecord]) -> str:
 def kept(records: Sequence[RunRecord], size: str) -> str:
     """The share that is kept where it is not the size that was asked for."""
     share = 100 * float(np.mean([record.ratio or 0.0 for record in records]))
-    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f} %)"
+    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f}%)"
 
 
 def sizes_table(records: Sequence[RunRecord]) -> str:

@@ -72,34 +72,41 @@ def _all_commands() -> dict[str, Any]:
 
 
 def _commands_page() -> str:
-    """Usage, arguments and options of every command; what an earlier command has in the same words is only named."""
+    """Arguments and options of every command; what an earlier command has in the same words is only named."""
     known: dict[tuple[str, str], str] = {}
     lines = [NOTICE, "", COMMANDS_HEAD]
     for name, command in _all_commands().items():
-        usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), "", f"`{usage}`", ""]
-        arguments = [p for p in command.params if p.param_type_name == "argument"]
-        lines += [f"- `{p.metavar or p.name.upper()}`: {_line(p.help)}" for p in arguments]
+        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), ""]
         same: dict[str, list[str]] = {}
-        for option in _options(command):
-            words = "" if option.name == "set" else option.help  # --set differs only in its example
-            owner = known.setdefault((option.name, words), name)
+        for one in (*_arguments(command), *_options(command)):
+            words = "" if one.name == "set" else one.help  # --set differs only in its example
+            owner = known.setdefault((one.name, words), name)
             if owner == name:
-                lines.append(_option(option))
+                lines.append(_entry(one))
             else:
-                same.setdefault(owner, []).append(f"`{option.opts[0]}`")
+                same.setdefault(owner, []).append(f"`{_name(one)}`")
         lines += [
             f"- as [{owner}](#gsmerge-{owner.replace(' ', '-')}): {', '.join(names)}" for owner, names in same.items()
         ]
     return "\n".join([*lines, ""])
 
 
+def _arguments(command: Any) -> list[Any]:
+    return [p for p in command.params if p.param_type_name == "argument"]
+
+
 def _options(command: Any) -> list[Any]:
     return [p for p in command.params if p.param_type_name == "option" and p.name not in ("help", "help_all")]
 
 
-def _option(param: Any) -> str:
-    """A line for an option: its names, its value, its default, and its help."""
+def _name(param: Any) -> str:
+    return str(param.opts[0] if param.param_type_name == "option" else param.metavar or param.name.upper())
+
+
+def _entry(param: Any) -> str:
+    """A line for an argument, or for an option: its names, its value, its default, and its help."""
+    if param.param_type_name == "argument":
+        return f"- `{_name(param)}`: {_line(param.help)}"
     named = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
     value = "" if param.is_flag else f" {_value(param)}"
     default = _line(_default(param))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
+from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
@@ -76,9 +75,9 @@ def holds_scene(path: Path) -> bool:
     if os.path.isdir(path):
         return bool(list_plys(path))
     suffix = path.suffix.lower()
-    return suffix in SCENE_SUFFIXES and (
-        suffix not in SEVERAL_USES or (os.path.exists(path) and may_hold_gaussians(path))
-    )
+    if suffix in SEVERAL_USES:
+        return os.path.exists(path) and may_hold_gaussians(path)
+    return suffix in SCENE_SUFFIXES
 
 
 def damage(path: Path) -> list[str]:
@@ -123,27 +122,14 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 def _read_cameras(path: Path) -> FileCheck:
     """Read the cameras of a file, of all scenes if it has several, or of a folder."""
-    count, notes = 0, list[str]()
+    count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)
-    source, place = cameras.source, Path(cameras.path)
-    if path.is_dir() and not is_colmap(path):
-        notes.append("the folder has no Gaussians: its cameras alone were read")
-    if place.is_dir():
-        ending = ".bin" if source == "COLMAP binary" else ".txt"
-        read = {f"{name}{ending}" for name in ("cameras", "images")}
-        others = sorted(file.name for file in place.iterdir() if file.suffix in (".bin", ".txt"))
-        notes += _not_read([name for name in others if name not in read])
-    elif place.suffix == ".npz":
-        read_depths(place)
-        notes += _not_read(sorted(array_names(place) - READ_ARRAYS), " but for their checksums")
-    return FileCheck(str(path), "cameras", count, source, notes=tuple(notes))
-
-
-def _not_read(names: Sequence[str], remark: str = "") -> list[str]:
-    """Make a note of the files that were not read; none if all were."""
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return [f"not read{remark}: {', '.join(names[:4])}{more}"] if names else []
+    if Path(cameras.path).suffix == ".npz":
+        read_depths(Path(cameras.path))
+    alone = os.path.isdir(path) and not is_colmap(path)
+    notes = ("the folder has no Gaussians: its cameras alone were read",) if alone else ()
+    return FileCheck(str(path), "cameras", count, cameras.source, notes=notes)
 
 
 def _read_levels(path: Path) -> FileCheck:

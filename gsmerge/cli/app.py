@@ -67,6 +67,7 @@ FORMER_OPTIONS = {
     "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
     "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
     "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
+    "config": "use --set NAME=VALUE for each setting in it",
     "draw_only": "a call without scenes draws what the folder holds",
     "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
     "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",

@@ -57,9 +57,8 @@ PARAMETERS = (
     f"{opt.READING} masks budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A new name without an ending, such as site/: a web site. A folder named colmap: a COLMAP model. "
-               "Another folder that exists: into it.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream. A new folder: a web "
+               "site; colmap: a COLMAP model; a folder with files in it gets the result.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -155,7 +154,7 @@ def _compact(args: opt.Args) -> None:
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    if args.strict and document["psnr_input_views"]["before"] is None:
+    if args.strict and document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
     if document["worse"] and not args.strict:

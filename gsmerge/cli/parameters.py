@@ -97,7 +97,7 @@ class Args(SimpleNamespace):
         values = options | chosen
         if "seed" in settings:
             values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
-        if Path(values.get("crop") or "").suffix.lower() in CROP_FILES:
+        if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
             from gsmerge.io.crop_file import read_crop
 
             values["crop"] = read_crop(Path(values["crop"]))

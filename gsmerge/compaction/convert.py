@@ -30,7 +30,6 @@ from gsmerge.io import (
     write_gaussians,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
@@ -106,8 +105,6 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
-    if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
-        comments += camera_comments(moved, names)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
     num_bytes, beside = _write(options, ending, gaussians, moved, photos, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}

@@ -13,12 +13,12 @@ import numpy as np
 
 from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
-from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
 from gsmerge.raster import render
-from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     import torch
 
     from gsmerge.pages.view import Page
+
+SAME = 120.0  # dB of equal pictures
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class Candidate:
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
-    psnr: float | None  # Mean PSNR (dB) of the scored views, or of the views that judge; None without either
+    psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
 
 
@@ -127,10 +129,11 @@ def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan:
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
-    """Measure the PSNR (dB) of Gaussians on the scored photos, or against the input; None without photos and pixels."""
-    if moved.reference.placed:
-        fidelity = _fidelity(moved.frame.enter(gaussians), moved.scene, plan)
-        choose(fidelity={"psnr": fidelity, "views": len(moved.scene)})
+    """Measure the PSNR (dB) of Gaussians on the scored photos, or against renders of the input."""
+    if moved.reference.name == RENDERS:
+        fidelity = _fidelity(moved.frame.enter(gaussians), moved, plan)
+        views, placed = len(plan.scored_views), moved.reference.placed
+        choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity
     measured = measure_result(gaussians, moved, plan)
     if measured is None:
@@ -140,9 +143,10 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> flo
 
 
 @stage("score")
-def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
-    """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
-    return score_photos(gaussians, scene_photos(judges), plan.scored_views).psnr
+def _fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
+    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input."""
+    views = [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
+    return min(score_photos(gaussians, scene_photos(prepared.scene), views).psnr, SAME)
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
@@ -228,6 +232,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
+    rendered = prepared.reference.name == RENDERS
     comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
@@ -236,13 +241,15 @@ def make_result(
 
     def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
-        shown = None if prepared.reference.placed else candidate.psnr
+        shown = None if rendered else candidate.psnr
         made = CompactReport(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered, psnr_reference=None if before is None else prepared.reference.name,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared) if comparable else None
+        if rendered and candidate is best and not plan.clean.hides:  # coarser levels are meant to differ
+            worse = describe_distance(candidate.psnr)
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 
     names = {**run.seconds, **seconds}
@@ -250,7 +257,7 @@ def make_result(
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = report(best, covered[0], seconds, "the result")
-    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
+    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(
         CompactResult(

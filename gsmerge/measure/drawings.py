@@ -40,7 +40,6 @@ from gsmerge.measure.preview import (
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR
-from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -187,9 +186,11 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     """Prepare a clip, or its frames as pictures, of the scenes along a path, with lines that move between them."""
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
+    paths = [path.absolute() for path, _ in group.scenes]
+    same = len({path.name for path in paths}) < len(paths)
     texts = [
-        (path.absolute().name, f"{len(gaussians):,} Gaussians", human_bytes(size))
-        for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
+        ("/".join(path.parts[-2:]) if same else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
+        for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
     ]
 
     def draw(threads: int) -> Iterator[Picture]:
@@ -243,9 +244,8 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
             )
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            cameras = sample_path(
-                path, cameras, depth, options.frames or max(round(SECONDS[path.kind] * options.fps), least)
-            )
+            count = options.frames or max(round(SECONDS[path.kind] * options.fps), least)
+            cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
     return group, cameras, NEAR * depth, ids
@@ -305,16 +305,6 @@ def picture_stems(names: Sequence[str]) -> list[str]:
         if len({stem.lower() for stem in stems}) == len(stems):  # some file systems do not tell case apart
             break
     return stems
-
-
-def drawing_document(drawing: Drawing, output: Path) -> dict[str, Any]:
-    """Return the report of a drawing as plain JSON types."""
-    return {
-        **document_head(),
-        "output": str(output),
-        "pictures": [str(path) for path in drawing.paths],
-        **drawing.facts,
-    }
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def describe_fog(name: str, fog: Fog) -> str | None:
         return None
     return (
         f"{name}: seen from outside, the result shows haze where the input shows nothing: far fog {fog.fog_far:.2f};"
-        " if a fit made it, compact the scene again, with --fit none if that does not help"
+        " if it comes from a fit to photos, compact --fit none makes none"
     )
 
 

@@ -62,7 +62,8 @@ class CompactOptions(Settings):
     method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/internals/plugins.md "
         "lists them.",
         "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME")  # fmt: skip
-    effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
+    effort: str = setting("default", "Quality for time: best is sharper and takes two to three times as "
+        "long; fast and draft take a third or less.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",

@@ -69,7 +69,7 @@ class Tuning:
 class FitOptions(Settings):
     """Settings of the fit to the photos."""
 
-    fit: Fit = setting("full", "What is fitted to the photos.", "`full`: all parameters; `none`: nothing.")
+    fit: Fit = setting("full", "full: closer to the photos, for most of the time that a run takes; none: neither.")
     fit_steps: int | None = setting(None, "Steps of the full fit, one view each.",
         "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
     time_budget: float | None = setting(None, "Seconds after which the full fit stops.",

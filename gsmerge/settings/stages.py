@@ -120,8 +120,8 @@ class MatchOptions(Settings):
 class DecodeOptions(Settings):
     """Settings of decoding: how many Gaussians each Feature Gaussian becomes."""
 
-    k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by "
-        "its saliency; auto: 1, and 4 for one photo without a long fit.",
+    k: int | Literal["mixed", "auto"] = setting(AUTO, "More detail and a larger file: Gaussians for each superpixel; "
+        "mixed: 1, 2 or 4, most where there is most to see; auto: 1, and 4 for one photo without a long fit.",
         "`mixed` is of the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto")  # fmt: skip
     k_low: float = setting(50.0, "Percentile of `mixed` up to which groups become one Gaussian.",
         "The paper's are 33.3 and 66.7.", least=0, most=100)  # fmt: skip

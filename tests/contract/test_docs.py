@@ -301,7 +301,7 @@ def test_architecture_names_every_module(root: Path) -> None:
 
 def stability_rows(root: Path) -> list[tuple[str, str]]:
     """Numbers and tests of every line of cases."""
-    text = (root / "docs" / "internals" / "stability.md").read_text()
+    text = re.sub(r"\n  +", " ", (root / "docs" / "internals" / "stability.md").read_text())
     return re.findall(r"^- ([\d, ]+): .+ -> .+ \((.+)\)$", text, re.MULTILINE)
 
 

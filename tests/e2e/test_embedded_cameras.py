@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from saved_cameras import embed
 from sweeps import sweep
 
 import gsmerge
 from gsmerge.io import read_cameras
-from gsmerge.io.cameras.embedded import camera_comments
 from gsmerge.scene.read import load_scene
 
 from .conftest import Run
@@ -29,9 +29,8 @@ def alone(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     call = ["compact", small_scene, "-o", folder / "small.ply", *FAST, "--levels", 2]
     assert main([str(word) for word in [*call, "--set", "viewer_cameras=false", "--set", "superpixels=200", "-q"]]) == 0
     scene = gsmerge.read_scene(small_scene)
-    lines = "".join(f"comment {line}\n" for line in camera_comments(scene.cameras, scene.names))
     for path in folder.glob("*.ply"):
-        path.write_bytes(path.read_bytes().replace(b"element", lines.encode() + b"element", 1))
+        embed(path, scene.cameras, scene.names)
     shutil.copytree(small_scene / "images", folder / "images")
     return folder
 

@@ -93,6 +93,24 @@ def test_a_line_moves_between_two_scenes(scene_copy: Path, tmp_path: Path, run: 
     assert [int((half > 200).sum()) > 300 for half in (captions[:, :150], captions[:, 170:])] == [True, True]
 
 
+def test_captions_of_files_of_one_name_have_their_folders(
+    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr("gsmerge.measure.drawings.make_captions", lambda texts, *_: asked.append(texts) or [])
+    monkeypatch.setattr("gsmerge.measure.drawings.draw_swipe", lambda pictures, *_: pictures[0])
+    scene, other = scene_copy / "scene.ply", tmp_path / "other" / "scene.ply"
+    other.parent.mkdir()
+    shutil.copy(scene, other)
+    run("render", scene, other, "--frames", 2, "-o", tmp_path / "a.gif", code=0)
+    run("render", scene, other.rename(other.with_name("b.ply")), "--frames", 2, "-o", tmp_path / "b.gif", code=0)
+    assert [[text[0] for text in texts] for texts in asked] == [
+        [f"{scene_copy.name}/scene.ply", "other/scene.ply"],
+        ["scene.ply", "b.ply"],
+    ]
+    assert asked[0][0][1:] == ("30,720 Gaussians", f"{scene.stat().st_size / 1e6:.1f} MB")
+
+
 def test_a_clip_is_an_orbit_by_default(made_scene: Path, tmp_path: Path, run: Run) -> None:
     document = json.loads(run("render", made_scene, "-o", tmp_path / "a.gif", "--frames", 2, "--json", code=0).out)
     assert (document["path"], document["fps"], document["encoding"]) == ("orbit", 12.5, "GIF")

@@ -12,11 +12,11 @@ import cv2
 import motions
 import numpy as np
 import pytest
+from saved_cameras import write_transforms
 from tiny_scene import edited_json
 
 from gsmerge.geometry import pose_changes
 from gsmerge.io import write_gaussians
-from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 

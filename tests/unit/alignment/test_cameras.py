@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import motions
 import numpy as np
 import pytest
 from messages import names, noted, refuses
+from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge import compact_tensors
@@ -18,7 +18,6 @@ from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
-from gsmerge.io.cameras.json_files import transforms_document
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -29,10 +28,6 @@ NAMES = ("a", "b", "c")
 @pytest.fixture(scope="module")
 def large() -> Tiny:
     return make_tiny(200, 140)
-
-
-def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    path.write_text(json.dumps(transforms_document(cameras, names)))
 
 
 def cameras_of(tiny: Tiny, viewmats: np.ndarray | None = None) -> Cameras:

@@ -24,7 +24,6 @@ from gsmerge.measure.camera_path import (
     turned_degrees,
     turntable,
     viewing_depth,
-    wide_orbit,
 )
 from gsmerge.measure.fog import outside_cameras
 from gsmerge.types import Cameras
@@ -184,7 +183,7 @@ def test_an_orbit_is_as_wide_as_the_cameras_stand_within_limits(apart: float, ra
     cameras = make_cameras(places, np.zeros((3, 3)).tolist())
     centres = camera_centres(orbit(cameras, DEPTH, 100).viewmats)
     assert median_camera(cameras) == (1 if apart else 0)
-    assert np.abs(centres).max(0) == pytest.approx([radius, UPRIGHT[0] * DEPTH, 0], rel=0.01, abs=1e-12)
+    assert np.abs(centres).max(0)[:2] == pytest.approx([radius, UPRIGHT[0] * DEPTH], rel=0.01)
 
 
 def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
@@ -195,7 +194,7 @@ def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
 
 @pytest.mark.parametrize("turn", [20.0, 90.0])
 def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn: float) -> None:
-    path = wide_orbit(walk, DEPTH, 60, turn)
+    path = orbit(walk, DEPTH, 60, turn)
     home = walk.viewmats[median_camera(walk)]
     centres, focus = camera_centres(path.viewmats), camera_centres(home) + DEPTH * home[2, :3]
     np.testing.assert_allclose(np.linalg.norm(centres - focus, axis=1), DEPTH)
