@@ -3,8 +3,8 @@
 python benchmarks/capture_exports.py SCENE OUT                    # plain: all pixels, view by view
 python benchmarks/capture_exports.py SCENE OUT --style anysplat   # or da3, depthsplat
 
-Depth, confidence and colour are the capture's (docs/guide/captures.md); scales, rotations, opacities and offsets, which
-its depth network does not predict, follow from them with jitter. A seed gives the same bytes every time.
+Depth, confidence and colour are the capture's (docs/internals/captures.md); scales, rotations, opacities and offsets,
+which its depth network does not predict, follow from them with jitter. A seed gives the same bytes every time.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def interval(values: Sequence[float | None], digits: int) -> str:
     if len(known) < 2:
         return f"{np.mean(known):.{digits}f}" if known else "-"
     both = mean_interval(known)
-    return f"{both.mean:.{digits}f} ± {both.high - both.mean:.{digits}f}"
+    return f"{both.mean:.{digits}f} ±{both.high - both.mean:.{digits}f}"
 
 
 def main() -> None:

@@ -32,15 +32,15 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 FAST = "--effort draft --fit none --threads 1"
-COMPACT = f"compact {{scene}} -o {{out}}/a.ply --levels 2 --report {{out}}/a.json --overwrite {FAST}"
+COMPACT = f"compact {{scene}} -o {{out}}/a.ply --levels 2 --overwrite {FAST}"
 LOD = f"compact {{scene}} -o {{out}}/lod/lod-meta.json --levels 2 --overwrite {FAST}"
 # What is run, with the scene of {scene}, and what is run before for the earlier files
 COMMANDS = {
     "compact": (COMPACT.format(scene="{a}", out="{out}"), COMPACT.format(scene="{b}", out="{out}")),
-    "extend": ("extend {out}/a.gsm {b} --effort draft --threads 1", "extend {out}/a.gsm {a} --effort draft"),
+    "extend": ("extend {out}/a.gsm {b} --set effort=draft", "extend {out}/a.gsm {a} --set effort=draft"),
     "batch": (f"batch {{scenes}} -o {{out}} --jobs 1 {FAST}", None),
     "lod": (LOD.format(scene="{a}", out="{out}"), LOD.format(scene="{b}", out="{out}")),
-    "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite --threads 1" for x in "ab"),
+    "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite" for x in "ab"),
 }
 # Imported before the commands are run, which would each do it anew
 MODULES = ("gsmerge.cli.app", "gsmerge.compaction.files", "gsmerge.networks.apply", "gsmerge.states.files")

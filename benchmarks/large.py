@@ -56,13 +56,13 @@ def write_export(source: Path, out: Path, degree: int) -> None:
 
 def measure(scene: Path, settings: str, out: Path) -> tuple[dict, float]:
     """The report of one run, and its processor seconds."""
-    report = out / "report.json"
-    words = ["compact", str(scene), "-o", str(out / "out.ply"), "--overwrite", "--quiet", "--report", str(report)]
+    words = ["compact", str(scene), "-o", str(out / "out.ply"), "--overwrite", "--json"]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-m", "gsmerge", *words, *shlex.split(settings)], check=True)
+    call = [sys.executable, "-m", "gsmerge", *words, *shlex.split(settings)]
+    document = json.loads(subprocess.run(call, check=True, stdout=subprocess.PIPE).stdout)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return json.loads(report.read_text()), seconds
+    return document, seconds
 
 
 def row(scene: Path, views: int, degree: int, settings: str, out: Path) -> str:

@@ -1,6 +1,6 @@
 """What the trained networks gain on real scenes: learned against analytic at equal counts, and stage by stage.
 
-python benchmarks/networks.py eval                     # the tables of docs/laboratory/networks.md; what is done is kept
+python benchmarks/networks.py eval                     # the tables of docs/internals/networks.md; what is done is kept
 python benchmarks/networks.py train --only gain
 python benchmarks/networks.py fox,fern --checkpoint FILE
 
@@ -212,7 +212,7 @@ def summary(runs: dict[str, dict[str, Any]]) -> str:
         for name in MEASURES
         if all(name in r for r in runs.values())
     }
-    return " / ".join(f"{value:.2f}" if name == "psnr" else f"{value:.3f}" for name, value in means.items())
+    return "/".join(f"{value:.2f}" if name == "psnr" else f"{value:.3f}" for name, value in means.items())
 
 
 def words(interval: Interval) -> str:

@@ -136,7 +136,7 @@ def end_table(ends: dict[str, dict[str, Figures]]) -> str:
     for scene, ways in ends.items():
         for way, end in ways.items():
             quality = [f"{end[name]:.{digits}f}" for name, digits in zip(QUALITY, (2, 3, 3), strict=True)]
-            counts = [f"{end['count']:,.0f}", f"{end['share']:.1f} %"]
+            counts = [f"{end['count']:,.0f}", f"{end['share']:.1f}%"]
             rows.append([scene, way, *counts, *quality, f"{end['frames']:.3g}", f"{end['overdraw']:.1f}"])
     return make_table(["scene", "way", "Gaussians", "share", *QUALITY, "frames a second", "overdraw"], rows)
 

@@ -1,4 +1,4 @@
-"""Every format that is written, opened by programs of others, for docs/guide/open-it.md.
+"""Every format that is written, opened by programs of others, for docs/guide/formats.md.
 
 gsmerge compact demo -o small.ply
 python benchmarks/open_formats.py small.ply opened --photos demo/images --npm packages --gsplat checkout
@@ -48,11 +48,11 @@ from gsmerge.research.baselines.simple import find_program
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "e2e"))
 
 NAMES = (
-    "a.ply", "a.compressed.ply", "a.spz", "version4/a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json",
-    "a.usdc", "a.usda", "a.usdz", f"{FOLDER}/{PLACE}/{POINTS}",
+    "a.ply", "a.spz", "a.sog", "a.splat", "a.glb", "web/lod-meta.json", "a.usdc", "a.usdz",
+    f"{FOLDER}/{PLACE}/{POINTS}",
 )  # fmt: skip
 SPLATS = (".ply", ".spz", ".sog", ".splat", "lod-meta.json")
-USD = (".usdc", ".usda", ".usdz")
+USD = (".usdc", ".usdz")
 NODE_SCRIPT = Path(__file__).with_suffix(".mjs")
 UPRIGHT = np.array([-1, -1, 1, 1, 1, 1, 1])  # what half a turn about z does to values
 
@@ -249,9 +249,8 @@ def write_all(source: Path, folder: Path, photos: Path) -> None:
     harmonics = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 15, 3)).astype(np.float32)
     gsmerge.write_ply(folder / "a.ply", replace(gaussians, shN=harmonics), overwrite=True)
     for name in NAMES[1:]:
-        number = 4 if name.startswith("version4") else 3
         cameras = viewer_cameras_path(source)
-        convert_files(ConvertOptions([folder / "a.ply"], folder / name, cameras, spz_version=number, overwrite=True))
+        convert_files(ConvertOptions([folder / "a.ply"], folder / name, cameras, overwrite=True))
     shutil.copytree(photos, folder / FOLDER / "images", dirs_exist_ok=True)
 
 

@@ -47,7 +47,7 @@ class Way:
         key: Of the paper's printed figures.
         networks: The file that it depends on: "paper", or "" for none.
         silent: Networks whose last layers are set to zero.
-        equal: Whether it has as many Gaussians as ``--recipe paper`` with K = 1.
+        equal: Whether it has as many Gaussians as ``recipe=paper`` with K = 1.
     """
 
     name: str
@@ -73,7 +73,7 @@ def recipe(name: str, key: str = "", silent: str | None = None, **settings: Any)
 
 
 INPUT = Way("the input", None, "input")
-WHOLE = recipe("`--recipe paper`, K = 1", "k1", k=1)
+WHOLE = recipe("the recipe, K = 1", "k1", k=1)
 CHILDREN = tuple(recipe(f"K = {k}", f"k{k}", k=k) for k in (2, 4))
 MIXED = recipe("mixed K, by thirds", "mixed", k="mixed")
 MOMENTS = Way("`moment-matching`", {"method": "moment-matching"}, "moments", equal=True)

@@ -1,4 +1,4 @@
-"""The superpixel merging paper's tables with ``--recipe paper``: its section of docs/results.md, as Markdown.
+"""The superpixel merging paper's tables with ``recipe=paper``: its section of docs/results.md, as Markdown.
 
 python benchmarks/paper_tables.py                                 # finished runs are kept, so it can be stopped
 python benchmarks/paper_tables.py --page docs/results.md          # and the section there is replaced
@@ -54,11 +54,11 @@ TITLE = "## The paper's own method"
 def mean_cell(runs: Runs) -> str:
     """Means of PSNR / SSIM / LPIPS over the scenes."""
     means = np.mean([run["seen"] for run in runs.values()], 0)
-    return " / ".join(f"{value:.{3 if i else 2}f}" for i, value in enumerate(means))
+    return "/".join(f"{value:.{3 if i else 2}f}" for i, value in enumerate(means))
 
 
 def share(runs: Runs) -> str:
-    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f} %"
+    return f"{100 * np.mean([run['ratio'] for run in runs.values()]):.1f}%"
 
 
 def compared(runs: Runs, whole: Runs) -> str:
@@ -73,7 +73,7 @@ def difference(runs: Runs, whole: Runs) -> Interval:
 
 
 def plus_minus(interval: Interval) -> str:
-    return f"{interval.mean:+.2f} ± {interval.high - interval.mean:.2f}"
+    return f"{interval.mean:+.2f} ±{interval.high - interval.mean:.2f}"
 
 
 def over_counts(bench: Bench, way: Way) -> Runs:
@@ -100,11 +100,9 @@ def views_section(bench: Bench) -> str:
             cells = [cell for count, cell in zip(COUNTS, cells, strict=True) if count in bench.counts]
             rows.append((f"printed: {way.name}", kept, *cells, mean, ""))
     names = [f"{count} views ({captures(bench.runs(WHOLE, Case(views=count)))})" for count in bench.counts]
-    head = ("", "kept", *names, "mean", "PSNR less K = 1 (95 %)")
-    text = """Evenly spread input views, held-out views midway between them. Mean: of each capture over the numbers of
-    views that it has, then over the captures. The depth of every row, also of 3, 6 and 9 views, was predicted from all
-    input views of the capture, the paper's from the views of the row alone: our rows of few views have better depth
-    than these views give. Printed: with Depth Anything 3."""
+    head = ("", "kept", *names, "mean", "PSNR less K = 1 (95%)")
+    text = """Mean: of each capture over the numbers of views that it has, then over the captures. Our depth was always
+    predicted from all input views, the paper's from those of the column. Printed: with Depth Anything 3."""
     return section("By number of views", text, make_table(head, rows))
 
 
@@ -115,9 +113,8 @@ def sizes_section(bench: Bench) -> str:
         whole = bench.runs(WHOLE, case)
         cells = [compared(bench.runs(way, case), whole) for way in (MOMENTS, FIT)]
         rows.append((size, share(whole), mean_cell(whole), *cells, printed.SIZES.get(size, "")))
-    head = ("`--superpixels`", "kept", "`--recipe paper`", MOMENTS.name, FIT.name, "printed: AnySplat")
-    text = """All views, K = 1; the columns after `--recipe paper` have as many Gaussians. In brackets their
-    PSNR less that of the recipe, with the 95 % interval."""
+    head = ("superpixels", "kept", "the recipe", MOMENTS.name, FIT.name, "printed: AnySplat")
+    text = """All views, K = 1, equal counts. In brackets: PSNR less that of the recipe, with the 95 % interval."""
     return section("By size", text, make_table(head, rows))
 
 
@@ -131,13 +128,12 @@ def backbones_section(bench: Bench) -> str:
             runs = whole if way is WHOLE else bench.runs(way, case)
             kept = np.mean([run["count"] / before[scene]["count"] for scene, run in runs.items()])
             less = "" if runs is whole else f" ({difference(runs, whole).mean:+.2f})"
-            cells.append(f"{100 * kept:.1f} %: {mean_cell(runs)}{less}")
+            cells.append(f"{100 * kept:.1f}%: {mean_cell(runs)}{less}")
         rows.append((way.name, *cells, *printed.BACKBONES.get(way.key, ("",) * 3)))
     names = ("DA3", "DepthSplat", "AnySplat, voxels")
     head = ("", "plain", *STYLES[:2], "anysplat, voxels", *(f"printed: {name}" for name in names))
-    text = """All views. The first four columns are of one depth network, written as four programs write their files,
-    the last of them merged into voxels. Percentages are of one Gaussian per pixel; in brackets PSNR less that of
-    K = 1."""
+    text = """All views, one depth network, written as four programs write their files. Percentages are of one Gaussian
+    per pixel; in brackets: PSNR less that of K = 1."""
     return section("By backbone, and of voxels", text, make_table(head, rows))
 
 
@@ -149,10 +145,10 @@ def ablation_section(bench: Bench) -> str:
     known += [(name, bench.runs(WHOLE, Case(size=size)), whole) for size, name in RESIZED.items()]
     rows = []
     for name, runs, base in known:
-        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f} %"
+        kept = f"{100 * np.mean([run['matched'] for run in runs.values()]):.0f}%"
         gain = "" if runs is base else words(difference(runs, base))
         rows.append((name, kept, share(runs), mean_cell(runs), gain, printed.ABLATION.get(name, "")))
-    names = ("groups kept across views", "kept", "`--recipe paper`", "PSNR less the whole (95 %)")
+    names = ("groups kept across views", "kept", "the recipe", "PSNR less the whole (95%)")
     text = "All views, K = 1."
     return section("Without a part", text, make_table(("", *names, "printed: AnySplat"), rows))
 
@@ -188,17 +184,15 @@ def head_section(bench: Bench) -> str:
     training = load_checkpoint(bench.files["paper"]).training
     steps, scenes = training["step"], len(training["data"])
     names = ", ".join(f"{folder.name} ({num_views(folder)} views)" for folder in bench.folders)
-    how = f"""`--recipe paper`: BASS superpixels, encoder, geometry of the head for K = 1, matching by latents and
-    boxes, merger, refiner, heads, pruning by opacity, no fit and no budget: superpixels are 5.3 % of the pixels, before
-    merging, unless a table says otherwise. `moment-matching` and gsmerge's defaults have at most as many Gaussians as
-    the recipe with K = 1. Cells are means over the captures of PSNR / SSIM / LPIPS, photos at {PHOTO_SIDE} pixels,
-    held-out views, pixels that the input views see; intervals are 95 % t intervals of
-    differences that are paired by capture. `python benchmarks/paper_tables.py --page docs/results.md` writes this
-    section."""
-    data = f"""Captures: {names}, with the depth of a multi-view-stereo network, and
-    [networks](laboratory/networks.md) trained for {steps:,} steps on {scenes} scenes. Printed: the paper's own figures,
-    of DL3DV-Bench, MipNeRF360 and Tanks and Temples together, with the backbone that is named, and networks trained for
-    300,000 steps on DL3DV-10K. The two compare only in order and differences."""
+    how = f"""`--set recipe=paper`: BASS superpixels, encoder, geometry of the head for K = 1, matching by latents and
+    boxes, merger, refiner, heads, pruning by opacity, no fit and no budget; 5.3 % superpixels before merging, unless a
+    table says otherwise. `moment-matching` and the defaults have at most as many Gaussians as the recipe with K = 1.
+    Cells are means of PSNR/SSIM/LPIPS, photos at {PHOTO_SIDE} pixels, held-out views, pixels that the input views see;
+    intervals are 95 % t intervals of differences paired by capture. `python benchmarks/paper_tables.py --page
+    docs/results.md` writes this section."""
+    data = f"""Captures: {names}. [Networks](internals/networks.md) were trained for {steps:,} steps on {scenes} scenes.
+    Printed: the paper's own figures, of DL3DV-Bench, MipNeRF360 and Tanks and Temples, with the backbone that is named,
+    and networks trained for 300,000 steps on DL3DV-10K. The two compare only in order and differences."""
     return "\n\n".join((TITLE, filled(how), filled(data)))
 
 

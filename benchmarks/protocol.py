@@ -111,7 +111,7 @@ def measure_scene(folder: Path, capture: Capture, entry: Entry, args: argparse.N
     start = time.perf_counter()
     result = gsmerge.compact(load.scene, **dict(args.set))
     seconds = time.perf_counter() - start
-    options = gsmerge.EvaluateOptions(lpips=("vgg",) if args.lpips else (), context=False, fog=False)
+    options = gsmerge.EvaluateOptions(lpips=("vgg",) if args.lpips else (), lpips_views=None, context=False, fog=False)
     results = {"gsmerge": result.gaussians}
     evaluation = gsmerge.evaluate(load.scene, results, targets, options, cameras={"gsmerge": result.cameras})
     return {

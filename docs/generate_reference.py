@@ -1,6 +1,6 @@
 """Writes the pages of docs/reference that are made from the program itself.
 
-python docs/generate_reference.py          # write the pages that differ, remove those of commands that are gone
+python docs/generate_reference.py          # write the pages that differ
 python docs/generate_reference.py --check  # name them, exit code 1 if there are any; write nothing
 """
 
@@ -17,34 +17,30 @@ from api_page import api_page
 from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
-COMMANDS, SETTINGS, TRAINING, API = "commands", "settings.md", "training-settings.md", "api.md"
+COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
-KINDS = {int: "whole number", float: "number", str: "text", Path: "path"}
+KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
+COMMANDS_HEAD = """# Commands
+
+`gsmerge COMMAND --help` prints the same; what is in brackets is the default. `gsmerge SCENE` takes the options of
+`compact`, and opens the page of `view`. Where a command has no `--threads` or `--seed`, `GSMERGE_THREADS` and
+`GSMERGE_SEED` of the environment are read. [Exit codes](exit-codes.md)."""
+SETTINGS_HEAD = """# Settings
+
+`compact`, `batch`, `extend` and `lab stress` take them as `--set NAME=VALUE`, such as `--set poses=fixed`; in Python
+they are arguments of `gsmerge.compact`, and `help(gsmerge.CompactOptions)` says more. `--set help` lists those of a
+command. In brackets: default, possible values. [Options](commands.md#gsmerge-compact) of `compact` are settings too."""
 
 
 def main() -> int:
     """Write the pages, or name those that are stale."""
-    pages, stale = make_pages(), stale_pages()
-    for name in stale:
+    stale = {name: text for name, text in make_pages().items() if not _same(REFERENCE / name, text)}
+    for name, text in stale.items():
         print(f"docs/reference/{name}")
-        path = REFERENCE / name
-        if "--check" in sys.argv[1:]:
-            continue
-        if name in pages:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(pages[name], encoding="utf-8")
-        else:
-            path.unlink()
+        if "--check" not in sys.argv[1:]:
+            (REFERENCE / name).write_text(text, encoding="utf-8")
     return 1 if stale and "--check" in sys.argv[1:] else 0
-
-
-def stale_pages() -> list[str]:
-    """Pages that are missing, differ from what the program says now, or describe a command that is gone."""
-    pages = make_pages()
-    present = {path.relative_to(REFERENCE).as_posix() for path in (REFERENCE / COMMANDS).glob("*.md")}
-    differ = {name for name, text in pages.items() if not _same(REFERENCE / name, text)}
-    return sorted(differ | (present - set(pages)))
 
 
 def _same(path: Path, text: str) -> bool:
@@ -53,65 +49,77 @@ def _same(path: Path, text: str) -> bool:
 
 def make_pages() -> dict[str, str]:
     """Every generated page by its path below docs/reference."""
+    return {
+        COMMANDS: _commands_page(),
+        SETTINGS: _settings_page(),
+        API: f"{NOTICE}\n\n{api_page()}",
+        EXPORTERS: _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8")),
+        FORMATS: _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8")),
+    }
+
+
+def _all_commands() -> dict[str, Any]:
+    """Every command by its name; those of a group by both names, such as "lab chart"."""
     from gsmerge.cli.app import app
 
-    commands: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    pages = {f"{COMMANDS}/{name}.md": command_page(name, command) for name, command in commands.items()}
-    pages[f"{COMMANDS}/README.md"] = _index(commands)
-    pages[SETTINGS], pages[TRAINING] = _settings_page(), _training_page()
-    pages[API] = f"{NOTICE}\n\n{api_page()}"
-    pages[EXPORTERS] = _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8"))
-    pages[FORMATS] = _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8"))
-    return pages
+    commands: dict[str, Any] = {}
+    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        if command.hidden:
+            continue
+        inner = getattr(command, "commands", None)
+        commands |= {name: command} if inner is None else {f"{name} {last}": one for last, one in inner.items()}
+    return commands
 
 
-def _index(commands: dict[str, Any]) -> str:
-    rows = [f"| [{name}]({name}.md) | {_cell(command.help)} |" for name, command in commands.items()]
-    return "\n".join([NOTICE, "", "# Commands", "", "| command | what it does |", "|---|---|", *rows, ""])
-
-
-def command_page(name: str, command: Any) -> str:
-    """The page of one command: usage, arguments, and a table of options for each panel of its help."""
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
-    usage = " ".join(["gsmerge", name, *command.collect_usage_pieces(None)])
-    lines = [NOTICE, "", f"# gsmerge {name}", "", " ".join(command.help.split()), "", "```console", usage, "```"]
-    if arguments:
-        lines += ["", "| argument | what it is |", "|---|---|"]
-        lines += [f"| `{_cell(_metavar(p))}` | {_cell(p.help)} |" for p in arguments]
-    panels: dict[str, list[Any]] = {}
-    for param in command.params:
-        if param.param_type_name == "option" and param.name not in ("help", "help_all"):
-            panels.setdefault(param.rich_help_panel or "Options", []).append(param)
-    for panel, params in panels.items():
-        lines += ["", f"## {panel}", "", "| option | value | default | what it does |", "|---|---|---|---|"]
-        lines += [_option_row(param) for param in params]
+def _commands_page() -> str:
+    """Arguments and options of every command; what an earlier command has in the same words is only named."""
+    known: dict[tuple[str, str], str] = {}
+    lines = [NOTICE, "", COMMANDS_HEAD]
+    for name, command in _all_commands().items():
+        lines += ["", f"## gsmerge {name}", "", " ".join(command.help.split()), ""]
+        same: dict[str, list[str]] = {}
+        for one in (*_arguments(command), *_options(command)):
+            words = "" if one.name == "set" else one.help  # --set differs only in its example
+            owner = known.setdefault((one.name, words), name)
+            if owner == name:
+                lines.append(_entry(one))
+            else:
+                same.setdefault(owner, []).append(f"`{_name(one)}`")
+        lines += [
+            f"- as [{owner}](#gsmerge-{owner.replace(' ', '-')}): {', '.join(names)}" for owner, names in same.items()
+        ]
     return "\n".join([*lines, ""])
 
 
-def _metavar(param: Any) -> str:
-    return param.metavar or param.name.upper()
+def _arguments(command: Any) -> list[Any]:
+    return [p for p in command.params if p.param_type_name == "argument"]
 
 
-def _option_row(param: Any) -> str:
-    names = ", ".join(f"`{name}`" for name in sorted((*param.opts, *param.secondary_opts), key=_long_first))
-    repeated = "; may be repeated" if param.multiple else ""
-    return f"| {names} | {_values(param)}{repeated} | {_cell(_default(param))} | {_cell(param.help)} |"
+def _options(command: Any) -> list[Any]:
+    return [p for p in command.params if p.param_type_name == "option" and p.name not in ("help", "help_all")]
 
 
-def _long_first(name: str) -> tuple[bool, bool]:
-    return not name.startswith("--"), name.startswith("--no-")
+def _name(param: Any) -> str:
+    return str(param.opts[0] if param.param_type_name == "option" else param.metavar or param.name.upper())
 
 
-def _values(param: Any) -> str:
-    """What an option takes: nothing, one of some words, a number, a path."""
-    if param.is_flag:
-        return ""
+def _entry(param: Any) -> str:
+    """A line for an argument, or for an option: its names, its value, its default, and its help."""
+    if param.param_type_name == "argument":
+        return f"- `{_name(param)}`: {_line(param.help)}"
+    named = sorted((*param.opts, *param.secondary_opts), key=lambda name: (not name.startswith("--"), name))
+    value = "" if param.is_flag else f" {_value(param)}"
+    default = _line(_default(param))
+    return f"- `{', '.join(named)}{value}`{f' ({default})' if default else ''}: {_line(param.help)}"
+
+
+def _value(param: Any) -> str:
+    """What an option takes, as a word in capitals or a list of words."""
     if param.metavar and param.metavar not in METAVARS.values():
-        return f"`{_cell(param.metavar)}`"
+        return _line(param.metavar)
     kind = param.type_descriptor.annotation
     kind = next((k for k in get_args(kind) if k is not type(None)), kind)  # of a list, or of an optional one
-    bounds = [("from", param.min), ("to", param.max)]
-    return " ".join([KINDS.get(kind, "text"), *(f"{word} {bound:g}" for word, bound in bounds if bound is not None)])
+    return KINDS.get(kind, "TEXT")
 
 
 def _default(param: Any) -> str:
@@ -124,9 +132,14 @@ def _default(param: Any) -> str:
     return "on" if value is True else str(value)
 
 
+def _line(text: str | None) -> str:
+    """Text in one line, without markup of rich."""
+    return " ".join((text or "").split()).replace("\\[", "[")
+
+
 def _cell(text: str | None) -> str:
-    """Text for a table: one line, no markup of rich, no column separators."""
-    return " ".join((text or "").split()).replace("\\[", "[").replace("|", "\\|")
+    """Text for a table: one line, no column separators."""
+    return _line(text).replace("|", "\\|")
 
 
 def _settings_page() -> str:
@@ -146,42 +159,31 @@ def _settings_page() -> str:
         "Fit": stages["fit"],
         "Before and after": stages["prepare"] + stages["clean"],
         "The whole run": [one for name, one in whole.items() if name not in stages],
-        "Files": flat_settings(FileOptions).values(),
-        "The frame of what is written": flat_settings(PlacementOptions).values(),
-        "`gsmerge extend`": flat_settings(ExtendOptions).values(),
+        "Files": list(flat_settings(FileOptions).values()),
+        "gsmerge convert": list(flat_settings(PlacementOptions).values()),
+        "gsmerge extend": list(flat_settings(ExtendOptions).values()),
     }
-    lines = [NOTICE, "", "# Settings", ""]
-    lines += ["`compact`, `batch`, `extend` and `stress` take them as `--set NAME=VALUE`, such as"]
-    lines += ["`--set poses=fixed --set min_opacity=0.01`; `compact` of a state takes those of the fit and of files,"]
-    lines += ["`render` and `view` those of superpixels. In Python they are arguments of `gsmerge.compact`."]
-    lines += ["A value is JSON, or text as it is; an empty default is `null`: the program chooses. Settings with"]
-    lines += ["an option of their own are listed too: `--k 2` is `--set k=2`."]
+    commands = _all_commands()
+    options = {p.name for name in ("compact", "convert") for p in _options(commands[name])}
+    lines = [NOTICE, "", SETTINGS_HEAD]
     for title, settings in tables.items():
-        lines += ["", f"## {title}", "", *_table(settings)]
+        rest = [one for one in settings if one.name not in options]
+        lines += ["", f"## {title}", "", *_list(rest)] if rest else []
     lines += ["", "## Hints", "", "`--hint NAME=VALUE` says how to read a file that is recognised wrongly.", ""]
-    lines += _table(flat_settings(FileHints).values(), "hint")
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, *_list(flat_settings(FileHints).values()), ""])
 
 
 def _exporters_page(page: str) -> str:
-    """Renew the tables of a page: what lies between the comments that name them and those that end them."""
+    """Renew the list of a page: what lies between the comment that names it and the one that ends it."""
     from gsmerge.scene.exporters import EXPORTERS
-    from gsmerge.scene.no_gaussians import POINTS_ONLY
 
-    exporters = EXPORTERS.values()
-    rows = [
-        (f"`{e.name}`", ", ".join(model.title for model in e.models), e.order, ", ".join(e.kinds * (e.order != "none")),
-         e.opacity, e.quats, ", ".join(map(str, e.degrees)), _columns(e))
-        for e in exporters
-    ]  # fmt: skip
-    head = ("name", "models", "order", "pixels", "opacity", "rotations", "degrees", "columns besides")
-    page = _renew(page, "names", head, rows)
-    models = ((m.title, m.source, m.leaves, m.result) for e in exporters for m in e.models)
-    points = ((row.title, ", ".join(f"`{file}`" for file in row.files), row.remedy) for row in POINTS_ONLY)
-    page = _renew(page, "points", ("program", "what it leaves", "what to do"), points)
-    return _renew(
-        page, "models", ("model", "saving code that was read", "what it leaves", "what becomes of it"), models
-    )
+    results: dict[str, list[str]] = {}
+    for one in EXPORTERS.values():
+        for model in one.models:
+            leaves = model.leaves.partition(";")[0].replace("no cameras", "")
+            facts = "; ".join(filter(None, (f"`{one.name}`", leaves)))
+            results.setdefault(model.result, []).append(f"{model.title} ({facts})")
+    return _renew(page, "models", [f"- *{result}*: {'; '.join(models)}" for result, models in results.items()])
 
 
 def _formats_page(page: str) -> str:
@@ -191,52 +193,39 @@ def _formats_page(page: str) -> str:
 
     rows = [
         (f"`{row.ending}`", "no" if row.read is None else "yes",
-         str(row.max_degree) if row.max_degree >= 0 else "not written",
-         *(f"{row.each[i]:.0f}" if i < len(row.each) else "" for i in (0, 3)), row.about)
+         f"to degree {row.max_degree}" if row.max_degree >= 0 else "no",
+         " / ".join(f"{row.each[i]:.0f}" for i in (0, 3) if i < len(row.each)), row.about)
         for row in ROWS
     ]  # fmt: skip
-    head = ("ending or name", "read", "written harmonics, up to degree", "bytes each", "of degree 3", "what it is")
-    page = _renew(page, "formats", head, rows)
-    cameras = ((row.files, " ".join(row.convention), row.intrinsics) for row in CAMERA_FORMATS)
-    return _renew(page, "cameras", ("file", "poses, axes", "intrinsics"), cameras)
+    page = _renew(page, "formats", _rows(("name", "read", "written", "bytes", "what it is"), rows))
+    cameras = (f"- {row.files}: {' '.join(row.convention)}; {row.intrinsics}" for row in CAMERA_FORMATS)
+    return _renew(page, "cameras", list(cameras))
 
 
-def _columns(exporter: Any) -> str:
-    """What a file has besides the 14 columns of all."""
-    normals = "normals as bytes" if exporter.byte_columns else "normals" if exporter.normals else ""
-    marks = (normals, *(f"`{name}`" for name in exporter.elements), exporter.comment and f"comment {exporter.comment}")
-    return ", ".join(mark for mark in marks if mark)
-
-
-def _renew(page: str, name: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table."""
     lines = ["| " + " | ".join(map(_cell, row)) + " |" for row in (head, *rows)]
-    lines.insert(1, "|---" * len(head) + "|")
+    return [lines[0], "|---" * len(head) + "|", *lines[1:]]
+
+
+def _renew(page: str, name: str, lines: Sequence[str]) -> str:
     start, end = f"<!-- {name}: made by docs/generate_reference.py from the program -->\n", "\n<!-- end -->"
     before, _, rest = page.partition(start)
     _, found, after = rest.partition(end)
     if not found:
-        raise ValueError(f"expected a table {name!r} between {start.strip()} and {end.strip()}")
+        raise ValueError(f"expected {name!r} between {start.strip()} and {end.strip()}")
     return before + start + "\n".join(["", *lines, ""]) + end + after
 
 
-def _training_page() -> str:
-    from gsmerge.networks.options import NetworkOptions
-    from gsmerge.research.training import TrainOptions
-    from gsmerge.settings.setting import settings_of
-
-    lines = [NOTICE, "", "# Settings of a training run", ""]
-    lines += ["Keys of the TOML or JSON file that `gsmerge train --config` reads.", ""]
-    lines += [*_table(settings_of(TrainOptions).values()), ""]
-    return "\n".join([*lines, "## The table `network`", "", *_table(settings_of(NetworkOptions).values()), ""])
-
-
-def _table(settings: Iterable[Any], head: str = "setting") -> list[str]:
-    """A table of settings: name, default, values, and what is said of each."""
-    rows = []
+def _list(settings: Iterable[Any]) -> list[str]:
+    """A line for each setting: name, default, values, and what it is."""
+    lines = []
     for one in settings:
-        shown = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
-        rows.append(f"| `{one.name}` | {shown} | {_cell(one.values())} | {_cell(one.text)} |")
-    return [f"| {head} | default | values | what it is |", "|---|---|---|---|", *rows]
+        default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
+        facts = "; ".join(filter(None, (default, _line(one.values(null=False)) if one.words else "")))
+        text = _line(one.text if one.default is None else one.help)
+        lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
+    return lines
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,7 @@
     python examples/01_make_scene.py made
 
 A furnished room is photographed from an arc of views, and every pixel becomes one Gaussian with the errors of a
-predicted depth (docs: "generator"). `gsmerge generate` makes many such scenes, of other kinds too. The folder gets
+predicted depth (docs: "generator"). `gsmerge lab generate` makes many such scenes, of other kinds too. The folder gets
 
     scene.ply          one Gaussian per pixel, 17 columns, view-major and row-major
     transforms.json    the cameras (nerfstudio: camera to world, OpenGL axes)

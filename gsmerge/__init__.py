@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from gsmerge.io.formats.streamed import write_levels as write_levels
     from gsmerge.measure.evaluate import Evaluation as Evaluation
     from gsmerge.measure.evaluate import evaluate as evaluate
+    from gsmerge.pages.view import view as view
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
     from gsmerge.scene.read import read_scene as read_scene
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
     from gsmerge.types import Scene as Scene
     from gsmerge.types import Views as Views
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PUBLIC = {
     "compaction.compact": ("compact",),
@@ -58,6 +59,7 @@ _PUBLIC = {
     "io.formats.streamed": ("write_levels",),
     "io.formats.write": ("write_gaussians", "write_ply"),
     "measure.evaluate": ("Evaluation", "evaluate"),
+    "pages.view": ("view",),
     "states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
     "scene.read": ("read_scene",),

@@ -78,7 +78,7 @@ def is_opencv_damaged(error: BaseException) -> bool:
 
 
 TORCH_INSTALL = 'pip install "torch>=2.4,<3" --extra-index-url https://download.pytorch.org/whl/cpu'
-NO_TORCH = f"this needs torch, which is not installed; its build for CPUs: {TORCH_INSTALL}"
+NO_TORCH = f"this needs torch, which is not installed; install gsmerge[torch], or its build for CPUs: {TORCH_INSTALL}"
 
 
 def is_torch_missing(error: BaseException) -> bool:

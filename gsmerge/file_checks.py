@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.npz_files import READ_ARRAYS, array_names, read_depths
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras
+from gsmerge.io.cameras.npz_files import read_depths
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
-from gsmerge.io.formats.table import SCENE_SUFFIXES, may_hold_gaussians
+from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
@@ -73,16 +72,17 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 def holds_scene(path: Path) -> bool:
     """Return whether a path is read as a scene, and not as cameras, networks, levels or a state alone."""
-    if path.is_dir():
-        return bool(list_plys(path))
-    return path.suffix.lower() in SCENE_SUFFIXES and (not path.exists() or may_hold_gaussians(path))
+    suffix = path.suffix.lower()
+    if suffix in SEVERAL_USES:
+        return os.path.exists(path) and may_hold_gaussians(path)
+    return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 
 def damage(path: Path) -> list[str]:
     """List what reading a file does not meet: bytes behind its content, and wrong checksums of its parts."""
     suffix = path.suffix.lower()
-    if path.is_dir():
-        return [f"{ply.name}: {problem}" for ply in find_scene_files(path).plys for problem in damage(ply)]
+    if os.path.isdir(path):
+        return [f"{file.name}: {problem}" for file in list_plys(path) for problem in damage(file)]
     found = _damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
     left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
     return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
@@ -101,7 +101,7 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    if os.path.isdir(path) or suffix in CAMERAS:
+    if suffix in CAMERAS:
         return _read_cameras(path)
     check_file(path)
     endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
@@ -119,28 +119,13 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 
 def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file, of all scenes if it has several, or of a folder."""
-    count, notes = 0, list[str]()
+    """Read the cameras of a file, of all scenes if it has several."""
+    count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)
-    source, place = cameras.source, Path(cameras.path)
-    if path.is_dir() and not is_colmap(path):
-        notes.append("the folder has no Gaussians: its cameras alone were read")
-    if place.is_dir():
-        ending = ".bin" if source == "COLMAP binary" else ".txt"
-        read = {f"{name}{ending}" for name in ("cameras", "images")}
-        others = sorted(file.name for file in place.iterdir() if file.suffix in (".bin", ".txt"))
-        notes += _not_read([name for name in others if name not in read])
-    elif place.suffix == ".npz":
-        read_depths(place)
-        notes += _not_read(sorted(array_names(place) - READ_ARRAYS), " but for their checksums")
-    return FileCheck(str(path), "cameras", count, source, notes=tuple(notes))
-
-
-def _not_read(names: Sequence[str], remark: str = "") -> list[str]:
-    """Make a note of the files that were not read; none if all were."""
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return [f"not read{remark}: {', '.join(names[:4])}{more}"] if names else []
+    if Path(cameras.path).suffix == ".npz":
+        read_depths(Path(cameras.path))
+    return FileCheck(str(path), "cameras", count, cameras.source)
 
 
 def _read_levels(path: Path) -> FileCheck:

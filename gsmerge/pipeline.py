@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
 from gsmerge.runtime.record import choose
@@ -22,6 +23,8 @@ Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonica
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
     decoded = start(prepared, plan, count)
+    if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
+        return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
     return fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
 
 

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.budget import FileSize, exact_count, file_size
 from gsmerge.errors import UsageError
 from gsmerge.facts.partition import usual_blocks
-from gsmerge.facts.prepare import Prepared, Reference
+from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import report_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, BudgetOptions
+from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -45,6 +45,7 @@ AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost l
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians in the pixels
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
+KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -79,7 +80,7 @@ class Plan:
     fit: FitOptions  # Fit to the photos
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
-    target_psnr: float | None  # PSNR (dB) that the input photos have to reach; None: no target
+    target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
@@ -110,6 +111,11 @@ class Plan:
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
+    def keeps_psnr(self) -> bool:
+        """Whether the target is that of :func:`kept_psnr`."""
+        return self.target_psnr is not None and self.settings["quality"] is None
+
+    @property
     def limits(self) -> CountLimits:
         """Limits of the number of Gaussians."""
         return self.superpixels.limits
@@ -129,7 +135,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     ``checkpoint``: networks to use instead of those that the options name.
     """
     scene, reference, size = prepared.scene, prepared.reference, prepared.size
-    _check_photos(reference, options)
+    _check_photos(prepared, options)
+    target = options.budget.target_psnr or kept_psnr(size, options)
     cuts = options.method == OURS and size.num_views > 0  # views into superpixels
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
@@ -152,7 +159,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
     tree = None
-    searches = options.budget.quality is not None or options.budget.auto or options.budget.levels > 1
+    budget = options.budget
+    searches = target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
@@ -162,12 +170,12 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         fit=fit,
         clean=clean_options,
         unseen=unseen,
-        target_psnr=options.budget.target_psnr,
+        target_psnr=target,
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         size=file_size(options.budget),
-        scored_views=_choose_scored_views(prepared, options),
+        scored_views=_choose_scored_views(prepared, decisive=target is not None),
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
@@ -184,6 +192,7 @@ class SceneChoices:
     match: Method  # Of merging across views
     checkpoint: str  # Name of the networks to load; "none"
     fit: FitOptions  # With the steps that are taken
+    kept_psnr: float | None  # see :func:`kept_psnr`
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
         """Return all settings by flat name, with the values that the plan chose."""
@@ -197,6 +206,7 @@ def choose_for_scene(
 
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
+    kept = kept_psnr(scene, options)
     if not scene.photos:
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
@@ -208,7 +218,7 @@ def choose_for_scene(
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit)
+    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, kept)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
@@ -220,7 +230,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     if asked <= 1:
         return 1
     if problems:
-        raise UsageError(f"blocks {asked}: expected one piece (--blocks none) with {problems[0]}")
+        raise UsageError(f"blocks {asked}: expected one piece (--set blocks=none) with {problems[0]}")
     if asked > scene.num_views:
         raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
     return asked
@@ -230,7 +240,7 @@ def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
     """Note that a cluster has no use for a scene that is compacted in one piece."""
     if blocks == 1 and options.blocks.engine.engine != "local":
         problems = blocks_problems(scene, options)
-        remedy = f"which {problems[0]} needs" if problems else "--blocks NUMBER makes several"
+        remedy = f"which {problems[0]} needs" if problems else "--set blocks=NUMBER makes several"
         note(f"engine ray: the scene is compacted in one piece, on this machine; {remedy}")
 
 
@@ -260,11 +270,26 @@ def _whole_needed(options: CompactOptions) -> list[str]:
     return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
 
 
-def _check_photos(reference: Reference, options: CompactOptions) -> None:
+def kept_psnr(scene: SceneSize, options: CompactOptions) -> float | None:
+    """Return the PSNR (dB) from the input that decides the count; None where options, photos or pixels decide it.
+
+    A share of the Gaussians says little where they belong to no pixels: a scene that is compact already needs most of
+    its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
+    """
+    budget = options.budget
+    asked = budget.quality is not None or budget.budget not in (None, AUTO, *DEVICES)
+    asked |= options.segment.superpixels != SHARE or options.decode.k != AUTO or options.method != OURS
+    return KEPT_PSNR if scene.rendered and not asked else None
+
+
+def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
     """Raise UsageError for settings that need photos if there are none."""
-    if not reference.score_views and options.budget.quality is not None:
-        raise UsageError("a quality target needs photos, and the scene has none; give --images, or a --budget")
-    if reference.name == RENDERS and "sky" in options.clean.drops:
+    if prepared.reference.name != RENDERS:
+        return
+    if options.budget.max_drop is not None:
+        problem = f'quality {options.budget.quality}: expected a PSNR from the input as "35dB" without photos'
+        raise UsageError(f"{problem}, since nothing shows the scene better than the input; or give --images")
+    if "sky" in options.clean.drops and prepared.input_scene.images is None:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
@@ -277,7 +302,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """Return the name of the checkpoint to load: as asked, or the shipped one where it improves results.
 
     If no fit follows, the shipped networks improve scenes with one Gaussian per pixel, and others that have photos; a
-    fit gains more by further steps (docs/laboratory/networks.md).
+    fit gains more by further steps (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -306,7 +331,7 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     if options.recipe == "paper" and outputs != "absolute":
         raise UsageError(
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
-            " gsmerge train --preset paper makes them"
+            " gsmerge lab train --preset paper makes them"
         )
     require_children("k", options.decode.max_k, checkpoint)
     return checkpoint
@@ -395,7 +420,7 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     """Return the number of steps of the full fit: as set, or by effort, views and ``share``.
 
     ``share``: Gaussians of the result for each pixel. A step looks at one view. Measurements are in
-    docs/laboratory/large-scenes.md.
+    docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -418,12 +443,11 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 
-def _choose_scored_views(prepared: Prepared, options: CompactOptions) -> tuple[int, ...]:
-    """Choose views for scoring whose photos show the scene; more if they decide a search for a quality."""
+def _choose_scored_views(prepared: Prepared, *, decisive: bool) -> tuple[int, ...]:
+    """Choose views for scoring whose pictures show the scene; more if they are ``decisive`` for the count."""
     reference = prepared.reference
     if reference.placed:
         return reference.score_views
-    views = reference.fit_views or range(len(prepared.scene))
-    candidates = [view for view, place in enumerate(prepared.repeated) if place in views]
-    choose_some = report_views if options.budget.target_psnr is None else scored_views
+    candidates = [view for view, place in enumerate(prepared.repeated) if place in reference.score_views]
+    choose_some = scored_views if decisive else report_views
     return tuple(candidates[i] for i in choose_some(len(candidates)))

@@ -17,6 +17,7 @@ from gsmerge import __version__
 
 SCHEMA_VERSION = 1
 MAX_WIDTH = 10_000  # columns of a table in a pipe
+UNIT = r"(?<=\d) (?=(?:%|[kMG]?B|dB|px|m?s|min|h)(?:\W|$))"  # the space between a number and its unit
 MIN_NAME = 12  # columns that a table's first keeps in a narrow terminal
 
 
@@ -102,7 +103,9 @@ def wrap_line(line: str, columns: int | None, hang: int = 0) -> list[str]:
     label = re.match(r" *\S+(?: \S+)?  +|(?:note|warning|error): ", line)
     indents = (hang, len(label[0]) if label else 2)
     indent = " " * next((indent for indent in indents if 0 < indent < columns // 2), 2)
-    return textwrap.wrap(line, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    whole = re.sub(UNIT, "\N{NO-BREAK SPACE}", line)  # numbers stay with their units
+    wrapped = textwrap.wrap(whole, columns, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [part.replace("\N{NO-BREAK SPACE}", " ") for part in wrapped]
 
 
 def html_table(rows: Sequence[Sequence[str]]) -> str:

@@ -257,19 +257,17 @@ class Views:
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
 
-    A scene is aligned where every row's pixel is known, as feed-forward models export one Gaussian per pixel and view:
-    row ``(v·H + y)·W + x`` then belongs to pixel (x, y) of view v. Rows that were not finite in the file stay, fully
-    transparent, so that the order survives; pixels without a row are filled up like that, or from a depth map.
+    A scene is aligned where every row's pixel is known: row ``(v·H + y)·W + x`` belongs to pixel (x, y) of view v. Rows
+    that were not finite stay, fully transparent; pixels without a row are filled up like that, or from a depth map.
 
     Args:
         gaussians: n rows, in the frame of the cameras; V·H·W of an aligned scene.
         cameras: The V views; none where none are known.
-        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None where there are none.
-        pixel_ids: ``[n]`` int32, the pixel that each row belongs to, which is the row's own number, or -1 where the row
-            is no finite Gaussian; None where the pixels are not known.
+        images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32, or None.
+        pixel_ids: ``[n]`` int32, each row's pixel, or -1 where the row is not finite; None: not known.
         names: The views' names (image file names where known).
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
-        large_photos: The photos with more pixels than the views; None where they have no more.
+        large_photos: The photos with more pixels than the views, or None.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere.
 
     Raises:

@@ -1,34 +1,58 @@
-"""Makes docs/images/preview.jpg: the picture of the README's first commands, of one view and from outside, as a JPEG.
+"""Makes docs/images/preview.jpg: the room of the README before and after, from a camera of which there was no photo.
 
 python tools/make_preview.py
 """
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from readme_block import find_block
+
+import gsmerge
+from gsmerge.measure.preview import to_picture
+from gsmerge.measure.sizes import zoom_cameras
 
 ROOT = Path(__file__).parents[1]
-QUALITY = 90  # of the JPEG, in percent
+VIEW = 2  # of the held-out ones
+ZOOM = 1.5  # times the size of the views
+GAP, BAND, LETTERS = 8, 44, 24  # pixels
+QUALITY = 88  # of the JPEG, in percent
+
+
+def draw_half(scene: gsmerge.Gaussians, cameras: gsmerge.Cameras, path: Path, word: str) -> np.ndarray:
+    """Draw the Gaussians of a file, with their number and the bytes of the file below: ``[h,w,3]``, 8 bits."""
+    picture = to_picture(gsmerge.render(scene, cameras).images[0])
+    half = Image.fromarray(np.pad(picture, ((0, BAND), (0, 0), (0, 0)), constant_values=255))
+    text = f"{word}: {len(scene):,} Gaussians, {path.stat().st_size / 1e6:.1f} MB"
+    font = ImageFont.load_default(LETTERS)
+    ImageDraw.Draw(half).text((half.width / 2, half.height - BAND / 2), text, "black", font, anchor="mm")
+    return np.asarray(half)
 
 
 def main() -> None:
-    """Make the scene, compact it, draw it, and write the picture."""
+    """Make the scene and compact it by the README's command, draw both, and write the picture."""
+    (size,) = re.findall(r"01_make_scene.py demo (.+?) &&", find_block("examples/01_make_scene.py"))
     with TemporaryDirectory() as folder:
-        scene, gsmerge = Path(folder) / "demo", ("-m", "gsmerge")
-        plys, png = (scene / "scene.ply", scene / "scene.compact.ply"), scene / "preview.png"
-        for call in (
-            (ROOT / "examples" / "01_make_scene.py", scene),
-            (*gsmerge, "compact", scene, "--k", 2),
-            (*gsmerge, "render", *plys, "--views", 1, "-o", png),
-        ):
+        demo = Path(folder) / "demo"
+        for call in ((ROOT / "examples" / "01_make_scene.py", demo, *size.split()), ("-m", "gsmerge", "compact", demo)):
             subprocess.run([sys.executable, *map(str, call)], cwd=ROOT, check=True)
-        picture = ROOT / "docs" / "images" / "preview.jpg"
-        cv2.imwrite(str(picture), cv2.imread(str(png)), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        cameras = gsmerge.to_cameras(gsmerge.read_cameras(demo / "targets"))
+        files = (demo / "scene.ply", "before"), (demo / "scene.compact.ply", "after")
+        halves = [
+            draw_half(gsmerge.read_ply(path).gaussians, zoom_cameras(cameras[[VIEW]], ZOOM), path, word)
+            for path, word in files
+        ]
+    gap = np.full((len(halves[0]), GAP, 3), 255, np.uint8)
+    picture = ROOT / "docs" / "images" / "preview.jpg"
+    cv2.imwrite(str(picture), np.hstack([halves[0], gap, halves[1]])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     print(picture)
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.alignment.judge import Recovery
 from gsmerge.alignment.layouts import ESTIMATED, MAY_BE_UNALIGNED, TRIMS, WITH_PHOTOS, Layout
-from gsmerge.alignment.rotations import choose_rotations, read_rotations
+from gsmerge.alignment.rotations import choose_rotations, read_rotations, w_seems_last
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align
 

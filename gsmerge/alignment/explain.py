@@ -56,7 +56,7 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
             is_grid = own_camera is not None and median(pixel_errors(pairs, own_camera)) < 4 * alignment.limit_px
             if reason or is_grid:
                 raise misalignment_error(camera_file.path, alignment, reason)
-            problem = f"expected one Gaussian per pixel, found {ply.count} rows that are in no known order"
+            problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
         elif count > views * width * height and count % (width * height) == 0:
             size = views * width * height
             first = replace(inputs, gaussians=inputs.gaussians[:size], valid=inputs.valid[:size], order="view-major")
@@ -89,8 +89,9 @@ def _count_remedy(count: int, cameras: Cameras) -> str:
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
     """Make the SceneError for rows as many as pixels, which fit no layout or several."""
     if alignment.ok:
-        problem = f"expected rows that fit the pixels in one way, found several that do, to {alignment.worst_px:.1f} px"
-        return SceneError(path, problem, "name the order of the rows with --hint order=NAME")
+        found = f"several that do, to {alignment.worst_px:.1f} px"
+        problem = f"expected one order of the Gaussians that fits the pixels, found {found}"
+        return SceneError(path, problem, "name their order with --hint order=NAME")
     problem = (
         f"expected every view's Gaussians within {alignment.limit_px:g} px of their own pixels, "
         f"found a median of up to {alignment.worst_px:.1f} px and "
@@ -133,7 +134,7 @@ def explain_misalignment(
     for layout in (*full, replace(plain, order="reversed", views=plain.views[::-1])):
         pairs = find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
         if layout.order in _ORDERS and check_pairs(pairs, cameras).ok:
-            return f"the rows fit {_ORDERS[layout.order]}"
+            return f"the Gaussians fit {_ORDERS[layout.order]}"
     swapped = replace(cameras, width=cameras.height, height=cameras.width)
     if check_alignment(gaussians, swapped, valid).ok:
         return "the cameras fit with width and height swapped"

@@ -171,7 +171,7 @@ def read_unordered(rows: ProjectedRows, *, color_of: ColorOf | None = None) -> L
     slots_of_views = np.split(used, np.searchsorted(used, np.arange(1, num_views) * num_pixels))
     parts = [(view, owner[part], part - view * num_pixels) for view, part in enumerate(slots_of_views) if len(part)]
     lost = count - len(used)
-    note = f", {lost:,} rows without a pixel" if lost else ""
+    note = f", {lost:,} Gaussians without a pixel" if lost else ""
     return rows.layout("unordered", parts, missing=num_views * num_pixels - len(used), note=note)
 
 

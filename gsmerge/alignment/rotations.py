@@ -21,6 +21,7 @@ _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface
 _MIN_TESTED = 300  # Gaussians
 _MIN_COSINE, _MIN_GAIN = 0.6, 0.15  # of the mean cosine between thinnest axis and normal, for another reading
+_SIGNED_GAIN = 0.04  # the same for xyzw where the last column is never negative, as w often is not
 _AROUND = 5  # pixels of the square over which means are averaged before roots are compared
 _FOLLOWS = 0.95  # cosine above which an axis follows the surface
 _MAX_LEFT = 0.5  # share of Gaussians that follow under no root, over that under any other reading
@@ -70,7 +71,8 @@ def square_roots(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[QuatChoice, str]:
     """Choose the reading of rotations whose thinnest axes follow the surface normals; in doubt "wxyz".
 
-    Also returns a note. ``turn`` as in :func:`read_rotations`.
+    A last column that is never negative speaks for "xyzw", so less of a difference decides then. Also returns a note.
+    ``turn`` as in :func:`read_rotations`.
     """
     normals, rows, views = _normals(scene)
     scales = scene.gaussians.scales[rows]
@@ -87,14 +89,23 @@ def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[Quat
     means = parallel_map(lambda read: float(_cosines(read, thinnest, normals).mean()), single)
     cosine: dict[QuatChoice, float] = dict(zip(_READINGS, means, strict=True))
     best: QuatChoice = max(_READINGS, key=lambda name: cosine[name])
+    gain = _SIGNED_GAIN if best == "xyzw" and w_seems_last(scene.file_gaussians.quats) else _MIN_GAIN
     if _is_root(scene, rows, single, thinnest, normals):
         best, cosine["xyzw-root"] = "xyzw-root", _better_of(square_roots(as_xyzw), thinnest, normals, 0.0)
-    elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + _MIN_GAIN):
+    elif best == "wxyz" or cosine[best] < max(_MIN_COSINE, cosine["wxyz"] + gain):
         return "wxyz", ""
     return best, (
         f"rotations are {_DESCRIPTIONS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the"
         f" surface then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
     )
+
+
+def w_seems_last(quats: np.ndarray) -> bool:
+    """Return whether the last column of quaternions ``[n,4]`` is never negative, and the first one is.
+
+    Rotations from matrices rarely have a negative w; but Depth Anything 3 takes the sign from the last of wxyz.
+    """
+    return bool(quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0))
 
 
 def _camera_quats(scene: Scene, turn: np.ndarray | None) -> np.ndarray:

@@ -206,7 +206,7 @@ def _align_upright(source: _Source, grid: GridFit, rotation: Similarity) -> Alig
         replace(source.camera_file, viewmats=moved.cameras.viewmats),
         (*candidate.notes, f"the cameras are {frame.description}, as the photos' colours show"),
         candidate.transform,
-        problem="expected one Gaussian per pixel, found rows that were merged",
+        problem="expected one Gaussian per pixel, found Gaussians that were merged",
     )
 
 

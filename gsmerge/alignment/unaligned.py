@@ -181,7 +181,8 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
     if ratio > _MAX_FRONT_RATIO:
         found = (
-            f"even with cameras {name} the foremost rows' colours are {ratio:.2f} times as far from the photos as any"
+            f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"
+            " photos as any"
         )
         remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
         raise SceneError(why.path, f"{why.problem}; {found} others", remedy)

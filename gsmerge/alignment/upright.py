@@ -172,7 +172,7 @@ def upright_error(ply: FileInfo, num_photos: int) -> SceneError:
     photos = "photos that do not show" if num_photos else "no photos that show"
     return SceneError(
         ply.path,
-        "expected cameras in the frame of the rows, found rows that were centred, rescaled and turned upright (by how"
-        f" much, no file says), and {photos} where they lie",
+        "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned upright"
+        f" (by how much, no file says), and {photos} where they lie",
         "give the photos that the model saw, or cameras in the file's frame; or export all pixels, without a far cut",
     )

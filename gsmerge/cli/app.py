@@ -67,6 +67,8 @@ FORMER_OPTIONS = {
     "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
     "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
     "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
+    "masks": "masks beside the photos are found",
+    "config": "use --set NAME=VALUE for each setting in it",
     "draw_only": "a call without scenes draws what the folder holds",
     "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
     "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",
@@ -121,7 +123,7 @@ def make_app(only: str | None = None) -> typer.Typer:
     made = typer.Typer(
         name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
     )
-    made.callback()(root)
+    made.callback(invoke_without_command=True)(root)
     for panel, names in COMMANDS.items():
         for name in names:
             if only in (None, name):
@@ -131,7 +133,8 @@ def make_app(only: str | None = None) -> typer.Typer:
         made.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
     if only in (*OWN_COMMANDS, LOOK):
         return made
-    lab = typer.Typer()
+    lab = typer.Typer(help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks.")
+    lab.callback(invoke_without_command=True)(_lab_root)
     for name, entry in find_plugins(PLUGINS).items():
         is_ours = _is_ours(entry)
         if only in (None, LAB if is_ours else name) and name not in OWN_COMMANDS:
@@ -145,9 +148,13 @@ def make_app(only: str | None = None) -> typer.Typer:
             )
             place(function)
     if only in (None, LAB):
-        help = "Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
-        made.add_typer(lab, name=LAB, help=help, no_args_is_help=True, rich_help_panel="Research")
+        made.add_typer(lab, name=LAB, rich_help_panel="Research")
     return made
+
+
+def _lab_root(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 def _is_ours(entry: EntryPoint) -> bool:
@@ -188,6 +195,7 @@ def _print_version(value: bool) -> None:
 
 
 def root(
+    context: typer.Context,
     _: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
@@ -196,6 +204,8 @@ def root(
     ] = False,
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
+    if context.invoked_subcommand is None:
+        print(OPENING)
 
 
 def _usage_message(error: Any) -> str:
@@ -232,7 +242,8 @@ def _suggest(option: str, command: Any) -> str | None:
         return f"{option} is no option any more: {FORMER_OPTIONS[name]}" if name in FORMER_OPTIONS else None
     default = settings[positive].default
     value = str(not default).lower() if isinstance(default, bool) else "VALUE"
-    return f"{option} is no option: use --set {positive}={value}"
+    more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
+    return f"{option} is no option: use --set {positive}={value}{more}"
 
 
 _SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled
@@ -308,9 +319,6 @@ def run(args: Sequence[str] | None = None) -> int:
     try:
         with plain_warnings(), _orderly_stop(signals):
             _check_working_directory()
-            if not words:
-                print(OPENING)
-                return 0
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             app = make_app(_command_of(words))
             code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0

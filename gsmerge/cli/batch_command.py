@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import one_line, print_document, say, say_warning, separate_stdout, total_progress
+from gsmerge.cli.console import print_document, say, say_warning, separate_stdout, terminal_columns, total_progress
 from gsmerge.errors import BatchError, TargetError, UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import Engine
@@ -108,7 +108,7 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
         raise
     finally:
         if (totals.counts or interrupted) and not args.silent:
-            print("\n".join(map(one_line, totals.lines())))
+            print_document({}, totals.lines(terminal_columns(sys.stdout)), as_json=False)
     worse = ""
     if totals.worse:
         worse = f"{len(totals.worse)} of {totals.total} results show their photos worse than the input"
@@ -187,13 +187,13 @@ class Totals:
             if len(self.rows) < MAX_LISTED:
                 self.rows.append(_row(record["output"], report))
 
-    def lines(self) -> list[str]:
-        """Write a table of the results, what is worse, what failed, and a line of totals."""
+    def lines(self, columns: int | None = None) -> list[str]:
+        """Write a table of the results, ``columns`` wide, what is worse, what failed, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.report import text_table
 
-        header = ("result", "Gaussians", "of", "kept", "dB before", "after", "seconds")
-        lines = text_table([header, *sorted(self.rows)]) if self.rows else []
+        header = ("result", "Gaussians", "of", "kept", "dB before", "dB after", "seconds")
+        lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 6, 4, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
         for status, reasons in (("worse", self.worse), (FAILED, self.failed)):

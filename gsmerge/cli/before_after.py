@@ -50,8 +50,9 @@ class BeforeAfter:
     @property
     def title(self) -> str:
         """Name of the scene."""
-        ply = self.load.files.ply
-        return ply.parent.absolute().name if ply.stem == "scene" else ply.stem
+        from gsmerge.scene.files import scene_title
+
+        return scene_title(self.load.files.ply)
 
     @property
     def gaussians(self) -> dict[str, Gaussians]:

@@ -11,7 +11,15 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, say_warning, separate_stdout, stage_progress
+from gsmerge.cli.console import (
+    print_document,
+    say,
+    say_notes,
+    say_warning,
+    separate_stdout,
+    stage_progress,
+    terminal_columns,
+)
 from gsmerge.cli.paths import (
     FileOptions,
     check_format,
@@ -19,7 +27,6 @@ from gsmerge.cli.paths import (
     checkpoint_files,
     default_output,
     input_files,
-    is_camera_file,
     is_index,
     model_files,
     output_file,
@@ -50,8 +57,8 @@ PARAMETERS = (
     f"{opt.READING} masks budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream, in chunks beside it. "
-               "A folder named colmap: a COLMAP model. A folder that exists: into it.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream. A new folder: a web "
+               "site; colmap: a COLMAP model; a folder with files in it gets the result.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -114,7 +121,7 @@ def _compact(args: opt.Args) -> None:
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
-    beside = None if cameras is None or (not args.overwrite and is_camera_file(cameras)) else cameras
+    beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
     named = (out, *model, *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True, cameras=True)
@@ -131,7 +138,7 @@ def _compact(args: opt.Args) -> None:
 
     outputs = Outputs(
         out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
-        spz_version=writing.spz_version, full_columns=writing.columns == "full",
+        full_columns=writing.columns == "full",
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -145,9 +152,9 @@ def _compact(args: opt.Args) -> None:
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) else []
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
-        lines = result_table(document, shlex.join(look) or None)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet)
-    if args.strict and document["psnr_input_views"]["before"] is None:
+        lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
+    if args.strict and document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], document["worse"] if args.strict else None]
     if document["worse"] and not args.strict:
@@ -181,7 +188,7 @@ def _compact_state(args: opt.Args, start: float) -> None:
     with stage_progress(quiet=args.silent) as progress:
         document = compact_file(
             path, out, settings, k=args.k, budget=args.budget, mixed=mixed, always_fit=args.fit is not None,
-            normals=writing.normals, spz_version=writing.spz_version, overwrite=args.overwrite,
+            normals=writing.normals, overwrite=args.overwrite,
             dry_run=args.dry_run, progress=progress, seconds_before=before,
         )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
@@ -226,4 +233,4 @@ def print_plan(args: opt.Args, files: SceneFiles, settings: CompactOptions, out:
     load = read_input(files, opacity=args.opacity, hints=hints)
     with opt.usage_errors():
         document = plan_files(load, settings, Outputs(out, overwrite=args.overwrite))
-    print_document(document, plan_lines(document), as_json=args.json, wrap=True)
+    print_document(document, plan_lines(document), as_json=args.json)

@@ -137,6 +137,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
         yield lambda stage, done, total: None
         return
     from rich import progress as rich
+    from rich.table import Column
 
     from gsmerge.runtime.record import STAGES
 
@@ -148,7 +149,9 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
 
     count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}") for name in ("count", "detail"))
-    columns: tuple[rich.ProgressColumn, ...] = (rich.TextColumn("{task.description:>12}"), _bar(console), count)
+    place = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
+    name = rich.TextColumn("{task.description:>12}", table_column=place)
+    columns: tuple[rich.ProgressColumn, ...] = (name, _bar(console), count)
     if console.width >= NARROW:
         columns = *columns[:2], rich.TimeElapsedColumn(), count, TimeLeft(), detail
     with rich.Progress(*columns, console=console, transient=True, refresh_per_second=5) as bars:

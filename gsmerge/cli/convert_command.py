@@ -19,15 +19,16 @@ from gsmerge.settings.stages import CleanOptions
 class PhotoOptions(Settings):
     """Photos that a conversion reads."""
 
-    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and whose names a "
-        "COLMAP model has.", metavar="PATH")  # fmt: skip
+    images: str | None = setting(None, "Folder of the cameras' photos, which `--drop sky` needs, and which a COLMAP "
+        "model links; for the latter `images` beside the cameras is found.", metavar="PATH")  # fmt: skip
 
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb or lod-meta.json; several of one "
-                 "world are joined. The last is written, as its name says: one of these, .usdc, .usda, .usdz, or a "
-                 "folder named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
+                 "world are joined. The last is written, as its name says: .ply, .spz, .sog, .splat, .glb, .usdc, "
+                 ".usdz, lod-meta.json, a new folder for a web site, or one named colmap. Or a .gsm of gsmerge extend, "
+                 "and a .npz for its Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
@@ -52,7 +53,7 @@ def convert(args: opt.Args) -> None:
 
     options = ConvertOptions(
         inputs, output, args.cameras, images, args.opacity, cleaning, placement,
-        normals=writing.normals, full_columns=writing.columns == "full", spz_version=writing.spz_version,
+        normals=writing.normals, full_columns=writing.columns == "full",
         overwrite=args.overwrite,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):

@@ -17,12 +17,9 @@ from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.io import GaussianFile
     from gsmerge.measure.evaluate import Evaluation
     from gsmerge.pages.data import Stills
-    from gsmerge.types import Cameras
 
-OUTSIDE = 0.03  # share of a result's Gaussians beyond all of its own views: what merging and a fit move there
 PAGE = ".html"
 SUFFIXES = (".json", ".csv", ".md", PAGE)
 SPEED_ZOOMS = (1.0, 2.0)  # sizes of pictures whose render time is measured where `zoom` names none
@@ -73,8 +70,10 @@ def evaluate(args: opt.Args) -> None:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
     notes = [*pair.notes, *missing]
-    if len(pair.scene) < len(pair.load.scene):
-        notes += [_more_views(name, ply, pair.scene.cameras) for name, ply in pair.plys.items()]
+    if pair.plys and len(pair.scene) < len(pair.load.scene):
+        notes.append(
+            f"measured as results of {len(pair.scene)} views: one that was made of more has seen what it is asked here"
+        )
     say_notes(notes, quiet=args.silent)
     stills: Stills = {}
     more = {"on_image": still_keeper(stills)} if any(path.suffix == PAGE for path in outputs) else {}
@@ -86,7 +85,7 @@ def evaluate(args: opt.Args) -> None:
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
-    print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, quiet=args.silent)
 
 
@@ -137,22 +136,9 @@ def _seconds_of(making: float | str) -> float:
         seconds = document.get("total_seconds") if isinstance(document, dict) else None
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < 1e9:
         raise SceneError(
-            Path(str(making)), "expected seconds or the JSON of a compact run (total_seconds), found neither"
+            Path(str(making)), "expected seconds or the report of a compact run (total_seconds), found neither"
         )
     return float(seconds)
-
-
-def _more_views(name: str, ply: GaussianFile, cameras: Cameras) -> str:
-    """Describe a result that is measured as one made from some of the views, but may be made from all."""
-    from gsmerge.measure.visibility import share_outside
-
-    views, outside = len(cameras), share_outside(ply.gaussians[ply.valid], cameras)
-    if outside > OUTSIDE:
-        return (
-            f"{name}: {100 * outside:.0f} % of its Gaussians lie outside of the {views} views of --views: it was made"
-            f" of more views, so these are no scores of {views}"
-        )
-    return f"{name}: measured as a result of {views} views; if it was made of more, it has seen what it is asked here"
 
 
 def _write(

@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Any
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import one_line, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
@@ -45,7 +45,7 @@ def extend(args: opt.Args) -> None:
         documents.append(document)
         say_notes(document["notes"], quiet=args.silent)
         if not args.silent:
-            print(one_line(batch_line(document)))
+            print_document(document, batch_line(document), as_json=False)
     if args.json:
         from gsmerge.report import to_json
 

@@ -43,7 +43,7 @@ def _inspect_scene(args: opt.Args, path: Path) -> None:
         facts = inspect_scene(path, cameras=args.cameras, images=args.images, opacity=args.opacity, **vars(hints))
         problems = check_content(path).problems if path.name == INDEX else damage(path)
     document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
-    print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=True)
+    print_document(document, lines, as_json=args.json, quiet=args.quiet)
     if facts["compact"] is None:
         place, _, problem = facts["alignment_problem"].partition(": ")
         raise SceneError(place, problem)
@@ -72,7 +72,8 @@ def _check_files(args: opt.Args) -> None:
     }
     lines = [result.line for result in checks if several or not result.problems]
     print_document(document, lines, as_json=args.json, quiet=args.quiet)
+    count = f"wrong files: {len(wrong)} of {len(checks)}" if several else ""
     if wrong and several and not args.silent:
-        raise SceneError(f"{len(wrong)} of {len(checks)} files", "refused, for the causes above")
+        raise SceneError(wrong[0].path, "refused, for the cause above", count)
     if wrong:
-        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), "and others" if len(wrong) > 1 else "")
+        raise SceneError(wrong[0].path, "; ".join(wrong[0].problems), count)

@@ -98,7 +98,7 @@ class Args(SimpleNamespace):
         values = options | chosen
         if "seed" in settings:
             values |= {"seed": values["seed"]} if "seed" in values else _environment_seed()
-        if Path(values.get("crop") or "").suffix.lower() in CROP_FILES:
+        if Path(str(values.get("crop"))).suffix.lower() in CROP_FILES:
             from gsmerge.io.crop_file import read_crop
 
             values["crop"] = read_crop(Path(values["crop"]))
@@ -340,7 +340,7 @@ def share_list(text: str) -> list[str]:
 
 
 def number_or_text(text: str) -> int | str:
-    """Parse ``--k`` or ``--superpixels``: a number, or a word such as "auto"."""
+    """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
 
 
@@ -351,12 +351,9 @@ AFTER = argument(
 SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and view, or the folder it is in.")
 
 # What commands share: a text, and names of options
-COMPACT_SCENE = (
-    "The compact scene: .ply, .compressed.ply, .spz, .sog, .splat, .glb, .usdc, .usda or .usdz, by its name."
-)
+COMPACT_SCENE = "The compact scene: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz, by its name."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
-RUN = "seed threads"
 
 _TABLE = (
     panel(
@@ -377,7 +374,6 @@ _TABLE = (
     panel(
         COUNT,
         setting_option("k", parser=number_or_text),
-        setting_option("superpixels", parser=number_or_text),
         setting_option("budget"),
         setting_option("quality"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),

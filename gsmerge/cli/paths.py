@@ -32,9 +32,6 @@ class FileOptions(Settings):
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
     columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
         "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
-    spz_version: int = setting(3, "Version of a `.spz`: 3, which most programs read, or 4, with room for harmonics of "
-        "degree 4.",
-        "The latter needs `gsmerge[spz4]`.", choices=(3, 4))  # fmt: skip
     viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
         "for viewers.")  # fmt: skip
 
@@ -109,11 +106,9 @@ def check_format(output: Path, options: FileOptions, *, levels: bool = False, ca
     """
     from gsmerge.io import output_format
 
-    ending = output_format(output, options.spz_version, levels=levels, cameras=cameras).ending
+    ending = output_format(output, levels=levels, cameras=cameras).ending
     if options.columns == "full" and (ending != ".ply" or not options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
-    if options.spz_version != 3 and ending != ".spz":
-        raise UsageError(f"spz_version {options.spz_version}: expected an output as .spz, got {ending}")
 
 
 def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None], *, overwrite: bool) -> None:
@@ -153,9 +148,9 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
     target = Path(os.path.realpath(output))
     is_read = (target.suffix.lower() in IMAGE_SUFFIXES or target.name in MODEL_NAMES) and target.exists()
     if str(target) in inputs or (is_read and str(target.parent) in inputs):
-        raise UsageError(f"{output}: expected an output other than the input; name another file with --output")
+        raise UsageError(f"{output}: expected an output other than the input; name another output")
     if os.path.lexists(output) and not overwrite:
-        raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another with --output")
+        raise UsageError(f"{output}: exists already; pass --overwrite to replace it, or name another output")
     _check_place(output.parent, output, "a folder to write to")
 
 
@@ -168,7 +163,7 @@ def check_replaced(outputs: Sequence[Path]) -> None:
         except OSError:  # there is none yet, or writing fails with its own reason
             continue
         if start and not any(mark in start for mark in MARKS):
-            raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another with --output")
+            raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another output")
 
 
 def _check_place(folder: Path, output: Path, expected: str) -> None:
@@ -176,21 +171,11 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
     try:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
-        raise SceneError(output, f"cannot be read ({error.strerror})", "name another with --output") from error
+        raise SceneError(output, f"cannot be read ({error.strerror})", "name another output") from error
     if not nearest.is_dir():
-        raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another with --output")
+        raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another output")
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise SceneError(output, f"cannot be written: no permission for {nearest}", "name another with --output")
-
-
-def is_camera_file(path: Path) -> bool:
-    """Return whether a file is one of the camera files that ``compact`` writes beside results."""
-    from gsmerge.io.cameras.read import read_cameras
-
-    try:
-        return len(read_cameras(path)) > 0
-    except SceneError:
-        return False
+        raise SceneError(output, f"cannot be written: no permission for {nearest}", "name another output")
 
 
 def input_files(files: SceneFiles) -> tuple[Path, ...]:
@@ -222,8 +207,8 @@ def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> 
     try:
         occupied = folder.is_dir() and next(folder.iterdir(), None) is not None
     except OSError as error:
-        raise SceneError(folder, f"cannot be read ({error.strerror})", "name another with --output") from error
+        raise SceneError(folder, f"cannot be read ({error.strerror})", "name another output") from error
     if any(os.path.realpath(folder) == os.path.realpath(path) for path in inputs):
-        raise UsageError(f"{folder}: expected an output other than the input; name another folder with --output")
+        raise UsageError(f"{folder}: expected an output other than the input; name another folder")
     if occupied and not overwrite:
         raise UsageError(f"{folder}: expected an empty folder; pass --overwrite to write into it")

@@ -35,13 +35,12 @@ def parse_size(text: str) -> tuple[int, int]:
                "two scenes; or a folder for a picture of each camera.", default=opt.REQUIRED),
     *opt.panel(
         opt.OUTPUT,
-        opt.option("path", str, "The way of the camera in a clip, or in pictures of a folder. orbit: around the middle "
-                   "view and back to the start; orbit:45: by 45 degrees to each side; turntable: once about the "
-                   "scene's middle, by 360 degrees; spline: through all views in their order. turntable,back:0.5: half "
-                   "of the depth farther back. Or the cameras of a file, one for each frame.",
+        opt.option("path", str, "The way of the camera: orbit about the middle view, or orbit:45 by 45 degrees to each "
+                   "side; turntable, once about the scene's middle; spline through all views; each with ,back:0.5 for "
+                   "half of the depth farther back; or a camera for each frame in a file.",
                    wording="orbit, none for a folder", metavar="orbit|turntable|spline|FILE"),
-        opt.option("size", str, "Size in pixels, such as 1920x1080; of a panel that of each of its pictures. Views of "
-                   "another shape fill it, and lose two borders.", wording="the cameras', of a GIF at most 640",
+        opt.option("size", str, "Width and height in pixels, on a panel of each picture; views of another shape lose "
+                   "two borders.", wording="the cameras', of a GIF at most 640",
                    metavar="WIDTHxHEIGHT", parser=parse_size),
         opt.option("frames", int, "Frames of a clip, 30 a second, or 12.5 of a GIF.",
                    wording="6 seconds of a turntable, else 4", min=2, max=100_000),
@@ -55,6 +54,7 @@ def render(args: opt.Args) -> None:
     kind = _choose_kind(args)
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_path
+    from gsmerge.report import document_head
 
     files = args.files(args.scenes[0])
     like = drawings.frame_files(files, args.cameras, args.images)
@@ -70,7 +70,8 @@ def render(args: opt.Args) -> None:
     drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(files, args.scenes, like, args.output, args.opacity, hints, **arguments)
     )
-    document = drawings.drawing_document(drawing, args.output)
+    document = {**document_head(), "output": str(args.output), "pictures": [str(path) for path in drawing.paths]}
+    document |= drawing.facts
     say_notes(document["notes"], quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress:
         document |= drawings.write_drawing(drawing, overwrite=args.overwrite, progress=progress)

@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from os import PathLike
 from typing import Any
+from weakref import ref
 
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
@@ -21,6 +23,7 @@ from gsmerge.runtime.record import Progress, Record, add_seconds, adopt, choose,
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Scene, StrPath
 
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
@@ -41,7 +44,9 @@ def compact(
         progress: Called with (stage, done, stages), and from within longer ones with ("fit: ...", step, steps).
         **settings: Single settings by name, on top of ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
-    Raises SceneError for a path that cannot be read, ValueError for a setting that is unknown or out of range.
+    Raises:
+        SceneError: If a path cannot be read.
+        ValueError: If a setting is unknown or out of range.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget="5%")
@@ -49,6 +54,7 @@ def compact(
         384
     """
     options = (options or CompactOptions()).with_settings(settings)
+    given = scene if isinstance(scene, str | PathLike) else ref(scene)
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
         size = measure_size(scene)
@@ -59,8 +65,8 @@ def compact(
 
             blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
-                return compact_in_blocks(scene, options, choices, blocks, covisibility)
-        return compact_piece(scene, options)
+                return replace(compact_in_blocks(scene, options, choices, blocks, covisibility), scene=given)
+        return replace(compact_piece(scene, options), scene=given)
 
 
 def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
@@ -69,10 +75,13 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
     plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
+    trial = replace(plan, clean=CleanOptions()) if plan.keeps_psnr else plan  # what is left out would count as errors
     for count in search:
-        search.add(build_scored(method.build, prepared, plan, count))
+        search.add(build_scored(method.build, prepared, trial, count))
     rebuild = partial(build_scored, method.build, prepared, plan)
     best, packed = search.best, plan.size is not None and plan.size.packed
+    if trial is not plan and plan.clean.asked:
+        best = clean_candidate(best, prepared, plan)
     if packed:
         from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
 
@@ -88,6 +97,16 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
 def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
     """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
     return score(count, build_cleaned(build, prepared, plan, count), prepared, plan)
+
+
+def clean_candidate(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
+    """Clean up a candidate as the plan says, and score it again."""
+
+    def again(*_: object) -> Fitted:
+        adopt(candidate.record)
+        return candidate.fitted
+
+    return build_scored(again, prepared, plan, None)
 
 
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:

@@ -12,6 +12,7 @@ import numpy as np
 from gsmerge.compaction.placement import (
     NUM_FULL,
     add_colmap,
+    add_views,
     find_placement,
     name_photos,
     pad_harmonics,
@@ -29,14 +30,13 @@ from gsmerge.io import (
     write_gaussians,
 )
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.embedded import camera_comments, holds_cameras
-from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, SITE, input_format
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
@@ -65,7 +65,6 @@ class ConvertOptions:
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     full_columns: bool = False  # pad its harmonics with zeros up to degree 3
-    spz_version: int = 3
     overwrite: bool = False
 
 
@@ -75,7 +74,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
     UsageError for an ending that cannot be written, or for dropping the sky without photos.
     """
-    ending = output_format(options.output, options.spz_version, levels=True, cameras=True).ending
+    ending = output_format(options.output, levels=True, cameras=True).ending
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -100,15 +99,14 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
-    notes += output_notes(options.output, gaussians.sh_degree, options.spz_version, options.images)
+    names = () if stored is None else stored.names
+    photos = name_photos(_photo_folder(options, stored), names)
+    notes += output_notes(options.output, gaussians.sh_degree, photos)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
-    names = () if stored is None else stored.names
-    if ending == ".ply" and len(moved) and holds_cameras(options.inputs[0]):
-        comments += camera_comments(moved, names)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, beside = _write(options, ending, gaussians, moved, names, comments)
+    num_bytes, beside = _write(options, ending, gaussians, moved, photos, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
@@ -135,6 +133,11 @@ def _read_cameras(options: ConvertOptions) -> CameraFile | None:
     return None if path is None else read_cameras(path)
 
 
+def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:
+    """Return the folder of the cameras' photos: the given one, or ``images`` beside their file."""
+    return options.images if stored is None or options.images else Path(stored.path).parent / "images"
+
+
 def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[Gaussians, dict[str, int]]:
@@ -158,6 +161,7 @@ def _write(
     ending: str,
     gaussians: Gaussians,
     cameras: Cameras,
+    photos: Photos,
     names: Sequence[str],
     comments: Sequence[str],
 ) -> tuple[int, str | None]:
@@ -166,7 +170,7 @@ def _write(
     with atomic_outputs(overwrite=options.overwrite) as add:
         first = add(out)
         if ending == COLMAP.ending:
-            written = add_colmap(add, out, first, gaussians, cameras, name_photos(options.images, names))
+            written = add_colmap(add, out, first, gaussians, cameras, photos)
         elif ending == SITE.ending:
             from gsmerge.pages.site import add_site
 
@@ -177,12 +181,11 @@ def _write(
         else:
             write_gaussians(
                 first, gaussians, overwrite=True, comments=comments, ending=ending, normals=options.normals,
-                spz_version=options.spz_version,
             )  # fmt: skip
             written = [first]
         if len(cameras) and ending not in (COLMAP.ending, SITE.ending):
             beside = viewer_cameras_path(out)
-            add(beside).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+            add_views(add, beside, cameras, names, overwrite=options.overwrite)
         num_bytes = sum(path.stat().st_size for path in written)
     if ending == INDEX:
         remove_unused_chunks(out)

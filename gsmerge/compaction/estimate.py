@@ -35,7 +35,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the most that the result can have; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` is a number, the fewest: more are
+        taken until the result is so many dB from the input; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
         known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
@@ -60,6 +61,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
+        "psnr_kept": choices.kept_psnr,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
@@ -83,8 +85,10 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     if per_view == 0:
         method = "neighbours merged pair by pair, because no view is known"
+    count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
+    number = f"at most {count}" if kept is None else f"{count}, or more until {kept:g} dB from the input are kept"
     return [
-        f"compact    at most {run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %),"
+        f"compact    {number},"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
         " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
         f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",

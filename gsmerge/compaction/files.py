@@ -9,17 +9,16 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.placement import add_colmap, add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.cameras.json_files import viewer_cameras
-from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
-from gsmerge.io.formats.write import output_notes
+from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
@@ -41,7 +40,6 @@ class Outputs:
     viewer_cameras: Path | None = None  # it may exist already with the same content, beside a result in another format
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
-    spz_version: int = 3
     full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
 
 
@@ -64,18 +62,17 @@ def compact_files(
     read or the result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
-    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
+    ending = output_format(out, levels=True, cameras=True).ending
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         first = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
         check_colmap(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
-        cameras_path = outputs.viewer_cameras
-        shared = cameras_path is not None and not outputs.overwrite and cameras_path.exists()
-        if cameras_path is not None and shared and list(read_cameras(cameras_path).names) != names:
-            raise _other_cameras(cameras_path)
-        cameras_path = cameras_path if len(load.scene) else None
+        cameras_path = outputs.viewer_cameras if len(load.scene) else None
+        shared = cameras_path if cameras_path is not None and cameras_path.exists() else None
+        if shared is not None and not outputs.overwrite and named_cameras(shared, names) is None:
+            raise other_cameras(shared)  # before the work
         read = perf_counter()
         result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
@@ -90,15 +87,11 @@ def compact_files(
             result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         comments = [RESULT_COMMENT, *load.comments]
-        views_named = result.cameras[views], names, files
+        views_named = result.cameras[views], name_photos(files.images, names), scene_title(files.ply)
+        notes = output_notes(out, result.gaussians.sh_degree, views_named[1])
         written = _write_results(add, outputs, first, results, comments, views_named, parts)
         if cameras_path is not None:
-            text = viewer_cameras(result.cameras[views], names)
-            if not shared:
-                add(cameras_path).write_text(text, encoding="utf-8")
-            elif cameras_path.read_text(encoding="utf-8", errors="replace") != text:
-                raise _other_cameras(cameras_path)
-        notes = output_notes(out, result.gaussians.sh_degree, outputs.spz_version, files.images)
+            add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
@@ -118,26 +111,24 @@ def _write_results(
     first: Path,
     results: Sequence[CompactResult],
     comments: Sequence[str],
-    views: tuple[Cameras, Sequence[str], SceneFiles],
+    views: tuple[Cameras, Photos, str],
     parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
 
-    A COLMAP model and a web site have the ``views``, too: cameras, names, and the files of the scene; ``parts`` are
-    those of a ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before
+    A COLMAP model and a web site have the ``views``, too: cameras, names with photos, and the scene's title; ``parts``
+    are those of a ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before
     they are renamed.
     """
     out = outputs.result
-    ending = output_format(out, outputs.spz_version, levels=True, cameras=True).ending
-    cameras, names, files = views
+    ending = output_format(out, levels=True, cameras=True).ending
+    cameras, photos, title = views
     if ending == COLMAP.ending:
-        from gsmerge.compaction.placement import add_colmap, name_photos
-
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, name_photos(files.images, names))}
+        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
     if ending == SITE.ending:
         from gsmerge.pages.site import add_site
 
-        return {out: add_site(add, out, first, results[0].gaussians, cameras, scene_title(files.ply), comments)}
+        return {out: add_site(add, out, first, results[0].gaussians, cameras, title, comments)}
     if parts is not None:
         return parts.write(add, out, first, comments)
     written = {out: [first]}
@@ -147,7 +138,6 @@ def _write_results(
     for (file,), result in zip(written.values(), results, strict=True):
         write_gaussians(
             file, result.gaussians, overwrite=True, comments=comments, ending=ending, normals=outputs.normals,
-            spz_version=outputs.spz_version,
         )  # fmt: skip
     return written
 
@@ -155,7 +145,7 @@ def _write_results(
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Say in the settings whose bytes a budget counts."""
     name = SITE_SCENE if SITE.names(outputs.result) else outputs.result.name
-    budget = replace(settings.budget, output=name, spz_version=outputs.spz_version)
+    budget = replace(settings.budget, output=name)
     return replace(settings, budget=budget)
 
 
@@ -172,12 +162,6 @@ def _views_once(scene: Scene) -> list[int]:
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
-
-
-def _other_cameras(path: Path) -> UsageError:
-    """Make the error for an existing camera file for viewers that belongs to another result."""
-    remedy = "pass --overwrite to replace it, or name another with --output"
-    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
 
 
 def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> Loaded:

@@ -40,7 +40,7 @@ _FILE_KEYS = (
     "opacity_encoding", "num_nonfinite", "num_clipped_scales", "num_zero_quats",
 )  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")
-_REPEATED = ("read as: ", "the rows belong to no pixels")  # notes that repeat a line of their own
+_REPEATED = ("read as: ", "the Gaussians belong to no pixels")  # notes that repeat a line of their own
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}
 
 
@@ -58,26 +58,23 @@ def inspect(
 
     Args:
         path: The scene.
-        cameras: A file or a folder; None: searched next to the ``.ply``, and so are the images.
-        images: A folder or an ``.npz``.
-        masks: A folder of images named as the photos, dark where a photo does not count.
-        opacity: As of :func:`gsmerge.io.read_ply`.
-        threads: How many, on which nothing depends; None: all processors.
-        hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
-            :class:`gsmerge.settings.reading.ReadHints`.
+        cameras: As of :func:`gsmerge.read_scene`.
+        images: As there.
+        masks: As there.
+        opacity: As there.
+        threads: How many; None: all processors.
+        hints: As there.
 
     Returns:
-        Plain JSON types, None for what is not finite or not known. Of the file: ``path``, ``bytes``,
-        ``bytes_by_attribute``, ``layout``, ``format``, ``exporter``, ``extra_columns`` and ``extra_elements`` (which
-        mean nothing here), ``sh_degree``, ``opacity_encoding``. Of the Gaussians: ``count``, ``num_nonfinite``,
-        ``num_clipped_scales``, ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255),
-        ``num_saturated`` (within 1e-6 of 0 or 1), ``extents`` (where they lie, how large they are). Of the views:
-        ``cameras``, ``camera_format``, ``images``, ``num_views``, ``width`` and ``height`` (0 without a grid of
-        pixels), ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order), ``alignment`` (or
-        ``alignment_problem``, why it could not be measured), ``sight`` (what the cameras see), ``coverage`` (shares of
-        the pixels and of the Gaussians in each view), ``num_sky_views``. ``compact``: the estimate of a run with the
-        defaults, None where ``compact`` would refuse the scene; ``auto``: what ``--budget auto`` makes of it, with
-        ``share``, ``num_gaussians`` and ``why``, None where a curve would decide. ``notes``: warnings.
+        Plain JSON types, None for what is not known. Of the file: ``path``, ``bytes``, ``bytes_by_attribute``,
+        ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
+        ``opacity_encoding``. Of the Gaussians: ``count``, ``num_nonfinite``, ``num_clipped_scales``,
+        ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
+        (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
+        ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
+        ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``. ``compact``: the estimate
+        of a run, None where it would refuse the scene; ``auto``: ``share``, ``num_gaussians`` and ``why`` of
+        ``--budget auto``. ``notes``: warnings.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not

@@ -89,10 +89,10 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     if method is SUPERPIXELS:
         return method, []
     place, size = f"method {method.name}", measure_size(scene)
-    if "photos" in method.needs and not size.photos:
-        raise UsageError(f"{place}: expected photos, found none; give --images, or another --method")
+    if "photos" in method.needs and not scene.is_shown:
+        raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not size.aligned:
-        raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another --method")
+        raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
     default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
     unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []

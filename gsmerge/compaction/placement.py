@@ -9,11 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
-from gsmerge.io.atomic import AddOutput
+from gsmerge.io.atomic import AddOutput, link_file
+from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.colmap_model import files_beside, model_files
+from gsmerge.io.cameras.json_files import viewer_cameras
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.table import MODEL_NAMES
+from gsmerge.io.formats.write import Photos, photo_folder
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.measure.visibility import front_rows
@@ -21,6 +25,7 @@ from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
 
 NUM_FULL = 15  # harmonics above degree 0 up to degree 3
+SAME = 1e-5  # relative difference up to which cameras are the same; pixels by a hundred times as much
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
@@ -72,23 +77,71 @@ def place(
     return frame.move_gaussians(wide), frame.move(cameras)
 
 
+def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str], *, overwrite: bool) -> None:
+    """Write cameras for viewers as part of :func:`atomic_outputs`; UsageError if ``path`` has others.
+
+    A file with these cameras, to within rounding, is left as it is: results in several formats share it.
+    """
+    if overwrite or not path.exists():
+        add(path).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+    elif not _has_cameras(path, cameras, names):
+        raise other_cameras(path)
+
+
+def named_cameras(path: Path, names: Sequence[str]) -> Cameras | None:
+    """Read the cameras of a file if they have these names; None for any other file."""
+    with suppress(SceneError):
+        stored = read_cameras(path)
+        return to_cameras(stored) if list(stored.names) == list(names) else None
+    return None
+
+
+def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str]) -> bool:
+    """Return whether a file holds these cameras under these names, to within rounding."""
+    found, reach = named_cameras(path, names), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+    if found is None or (found.width, found.height) != (cameras.width, cameras.height):
+        return False
+    same_place = np.allclose(found.viewmats, cameras.viewmats, rtol=0, atol=SAME * reach)
+    return same_place and np.allclose(found.Ks, cameras.Ks, rtol=SAME, atol=100 * SAME)
+
+
+def other_cameras(path: Path) -> UsageError:
+    """Make the error for an existing file of cameras that belongs to another result."""
+    remedy = "name another output, or pass --overwrite to replace it"
+    return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
+
+
 def add_colmap(
-    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, names: Sequence[str]
+    add: AddOutput,
+    path: Path,
+    points: Path,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    photos: Photos,
 ) -> list[Path]:
     """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
 
-    Returns the present paths of all its files.
+    ``photos``: those of :func:`name_photos`, which are linked where trainers look for them unless that folder exists.
+    Returns the present paths of all files of the model.
     """
-    files = [points, *map(add, files_beside(path))]
+    files, place = [points, *map(add, files_beside(path))], photo_folder(path)
+    if not place.exists():
+        for name, photo in dict(photos).items():
+            if photo is not None:
+                link_file(photo, add(place / name))
+    names = [name for name, _ in photos]
     contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
     for file, name in zip(files, MODEL_NAMES, strict=True):
         file.write_bytes(contents[name])
     return files
 
 
-def name_photos(photos: Path | None, names: Sequence[str]) -> Sequence[str]:
-    """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file."""
+def name_photos(photos: Path | None, names: Sequence[str]) -> Photos:
+    """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file.
+
+    Returns each name and its photo, None where that is in no folder.
+    """
     if photos is not None and photos.is_dir():
         with suppress(SceneError):
-            return [file.relative_to(photos).as_posix() for file in match_images(photos, names)]
-    return [name.removeprefix("./").removeprefix("images/") for name in names]  # as a transforms.json has them
+            return [(file.relative_to(photos).as_posix(), file) for file in match_images(photos, names)]
+    return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]  # as a transforms.json has them

@@ -9,7 +9,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line
+from gsmerge.report import (
+    document_head,
+    file_sha256,
+    html_table,
+    seconds_document,
+    seconds_line,
+    text_table,
+    wrap_line,
+)
 from gsmerge.runtime.memory import human_bytes
 
 
@@ -41,14 +49,16 @@ class CompactReport:
             quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
             :func:`gsmerge.evaluate` is exact.
         psnr_after: The same from the result.
-        choices: Decisions of the stages (count, curve, merge, scores, clusters, fit). Of a scene without cameras,
-            ``fidelity`` is the PSNR (dB) against the input from so many held-out ``views``.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). Where there are no photos
+            and the rows belong to no pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many
+            ``views``: of the scene, or ``held_out`` ones that were placed for lack of cameras.
         notes: Warnings about the input and adaptations to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
         unmet: Why a target that was asked for is not met, and how far the result got; None if it is.
-        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does, a sentence
-            that is among the notes, too; None where it does not, or photos cannot say it: none, odd ones, or a crop.
+        worse: That the result shows the scene's own photos by more than .5 dB worse than the input does or, where
+            ``fidelity`` is measured, that it is below 30 dB: a sentence that is among the notes, too. None where
+            neither holds, or cannot be said: of odd photos, or with a crop.
         psnr_reference: What PSNR of the input views is measured against: "photos", or "the model's own pixels"; None
             where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
@@ -87,6 +97,8 @@ class CompactReport:
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of the input views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
+        if judged := self.choices.get("fidelity"):
+            facts += [("PSNR", f"{judged['psnr']:.1f} dB {_judged_by(judged)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
@@ -117,7 +129,8 @@ def report_document(
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
         ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
-        ``worse``: that the result, or the first level that does, shows the photos worse than the input, or null.
+        ``worse``: that the result, or the first level that does, shows the photos worse than the input, or that the
+        result is below 30 dB from the input where there are no photos; or null.
     """
     numbers, at = asdict(report), written_at or {}
     return {
@@ -167,8 +180,11 @@ def summary_lines(document: Mapping[str, Any]) -> list[str]:
     return [summary_line(document), *level_lines(document), *curve_lines(document)]
 
 
-def result_table(document: Mapping[str, Any], next_step: str | None = None) -> list[str]:
-    """Return the closing table of ``compact`` in a terminal, at most 80 columns wide, with a ``next_step`` if any."""
+def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
+    """Return the closing table of ``compact`` in a terminal, ``columns`` wide, with a ``next_step`` if any.
+
+    Paths and the next step, which people copy, are never broken.
+    """
     before, after, psnr = document["input"], document["output"], document["psnr_input_views"]
     ratio = f"{100 * document['ratio']:.2f} %"
     rows = [
@@ -183,20 +199,21 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None) -> l
         rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
     judged = document["choices"].get("fidelity")
     if judged:
-        rows += [("PSNR", "", f"{judged['psnr']:.2f} dB", _judged_by(judged))]
+        rows += [("PSNR", "", f"{judged['psnr']:.1f} dB", _judged_by(judged))]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
     rows += [("time", "", f"{document['total_seconds']:.1f} s", f"most in {stages}")]
-    table = [f"  {name:9}  {old:>12}  {new:>12}  {remark}".rstrip() for name, old, new, remark in rows]
-    curve = curve_lines(document)
-    cameras = document.get("viewer_cameras")
-    last = [] if cameras is None else [f"  cameras    {cameras}"]
-    last += [] if next_step is None else [f"  next       {next_step}"]
-    return [after["path"], *table, *level_lines(document), *curve, *last]
+    figures = text_table([row[:3] for row in rows], "  ")
+    hang = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
+    lines = [(f"{left}  {row[3]}".rstrip(), hang) for left, row in zip(figures, rows, strict=True)]
+    lines += [(line, 0) for line in (*level_lines(document), *curve_lines(document))]
+    wrapped = [part for line, hang in lines for part in wrap_line(line, columns, hang)]
+    last = {"cameras": document.get("viewer_cameras"), "next": next_step}
+    return [after["path"], *wrapped, *(f"  {name:9}  {text}" for name, text in last.items() if text is not None)]
 
 
 def _judged_by(fidelity: Mapping[str, Any]) -> str:
-    return f"against the input from {fidelity['views']} held-out views"
+    return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 
 def level_lines(document: Mapping[str, Any]) -> list[str]:
@@ -238,7 +255,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     quality = (
         f"; input views {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
         if psnr["before"] is not None and psnr["after"] is not None
-        else f"; {judged['psnr']:.2f} dB {_judged_by(judged)}"
+        else f"; {judged['psnr']:.1f} dB {_judged_by(judged)}"
         if judged
         else ""
     )

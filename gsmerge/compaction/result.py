@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import TYPE_CHECKING, Any
+from weakref import ReferenceType
 
 import numpy as np
 
 from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
-from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan
 from gsmerge.raster import render
-from gsmerge.raster.metrics import describe_loss
+from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 
 if TYPE_CHECKING:
     import torch
+
+    from gsmerge.pages.view import Page
+
+SAME = 120.0  # dB of equal pictures
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,7 @@ class CompactResult:
         cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
             wrong, see ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+        scene: The path of the scene that was given, or a reference to it that does not keep it in memory.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
@@ -47,6 +54,25 @@ class CompactResult:
     report: CompactReport
     cameras: Cameras
     coarser: tuple[CompactResult, ...] = ()
+    scene: StrPath | ReferenceType[Scene] | None = field(default=None, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"scene": self.scene if isinstance(self.scene, str | PathLike) else None}
+
+    def show(self, scene: Scene | StrPath | None = None) -> Page:
+        """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
+
+        ``scene``: the input, which only needs to be given where it is in memory no more; without it the result is shown
+        alone.
+        """
+        from gsmerge.pages.view import view
+
+        if scene is None:
+            scene = self.scene() if isinstance(self.scene, ReferenceType) else self.scene
+        if scene is not None:
+            return view(scene, self)
+        names = tuple(f"view {i}" for i in range(len(self.cameras)))
+        return view(Scene(self.gaussians, self.cameras, None, None, names))
 
     def __repr__(self) -> str:
         levels = f", {len(self.coarser)} coarser level(s)" if self.coarser else ""
@@ -78,7 +104,7 @@ class Candidate:
     fitted: Fitted  # Fitted canonical Gaussians
     gaussians: Gaussians  # The same in the world, with those that no view sees
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
-    psnr: float | None  # Mean PSNR (dB) of the scored views, or of the views that judge; None without either
+    psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
 
 
@@ -103,10 +129,11 @@ def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan:
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
-    """Measure the PSNR (dB) of Gaussians on the scored photos, or against the input; None without photos and pixels."""
-    if moved.reference.placed:
-        fidelity = _fidelity(moved.frame.enter(gaussians), moved.scene, plan)
-        choose(fidelity={"psnr": fidelity, "views": len(moved.scene)})
+    """Measure the PSNR (dB) of Gaussians on the scored photos, or against renders of the input."""
+    if moved.reference.name == RENDERS:
+        fidelity = _fidelity(moved.frame.enter(gaussians), moved, plan)
+        views, placed = len(plan.scored_views), moved.reference.placed
+        choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity
     measured = measure_result(gaussians, moved, plan)
     if measured is None:
@@ -116,9 +143,10 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> flo
 
 
 @stage("score")
-def _fidelity(gaussians: Gaussians, judges: Scene, plan: Plan) -> float:
-    """Measure the mean PSNR (dB) of canonical Gaussians against the pictures of the input that judge them."""
-    return score_photos(gaussians, scene_photos(judges), plan.scored_views).psnr
+def _fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
+    """Measure the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input."""
+    views = [prepared.repeated[view] for view in plan.scored_views] if prepared.repeated else plan.scored_views
+    return min(score_photos(gaussians, scene_photos(prepared.scene), views).psnr, SAME)
 
 
 def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
@@ -204,6 +232,7 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan)
     before = None if input_score is None else input_score.psnr
+    rendered = prepared.reference.name == RENDERS
     comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
@@ -212,13 +241,15 @@ def make_result(
 
     def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
-        shown = None if prepared.reference.placed else candidate.psnr
+        shown = None if rendered else candidate.psnr
         made = CompactReport(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered, psnr_reference=None if before is None else prepared.reference.name,
         )  # fmt: skip
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared) if comparable else None
+        if rendered and candidate is best and not plan.clean.hides:  # coarser levels are meant to differ
+            worse = describe_distance(candidate.psnr)
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 
     names = {**run.seconds, **seconds}
@@ -226,7 +257,7 @@ def make_result(
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = report(best, covered[0], seconds, "the result")
-    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *main.notes]
+    choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
     coarser = tuple(
         CompactResult(

@@ -16,6 +16,7 @@ import numpy as np
 from gsmerge.budget import LEVEL_FACTOR
 from gsmerge.compaction.result import Candidate
 from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
@@ -38,10 +39,13 @@ RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
 SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians beats 4 % in PSNR it still blurs
 KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
-SLOPE = 1.0  # dB per doubling of the count, until two counts have been tried
+SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
+NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
 MAX_RUNS = 6
-MAX_FACTOR = 4  # times the usual count is the most that a quality target may take
+MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
+FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
+MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
 
 
 @dataclass(frozen=True)
@@ -60,15 +64,19 @@ class CountSearch:
 
     plan: Plan  # Target and limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    rendered: bool = False  # Whether renders of the input judge, which more Gaussians always show better
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def __iter__(self) -> Iterator[int | None]:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
-        most = min(limits.max_count, MAX_FACTOR * limits.default)
+        usual = self.plan.keeps_psnr and not self.plan.auto_count
+        least = min(limits.default, limits.max_count) if usual else limits.min_count
+        most = limits.max_count if self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
+        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, 0.0)
         while target is not None and len(self.candidates) < MAX_RUNS:
-            count = next_count(self.tried, target, limits.min_count, most)
+            count = next_count(self.tried, target, least, most, *steps)
             if count in self.tried:
                 return
             yield count
@@ -97,26 +105,41 @@ class CountSearch:
         """Reason why the target is not met; None if it is met."""
         if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
             return None
+        if self.plan.keeps_psnr:
+            return None
         psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
         reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
         return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
 
     def facts(self) -> dict[str, Any]:
-        """Return the search's entries of a report: ``seconds`` of all candidates, ``choices``, ``unmet``."""
+        """Return the search's entries of a report: ``seconds`` of all candidates, ``choices``, ``notes``, ``unmet``."""
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
-            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": self.unmet is None, "tried": tried}
-        return {"seconds": seconds, "choices": choices, "unmet": self.unmet}
+            met = (best.psnr or 0.0) >= self.plan.target_psnr
+            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": met, "tried": tried}
+        return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
+
+    @property
+    def notes(self) -> list[str]:
+        """Note that says how many Gaussians were kept by default, where they are more than usual."""
+        count, limits = self.best.count or 0, self.plan.limits
+        if not self.plan.keeps_psnr or count <= limits.default:
+            return []
+        kept, target = f"{count:,} of {limits.num_input:,} Gaussians", self.plan.target_psnr
+        if count > MOSTLY * limits.num_input:
+            return [f"the scene is compact already: kept {kept}, since fewer would be below {target:g} dB from it"]
+        return [f"kept {kept}, about the fewest that are {target:g} dB from the input or better"]
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Start a search for the number of Gaussians."""
     limits = plan.limits
     if plan.target_psnr is not None:
-        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count))
+        rendered = prepared.reference.name == RENDERS
+        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count), rendered)
     return CountSearch(plan, choose_count(prepared, plan, build))
 
 
@@ -125,7 +148,7 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
-    if not prepared.reference.score_views:
+    if prepared.reference.name == RENDERS:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
@@ -138,15 +161,13 @@ def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, coun
     """Measure PSNR, SSIM and, if its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
 
     The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on blocks that the fits
-    leave out; for a scene without views, on the whole pictures that judge it. LPIPS needs whole pictures.
+    leave out. LPIPS needs whole pictures.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
     reference = prepared.reference
     photos = scene_photos(prepared.scene)[reference.score_views]
-    weights = [np.zeros((photos.height, photos.width), np.float32)] * len(photos)  # all is left out
-    if reference.fit_views:
-        weights = training_weights(photos, HOLDOUT, plan.seed)
+    weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
     report_progress(TRIED, 0, len(counts))
     for count in counts:
@@ -231,24 +252,32 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     return round(float(power(2, middles[steep] + share * (middles[steep + 1] - middles[steep]))))
 
 
-def next_count(tried: Mapping[int, float], target: float, least: int, most: int) -> int:
+def next_count(
+    tried: Mapping[int, float], target: float, least: int, most: int, slope: float = SLOPE, near: float = 0.0
+) -> int:
     """Choose the next count to try in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
     ``tried`` has the PSNR (dB) of at least one count, assumed to rise with the count. If the result is in ``tried``,
-    the search ends.
+    the search ends, as it does ``near`` dB above the target. ``slope``: dB per doubling, until two counts are tried.
     """
     above = min((c for c, psnr in tried.items() if psnr >= target), default=None)
     below = max((c for c, psnr in tried.items() if psnr < target and (above is None or c < above)), default=None)
+    if above is not None and tried[above] <= target + near:
+        return above
     if above is not None and below is not None:
         if above <= below * CLOSE:
             return above
         inner = float(log(above / below))
-        slope = (tried[above] - tried[below]) / inner
-        step = (target - tried[below]) / slope if slope > 0 else inner / 2
+        rise = (min(tried[above], target + FAR) - tried[below]) / inner
+        step = (target - tried[below]) / rise if rise > 0 else inner / 2
         return round(below * float(exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner))))
+    if above is None and len(tried) > 1:
+        first, last = sorted(tried)[-2:]
+        measured = (tried[last] - tried[first]) / float(log(last / first) / log(2.0))
+        slope = min(max(measured, slope / 3), slope)
     edge = below if above is None else above
     assert edge is not None  # one count has been tried
-    doublings = (target - tried[edge]) / SLOPE
+    doublings = (target - tried[edge]) / slope
     if above is None:
-        return min(most, round(edge * float(power(2, min(max(doublings, 0.5), 3.0)))))
-    return max(least, round(edge * float(power(2, max(min(doublings, -0.5), -3.0)))))
+        return min(most, round(edge * float(power(2, min(max(doublings, 0.5 / slope), 3.0)))))
+    return max(least, round(edge * float(power(2, max(min(doublings, -0.5 / slope), -3.0)))))

@@ -17,6 +17,7 @@ from gsmerge.alignment import (
     move_cameras,
     other_conventions,
     sample_pixels,
+    w_seems_last,
 )
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
@@ -95,7 +96,7 @@ def compact_tensors(
         shape: Views, height and width; None: those of the images.
         names: Names of the views; None: numbers.
         order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
-            (trained scenes, voxels), for which cameras are optional.
+            (trained scenes, voxels); cameras are then optional.
         check_rotations: Refuse rotations that follow the surface far better in another convention;
             False for models whose own renderer takes them unchanged.
         progress: See :func:`gsmerge.compact`.
@@ -368,13 +369,8 @@ def _check_rotations(scene: Scene) -> None:
 
 
 def _rotation_notes(scene: Scene, *, check_rotations: bool) -> list[str]:
-    """Note quaternions whose w may come last, since those from matrices rarely have a negative w.
-
-    Depth Anything 3 writes w first and takes the sign from the last column. If pixels are known, the surface decides,
-    otherwise the caller.
-    """
-    first, last = scene.file_gaussians.quats[:, 0], scene.file_gaussians.quats[:, 3]
-    if not last.min() >= 0 > first.min():
+    """Note quaternions whose w may come last; if pixels are known, the surface decides, otherwise the caller."""
+    if not w_seems_last(scene.file_gaussians.quats):
         return []
     last_w = choose_rotations(scene)[0] == "xyzw" if scene.aligned else check_rotations
     return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"] * last_w

@@ -86,7 +86,7 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
             return scene
         objection = _find_objection(scene, views, pairs, gains)
         if objection:
-            note(f"{differ} and stay as they are: {objection}; --exposure per-photo brings them to their mean")
+            note(f"{differ} and stay as they are: {objection}; --set exposure=per-photo brings them to their mean")
             return scene
     choose(exposure=factors.tolist())
     note(f"{differ}: brought to their mean")

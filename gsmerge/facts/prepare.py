@@ -130,8 +130,8 @@ class Reference:
 
     @property
     def of_views(self) -> bool:
-        """Whether the scene's own views have pictures both for the fit and for the scores."""
-        return bool(self.fit_views and self.score_views)
+        """Whether the scene's own views have pictures, other than renders of it, for the fit and for the scores."""
+        return bool(self.fit_views) and self.name != RENDERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,11 +207,15 @@ def _prepare_pixels(
 def _prepare_others(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene whose rows belong to no pixels: without photos renders of it replace them, for the fit only."""
+    """Prepare a scene whose rows belong to no pixels: without photos renders of it replace them.
+
+    Where photos are given and none shows the scene, nothing is fitted to the renders.
+    """
     scene, views = _with_pictures(canonical, blank_pictures)
+    every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views)
-    if given.images is None:
-        reference = Reference(RENDERS, tuple(range(len(scene))), ())
+    if not views:
+        reference = Reference(RENDERS, every if given.images is None else (), every)
     unseen = scene.gaussians[:0]
     if options.unseen == "keep":
         scene, unseen = _split_unseen(scene)

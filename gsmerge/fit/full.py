@@ -42,7 +42,7 @@ def fit_full(
     state.box_shares[:], state.min_sizes[:] = limit_moves(survey, options.tuning)
     half, judged = optimiser.photos[1], not options.judged
     before = after = survey.score
-    step, steps, error, grows = 0, options.steps, 0.0, options.grows
+    step, steps, error, grows, looks = 0, options.steps, 0.0, options.grows, 0
     started = time.perf_counter()
     while step < steps:
         part = step / steps
@@ -53,7 +53,8 @@ def fit_full(
         if grows and part >= GROWTH and len(state.x) < job.count:
             state = grow_to(state, half, job.count)
         drawn = schedule.draw(step + 1, part, len(state.x))
-        error += (optimiser.step(state, drawn) - error) / min(step + 1, 10)
+        looks = 1 if part >= run.half_part > (step - 1) / steps else min(looks + 1, 10)  # anew with photos of full size
+        error += (optimiser.step(state, drawn) - error) / looks
         step += 1
         outside_view = run.outside_view(step, part)
         if outside_view is not None:
@@ -63,7 +64,7 @@ def fit_full(
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, run)
         if job.progress:
-            job.progress(step, steps, decibels(error))
+            job.progress(step, steps, decibels(error), part < run.half_part)
     if not judged:
         after = score_state(state, run, half)
     if options.judged and after <= before:

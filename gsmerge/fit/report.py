@@ -53,11 +53,11 @@ def record_fit(report: FitReport | None) -> None:
     choose(fit=report.to_dict())
     if report.fog is not None and report.fog > HAZE:
         seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
-        note(f"{seen}; --fit none makes none")
+        note(f"{seen}; --fit none makes none" if report.accepted else seen)
     if not report.accepted:
         note("the fit was not accepted: held-out patches of the photos did not get better")
 
 
-def report_steps(step: int, steps: int, photos: float) -> None:
-    """Report progress of the fit: step, and PSNR (dB) of the last photos."""
-    report_progress(f"fit: photos {photos:.1f} dB", step, steps)
+def report_steps(step: int, steps: int, photos: float, half_size: bool) -> None:
+    """Report progress of the fit: step, and PSNR (dB) of the last photos, which is higher at half their size."""
+    report_progress(f"fit: {'half-size ' * half_size}photos {photos:.1f} dB", step, steps)

@@ -117,6 +117,17 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
         _written.difference_update(made)
 
 
+def link_file(source: Path, target: Path) -> None:
+    """Make an empty file a link to another file, hard or symbolic, or a copy where neither can be."""
+    os.unlink(target)
+    real = os.path.realpath(source)
+    for make in (os.link, os.symlink):
+        with suppress(OSError, NotImplementedError):
+            make(real, target)
+            return
+    shutil.copyfile(real, target)
+
+
 def _make_folder(folder: Path) -> Iterator[Path]:
     """Make a folder and its parents, and yield each that was missing."""
     if os.path.lexists(folder):
@@ -241,4 +252,4 @@ def _refuse(path: Path, overwrite: bool) -> None:
     if not os.path.isdir(path.parent):
         raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
     if os.path.lexists(path) and not overwrite:
-        raise SceneError(path, "exists already", "choose another name or allow overwriting")
+        raise SceneError(path, "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)")

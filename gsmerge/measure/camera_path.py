@@ -25,10 +25,10 @@ PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline|turntable)(?:,back:(?P<
 MAX_TURN, MAX_BACK = 90.0, 10.0  # degrees to each side of an orbit; shares of the depth
 FINE = 64  # straight pieces of a curve from camera to camera by which its length is measured
 TURN = 6 * FINE  # the same for a whole orbit
-# Half axes of an orbit, shares of the distance of its middle: as far as half of the cameras are apart within these.
-# The least is what one photo bears, the most turns the view by 14 degrees to each side.
+# How far an orbit goes to the sides, and up and down, shares of the distance of its middle: the least is what one photo
+# bears, the most turns the view by 14 degrees to each side.
 ACROSS, UPRIGHT = (0.06, 0.25), (0.03, 0.125)
-LEVEL = 0.01  # squared sine of the angle by which cameras turn from which on their horizon says more than their mean up
+LEVEL = 0.01  # squared sine of the turn of cameras from which on their horizons say more than their mean up
 CLOSE = 0.1  # least radius of a turntable, a share of the depth
 SAME = 1e-9  # of a path's length: cameras that are no farther apart are one
 
@@ -95,10 +95,7 @@ def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) ->
         raise ValueError(f"frames: expected at least 2, got {count}")
     if path.kind == "spline":
         return spline(step_back(cameras, depth, path.back), (1 + path.back) * depth, count)
-    if path.kind == "turntable":
-        made = turntable(cameras, depth, count)
-    else:
-        made = orbit(cameras, depth, count) if path.turn is None else wide_orbit(cameras, depth, count, path.turn)
+    made = turntable(cameras, depth, count) if path.kind == "turntable" else orbit(cameras, depth, count, path.turn)
     return step_back(made, depth, path.back)
 
 
@@ -135,43 +132,22 @@ def median_camera(cameras: Cameras) -> int:
     return int((away / (away.mean() or 1.0) + turned).argmin())
 
 
-def orbit(cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Move around the middle camera on an ellipse in its image plane, looking at the point ``depth`` in front of it.
+def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None) -> Cameras:
+    """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
-    Frames are evenly spaced and form a loop; the picture's vertical stays that of the middle camera. The half axes are
-    the median distances of the cameras from the middle one, clipped to the shares ``ACROSS`` and ``UPRIGHT`` of the
-    depth.
+    Frames are evenly spaced and form a loop; the picture's vertical stays that of the middle camera. ``turn``: degrees
+    to each side, half of it up and down. None: as far as the cameras stand from the middle one in the median, clipped
+    to the shares ``ACROSS`` and ``UPRIGHT`` of the depth.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
-    axes = viewmat[:3, :3]
-    centre = camera_centres(viewmat)
-    offsets = np.abs(matmul(camera_centres(cameras.viewmats) - centre, axes.T))
-    wide, high, _ = lower_median(offsets)
-    wide = np.clip(wide, ACROSS[0] * depth, ACROSS[1] * depth)
-    high = np.clip(high, UPRIGHT[0] * depth, UPRIGHT[1] * depth)
-
-    def shifts(angles: np.ndarray) -> np.ndarray:
-        return wide * sin(angles)[:, None] * axes[0] + high * cos(angles)[:, None] * axes[1]
-
-    angles = np.linspace(0, 2 * np.pi, TURN + 1)
-    even = _at_equal_steps(shifts(angles), angles, np.arange(count) / count)
-    eyes = shifts(even)
-    turned = _look(depth * axes[2] - eyes, axes[1])
-    return replace(cameras[[middle] * count], viewmats=_viewmats(turned, centre + eyes))
-
-
-def wide_orbit(cameras: Cameras, depth: float, count: int, turn: float) -> Cameras:
-    """Turn about the point ``depth`` in front of the middle camera, by ``turn`` degrees to each side.
-
-    It also moves up and down by half of that, at a constant distance from the point. Frames are evenly spaced and form
-    a loop; the picture's vertical stays that of the middle camera.
-    """
-    middle = median_camera(cameras)
+    offsets = np.abs(matmul(camera_centres(cameras.viewmats) - camera_centres(viewmat), viewmat[:3, :3].T))
+    sines = (lower_median(offsets)[:2] / depth).clip(*np.transpose([ACROSS, UPRIGHT]))
+    turns = np.degrees(arctan2(sines, np.sqrt(1 - sines**2))) if turn is None else turn * np.array([1, 0.5])
 
     def turned(angles: np.ndarray) -> np.ndarray:
-        turns = turn * np.stack([sin(angles), cos(angles) / 2], 1)
-        return np.stack([step_outside(cameras.viewmats[middle], depth, 0, *vector) for vector in turns])
+        vectors = turns * np.stack([sin(angles), cos(angles)], 1)
+        return np.stack([step_outside(viewmat, depth, 0, *vector) for vector in vectors])
 
     angles = np.linspace(0, 2 * np.pi, TURN + 1)
     even = _at_equal_steps(camera_centres(turned(angles)), angles, np.arange(count) / count)
@@ -190,7 +166,10 @@ def turntable(cameras: Cameras, depth: float, count: int) -> Cameras:
     radius = max(float(np.median(_lengths(offsets - heights[:, None] * up))), CLOSE * depth)
     angles = 2 * np.pi * np.arange(count)[:, None] / count
     eyes = radius * (cos(angles) * towards + sin(angles) * np.cross(up, towards)) + np.median(heights) * up
-    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(_look(-eyes, -up), middle + eyes))
+    looks = normalize(-eyes)
+    right = normalize(np.cross(looks, up))
+    turned = np.stack([right, np.cross(looks, right), looks], 1)
+    return replace(cameras[[median_camera(cameras)] * count], viewmats=_viewmats(turned, middle + eyes))
 
 
 def turned_degrees(cameras: Cameras, depth: float) -> float:
@@ -285,13 +264,6 @@ def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt((vectors * vectors).sum(-1))
-
-
-def _look(directions: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Make the rotations ``[n,3,3]`` of cameras that look in ``directions [n,3]``, with ``down [3]`` below."""
-    looks = normalize(directions)
-    right = normalize(np.cross(down, looks))
-    return np.stack([right, np.cross(looks, right), looks], 1)
 
 
 def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:

@@ -40,7 +40,6 @@ from gsmerge.measure.preview import (
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR
-from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -157,7 +156,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
 
     def draw(_: int) -> Iterator[Picture]:
         parts = [(path.name, gaussians) for path, gaussians in group.scenes]
-        shown = [photos[[used[i]]][0] for i in ids] if len(photos) else None
+        shown = [photos[used[i]] for i in ids] if len(photos) else None
         if shown and options.size:
             shown = [fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(parts, cameras[ids], shown, ids, background=options.background)
@@ -187,16 +186,21 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     """Prepare a clip, or its frames as pictures, of the scenes along a path, with lines that move between them."""
     group, cameras, near, ids = _path_cameras(options)
     cameras = options.resize(cameras)
+    paths = [path.absolute() for path, _ in group.scenes]
+    same = len({path.name for path in paths}) < len(paths)
     texts = [
-        (path.absolute().name, f"{len(gaussians):,} Gaussians, {human_bytes(size)}")
-        for (path, gaussians), size in zip(group.scenes, group.sizes, strict=True)
+        ("/".join(path.parts[-2:]) if same else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
+        for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
     ]
 
     def draw(threads: int) -> Iterator[Picture]:
+        if len(texts) == 1:
+            yield from (picture for (picture,) in group.draw(cameras, options, threads, near))
+            return
         captions = make_captions(texts, cameras.width, cameras.height)
         places = swipe_places(len(texts), len(cameras), options.fps, cameras.width)
         for drawn, row in zip(group.draw(cameras, options, threads, near, places), places, strict=True):
-            yield draw_swipe(drawn, row, captions) if len(drawn) > 1 else drawn[0]
+            yield draw_swipe(drawn, row, captions)
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
@@ -240,9 +244,8 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
             )
         least = VIEW_FRAMES * len(ids) if path.kind == "spline" else 0
         try:
-            cameras = sample_path(
-                path, cameras, depth, options.frames or max(round(SECONDS[path.kind] * options.fps), least)
-            )
+            count = options.frames or max(round(SECONDS[path.kind] * options.fps), least)
+            cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
     return group, cameras, NEAR * depth, ids
@@ -302,16 +305,6 @@ def picture_stems(names: Sequence[str]) -> list[str]:
         if len({stem.lower() for stem in stems}) == len(stems):  # some file systems do not tell case apart
             break
     return stems
-
-
-def drawing_document(drawing: Drawing, output: Path) -> dict[str, Any]:
-    """Return the report of a drawing as plain JSON types."""
-    return {
-        **document_head(),
-        "output": str(output),
-        "pictures": [str(path) for path in drawing.paths],
-        **drawing.facts,
-    }
 
 
 def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> dict[str, Any]:

@@ -103,8 +103,7 @@ class Evaluation:
 
     Args:
         results: The scene itself first, as "input", if it was measured.
-        reference: "photos"; where there are none "the model's own pixels" or, of rows without pixels, "renders of the
-            input"; "photos, and ... in its own views" where there are none of those alone.
+        reference: "photos"; where there are none "the model's own pixels", or "renders of the input".
         num_views: Views by split.
         notes: Warnings, one sentence each.
         options: What was measured.

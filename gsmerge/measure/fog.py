@@ -78,7 +78,7 @@ def describe_fog(name: str, fog: Fog) -> str | None:
         return None
     return (
         f"{name}: seen from outside, the result shows haze where the input shows nothing: far fog {fog.fog_far:.2f};"
-        " compact the scene again if an earlier version made it, or with --fit none, which makes no haze"
+        " if it comes from a fit to photos, compact --fit none makes none"
     )
 
 

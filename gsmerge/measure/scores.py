@@ -21,7 +21,8 @@ ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {"fog_near": "near fog", "fog_far": "far fog", "holes": "holes"}  # fields of Fog
-LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after")  # what a narrow terminal leaves out
+# Columns that a narrow terminal leaves out, the first one first
+LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
 COVERED = "_covered"  # and over those that the input covers
 CSV_COLUMNS = (

@@ -92,15 +92,6 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
     return rows
 
 
-def share_outside(gaussians: Gaussians, cameras: Cameras) -> float:
-    """Measure the share of sampled Gaussians whose centres are outside every view's picture; 0 without any."""
-    points = gaussians.means[:: max(1, -(-len(gaussians) // MAX_SAMPLES))].astype(np.float64)
-    seen = np.zeros(len(points), bool)
-    for inside in inside_views(points, cameras):
-        seen |= inside
-    return float(1 - seen.mean()) if len(points) else 0.0
-
-
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     """Yield for each view a mask ``[n]`` of the points ``[n,3]`` inside its picture."""
     for view in range(len(cameras)):

@@ -23,7 +23,7 @@ from gsmerge.types import StrPath
 
 SCHEMA = 2  # version of the tensors' names and of the tokens that they were trained on
 FORMAT = "gsmerge-networks"
-REMEDY = "give another file, or --checkpoint none"
+REMEDY = "give another file, or --set checkpoint=none"
 SHIPPED = Path(__file__).with_name("shipped.safetensors")
 IN_PACKAGE = {"shipped": SHIPPED, "paper": Path(__file__).with_name("paper.safetensors")}  # by name
 

@@ -143,7 +143,7 @@ def collect(
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, threads=threads)
+    options = EvaluateOptions(nets, None, threads=threads)
     evaluation = evaluate(
         scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
     )

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-import numpy as np
-
+from gsmerge.facts.place_cameras import place_cameras
 from gsmerge.facts.views import even_views
-from gsmerge.geometry import lower_median, middle_depth
+from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import SITE, SITE_SCENE
@@ -27,8 +26,6 @@ POLICY = (
 )
 NAMES = {"scene": SITE_SCENE, "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
 MAX_VIEWS = 64  # of which the page knows where they stood
-FRAMED, VIEW_ANGLE = 0.8, 50.0  # without cameras: share of the Gaussians in the picture, its angle in degrees
-SIZE = 640, 480  # pixels of that picture
 LICENSED = ("spark", "three", "fflate")
 
 
@@ -37,7 +34,7 @@ def add_site(
 ) -> list[Path]:
     """Write a web site as part of :func:`gsmerge.io.atomic.atomic_outputs`; ``page`` is the temporary file of ``path``.
 
-    Without cameras the page looks at all Gaussians, from any side. Returns the present paths of all its files.
+    Without cameras some are placed, and one may look from any side. Returns the present paths of all its files.
     """
     contents = site_contents(gaussians, cameras, title, comments)
     written = [page, *(add(path.with_name(name)) for name in NAMES.values())]
@@ -50,8 +47,8 @@ def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: 
     """Make the files of a web site, by name."""
     scene = sog_bytes(gaussians, comments)
     is_free = len(cameras) == 0
-    shown = (overview_camera(gaussians) if is_free else cameras).numpy()
-    middle = median_camera(shown)
+    shown = place_cameras(gaussians.numpy()) if is_free else cameras.numpy()
+    middle = 0 if is_free else median_camera(shown)  # of placed ones the first shows the most
     picture = render(gaussians.numpy(), shown[[middle]]).images[0]
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
     page = render_template(
@@ -73,14 +70,3 @@ def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: 
         NAMES["poster"]: encode_still(to_picture(picture)),
         NAMES["licences"]: "\n\n".join(licences).encode(),
     }
-
-
-def overview_camera(gaussians: Gaussians) -> Cameras:
-    """Place a camera that looks along z at most Gaussians, y downwards."""
-    means, (width, height), half = gaussians.numpy().means.astype(np.float64), SIZE, np.radians(VIEW_ANGLE / 2)
-    middle = lower_median(means)
-    reach = np.quantile(np.sqrt(((means - middle) ** 2).sum(1)), FRAMED)
-    viewmat, focal = np.eye(4), height / 2 / np.tan(half)
-    viewmat[:3, 3] = (0, 0, reach / np.sin(half)) - middle
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(viewmat[None], K[None], width, height)

@@ -39,7 +39,7 @@ def pack_splats(
     count = int(drawn.sum())
     if count > MAX_GAUSSIANS:
         return None, 0
-    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREES[3])
+    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
     degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
     steps, levels = COARSE if count > MANY else EXACT
     stored = spz.spz_columns(gaussians[drawn], degree, fine=FINE)

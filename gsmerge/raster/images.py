@@ -47,11 +47,10 @@ def render(
     """Render Gaussians into every camera.
 
     Arrays give arrays, tensors give tensors. The CPU renders: tensors on a GPU are copied to it, and
-    the results, and gradients, back to where the Gaussians are.
+    the results, and gradients, back.
 
-    Of tensors, images and alphas are differentiable with respect to every tensor of the Gaussians
-    and the view matrices, where autograd is on and one of them asks for it; depths and intrinsics
-    are not. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
+    Of tensors, images and alphas are differentiable with respect to the Gaussians and the view matrices;
+    depths and intrinsics are not. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
 
     Args:
         gaussians: n Gaussians, SH degrees 0 to 4.

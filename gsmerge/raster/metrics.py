@@ -11,6 +11,7 @@ from gsmerge.types import Array, as_array
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB that a result may show the photos worse than its input without a word about it
+POOR = 30.0  # dB from its input below which the views of a result look different, where there are no photos
 
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
@@ -59,6 +60,13 @@ def describe_loss(name: str, before: float | None, after: float | None) -> str |
         return None
     loss = f"{after:.2f} dB, {before:.2f} dB before"
     return f"{name} shows the scene's own photos worse than the input does: {loss}"
+
+
+def describe_distance(psnr: float | None) -> str | None:
+    """Describe that a result is ``psnr`` dB from its input, which is poor; None from ``POOR`` on."""
+    if psnr is None or psnr >= POOR:
+        return None
+    return f"the result looks different from its input: {psnr:.1f} dB, below {POOR:g} dB"
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:

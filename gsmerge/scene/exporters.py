@@ -229,7 +229,7 @@ _EXPORTERS = (
                 "opacities from 0.005 on, sorted; harmonics in axes of their own; `transforms.json` as a list of poses"
                 " without intrinsics, `context/`", f"{_NO_PIXELS}; the focal length is searched",
             ),
-            Model("NAS3R", "mxlcanfly/NAS3R 2ad17fa", "the same with raw opacities; no cameras", _WITH_CAMERAS),
+            Model("NAS3R", "mxlcanfly/NAS3R 2ad17fa", "as VicaSplat, with raw opacities; no cameras", _WITH_CAMERAS),
         ),
         "logit", "unordered", ("pruned",), degrees=(0, 4),
     ),
@@ -272,8 +272,8 @@ _EXPORTERS = (
             ),
             Model(
                 "WorldMirror 2", "Tencent-Hunyuan/HY-World-2.0 05d3035; `inference_utils.py` 270f4b4",
-                "the same without masked pixels, at most 5,000,000 drawn at random; `camera_params.json`, COLMAP's"
-                " files on request; no photos", f"{_NO_PIXELS}; name the photos",
+                "as WorldMirror 1, without masked pixels, at most 5,000,000 drawn at random; `camera_params.json`,"
+                " COLMAP's files on request; no photos", f"{_NO_PIXELS}; name the photos",
             ),
         ),
         "raw", "none",
@@ -329,7 +329,7 @@ _EXPORTERS = (
     ),
     Exporter(
         "longlrm-sorted",
-        (Model("Long-LRM, sorted by opacity", "arthurhero/Long-LRM d92dd51", "the same, where it prunes", _NO_PIXELS),),
+        (Model("Long-LRM, sorted", "arthurhero/Long-LRM d92dd51", "as Long-LRM, where it prunes", _NO_PIXELS),),
         "logit", "unordered", ("pruned",), ("same", "scaled"), degrees=(3,), byte_columns=_NORMALS,
     ),
     # Scenes that were optimised, or predicted without pixels.
@@ -341,7 +341,7 @@ _EXPORTERS = (
                 "`point_cloud/iteration_N/point_cloud.ply`, `cameras.json`",
                 f"{_NO_PIXELS}; name the photos",
             ),
-            Model("InstantSplat", "NVlabs/InstantSplat 3c29c20", "the same", f"{_NO_PIXELS}; name the photos"),
+            Model("InstantSplat", "NVlabs/InstantSplat 3c29c20", "as INRIA 3DGS", f"{_NO_PIXELS}; name the photos"),
             Model("ZipSplat", "cvg/ZipSplat 69fd35b", "`scene.ply` of tokens and a film; no cameras", _WITH_CAMERAS),
             Model(
                 "SAM 3D Objects", "facebookresearch/sam-3d-objects; `gaussian_model.py` aa18aba",

@@ -130,12 +130,11 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place, each in a frame of its own, which are joined with it
-            in its frame (docs/guide/sharp.md).
+        *more: Other scenes of the same place, which are joined with it in its frame (docs/guide/sharp.md).
         cameras: Camera file or folder; None looks next to the ``.ply``.
         images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
-        masks: Folder of masks, images named as the photos, dark where a photo does not count; None: ``masks`` beside
-            the photos. Where a photo is transparent, it does not count either.
+        masks: Folder of images named as the photos, dark where a photo does not count; None: ``masks`` beside the
+            photos, and where these are transparent.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
@@ -324,7 +323,7 @@ def _make_load(
 
 def _unaligned_note(hints: ReadHints) -> str:
     """Note that rows have no pixels, and which searches were not made."""
-    note = "the rows belong to no pixels that could be found: unaligned"
+    note = "the Gaussians belong to no pixels that could be found: unaligned"
     if hints.exporter == "auto":
         return note
     return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
@@ -378,7 +377,7 @@ def _place_rows(
         gaussians = ply.gaussians
         keep = ply.valid & ~find_padding(gaussians)
         count = int(ply.valid.sum()) - int(keep.sum())
-        notes = [f"{count:,} rows that only fill the file up are left out"] if count else []
+        notes = [f"{count:,} Gaussians that only fill the file up are left out"] if count else []
         return ply.gaussians[keep], None, None, notes
     grid = len(result.views), result.cameras.height, result.cameras.width
     size, ids = int(np.prod(grid)), result.pixel_ids

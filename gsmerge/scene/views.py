@@ -102,7 +102,7 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
         better = ratio(seen) < _SHOWS_BETTER * ratio(usual)
     except SceneError:  # photos of other views
         return files, []
-    note = f"photos are those of {_SEEN_PLACE}: their colours are those of the rows, those of {usual.name} are not"
+    note = f"photos are those of {_SEEN_PLACE}: their colours are those of the Gaussians, those of {usual.name} are not"
     return (replace(files, images=seen), [note]) if better else (files, [])
 
 

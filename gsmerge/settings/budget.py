@@ -29,9 +29,10 @@ class BudgetOptions(Settings):
         metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
         "lose at most so much against the best, such as -0.2dB.",
-        "The best is what the scene's own curve reaches.", metavar="30dB|-0.2dB")  # fmt: skip
+        "The best is what the scene's own curve reaches. Where there are no photos and the rows belong to no pixels, a "
+        "PSNR is that from the input, and 32.5dB is kept unless a number is asked for.",
+        metavar="30dB|-0.2dB")  # fmt: skip
     output: str = setting("a.ply", "Name of the file whose bytes a size counts, with its ending.", internal=True)
-    spz_version: int = setting(3, "Version of that file, if it is a `.spz`.", internal=True)
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
         "Each is fitted by itself.", least=1, most=8)  # fmt: skip

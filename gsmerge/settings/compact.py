@@ -59,24 +59,22 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
-    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/guide/baselines.md "
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/internals/plugins.md "
         "lists them.",
-        "Packages add methods by entry points (`gsmerge.compaction.methods.Method`); for all but `gsmerge` the number "
-        "of Gaussians has to be settled beforehand.", choices=method_names, metavar="NAME")  # fmt: skip
-    effort: str = setting("default", "How much work goes into superpixels, merging and fit.",
+        "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME")  # fmt: skip
+    effort: str = setting("default", "Quality for time: best is sharper and takes two to three times as "
+        "long; fast and draft take a third or less.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",
-        "`shipped`: networks that come with the package; `paper`: networks with absolute outputs; `none`: only the "
-        "analytic stages. `auto`: the shipped networks if no fit follows; a draft or a fast run uses only their "
-        "decoder heads.", metavar="FILE|NAME")  # fmt: skip
+        "They do if no fit follows; a draft or a fast run uses only their decoder heads.",
+        metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
         "analytic stages.")  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
-        "Everything random depends on it alone; runs with one seed are bit-identical.",
-        least=0)  # fmt: skip
+        "Runs with one seed are bit-identical.", least=0)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
         shown="all processors")  # fmt: skip
 

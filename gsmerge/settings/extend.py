@@ -22,17 +22,16 @@ class ExtendOptions(Settings):
 
     max_k: int | None = setting(None, "Most Gaussians per superpixel that can be decoded later: fixed by the first "
         "batch. More take more space.",
-        "None: 4; 8 where `k` is larger, or a number of Gaussians is asked for (budgets, unaligned scenes).", least=1,
-        most=MAX_CHILDREN, shown="4, or 8 with a --budget")  # fmt: skip
+        "By default 4; 8 where `k` is larger, or a number of Gaussians is asked for.", least=1, most=MAX_CHILDREN,
+        shown="4, or 8 with a --budget")  # fmt: skip
     tolerance: float = setting(0.06, "Leave out a new group where the state shows its pixels with a colour error (root "
         "mean square, sRGB in [0, 1], holes counted) below this, or no larger than `margin` times that of the new "
         "views' own Gaussians.",
-        "0: nothing is left out, which is what the recipe `paper` sets.", least=0, most=1)  # fmt: skip
+        "0: nothing is left out.", least=0, most=1)  # fmt: skip
     margin: float = setting(1.0, "See `tolerance`.", least=0)
     replay: int = setting(96, "Most photos that are stored, spread evenly over all views, for a full fit when "
         "decoding.",
-        "Colours are fitted batch by batch and need none. The recipe `paper` sets 0: it has no fit.",
-        least=0)  # fmt: skip
+        "Colours are fitted batch by batch and need none.", least=0)  # fmt: skip
     fit_colors: bool = setting(True, "Fit the base colours to the photos of each batch; not of groups that keep their "
         "latents, whose colours are those of the heads.")  # fmt: skip
 

@@ -69,19 +69,18 @@ class Tuning:
 class FitOptions(Settings):
     """Settings of the fit to the photos."""
 
-    fit: Fit = setting("full", "What is fitted to the photos.", "`full`: all parameters; `none`: nothing.")
+    fit: Fit = setting("full", "full: closer to the photos, for most of the time that a run takes; none: neither.")
     fit_steps: int | None = setting(None, "Steps of the full fit, one view each.",
         "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
     time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
-        "The steps are then chosen from the measured time of the first ones, and the result is no longer the same on "
-        "every machine. By default there is no limit.", above=0, unit="seconds")  # fmt: skip
+        "The result is then no longer the same on every machine. By default there is no limit.", above=0,
+        unit="seconds")  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
         "after those on half-size photos look at larger photos, as far as the photos are that large.",
-        "`auto`: up to 2 with effort `default` and `best` where the photos are at least 1.25 times as large, on the "
-        "CPU; 1 otherwise.", least=1, below=math.inf)  # fmt: skip
+        "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf)  # fmt: skip
     dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
-        "By default 0.1 for five views or fewer and 150 steps or more, where the fit would memorise the photos, "
-        "otherwise 0.05 from 600 steps and 30 looks at each view on, and 0 below.", least=0, below=1)  # fmt: skip
+        "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
+        "on, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps on half-size photos.",
         "By default 0.5, below 150 steps 0.7, below 20 all; less for more than 8.6 % of the Gaussians.",
         least=0, most=1)  # fmt: skip

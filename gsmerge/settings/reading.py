@@ -20,8 +20,7 @@ class ReadHints(Settings):
     exporter: str = setting("auto", "The program that wrote the file, such as da3 or depthsplat; auto recognises it.")
     quats: QuatChoice = setting("auto", "How the file stores rotations: w first, w last, w last and applied twice, or "
         "relative to each view's camera.",
-        "The roots of rotations that are applied twice are used where the pixels are known. `auto`: as the exporter "
-        "says, and checked against the surface where the pixels are known.")  # fmt: skip
+        "`auto`: as the exporter says, and checked against the surface where the pixels are known.")  # fmt: skip
     order: Order = setting("auto", "Order of the rows; none: the Gaussians belong to no pixels.",
         "`unordered`: each may be made of a pixel.")  # fmt: skip
     scene_scale: float | None = setting(None, "Size of the Gaussians' world in units of the cameras'; null: it is "

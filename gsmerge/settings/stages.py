@@ -22,7 +22,7 @@ AUTO_SHARE = "auto"
 MAX_CHILDREN = 8
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # the K of groups of their own, and its values
 USUAL_K = 1  # what "auto" is unless there are reasons for more
-NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/laboratory/notebook.md has figures
+NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; docs/internals/notebook.md has figures
 CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
 CROP_FILES = (".json", ".toml")  # endings of files that hold a crop, which the command line reads
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
@@ -34,17 +34,14 @@ class PrepareOptions(Settings):
     """Settings of the preparation: poses, exposure and unseen Gaussians."""
 
     poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
-        "`free`: views of one Gaussian per pixel are moved to where their photos agree, and the full fit moves the "
-        "cameras on (on the CPU); `auto`: free where some view is more than 1.5 pixels off and its photo and the "
-        "others agree clearly better elsewhere (`gsmerge.facts.align_views` says by how much); fixed elsewhere, and "
-        "without photos and pixels.")  # fmt: skip
+        "`free`: views are moved to where their photos agree, and the fit moves the cameras on; `auto`: where some "
+        "view is more than 1.5 pixels off and agrees clearly better elsewhere.")  # fmt: skip
     exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
         "they differ at random, never, or always.",
-        "The Gaussians of their pixels change with them; `gsmerge.facts.exposure` says when they differ at "
-        "random.")  # fmt: skip
+        "The Gaussians of their pixels change with them.")  # fmt: skip
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
-        "`drop`: they are left out. `keep`: they are merged among their neighbours in space, at the rate of the "
-        "others, and added to the result.")  # fmt: skip
+        "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
+        "others.")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -62,8 +59,7 @@ class SegmentOptions(Settings):
         "By default 0, and by effort.")  # fmt: skip
     compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared pixels against "
         "squared colours in [0, 1].",
-        "At 0 the colours alone decide, and superpixels become snakes that no Gaussian fits.", least=0,
-        most=1)  # fmt: skip
+        "At 0 superpixels become snakes that no Gaussian fits.", least=0, most=1)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,21 +94,21 @@ class MatchOptions(Settings):
     """Conditions under which Feature Gaussians of different views are merged."""
 
     match: Method | None = setting(None, "How Feature Gaussians of different views are merged.",
-        "`overlap`: Bhattacharyya coefficient (does not depend on the world's axes), similar colours, and star "
-        "clusters that cannot chain. `aabb`, as in the paper (section 4.4): box IoU, similar latents, and connected "
-        "components. `none`: no merging across views. By default `overlap`, but `none` in a draft.")  # fmt: skip
+        "`overlap`: Bhattacharyya coefficient, similar colours, star clusters that cannot chain. `aabb`, as in the "
+        "paper (section 4.4): box IoU, similar latents, connected components. By default `overlap`, but `none` in a "
+        "draft.")  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of `overlap`.", least=0, most=1)
     iou: float = setting(0.2, "Least IoU of the boxes of `aabb` (tau_g).", least=0, most=1)
     similarity: float = setting(0.8, "Least cosine of the latents of `aabb` (tau_f).",
-        "Without an encoder there are no latents, and colours are compared in their place.", least=-1,
+        "Without latents colours are compared.", least=-1,
         most=1)  # fmt: skip
     max_color: float = setting(0.12, "Largest difference of base colours (Euclidean, sRGB in [0, 1]).", least=0)
     neighbors: int | None = setting(None, "Nearest neighbours of other views in 3D that are compared (k, which the "
         "paper leaves open).",
-        "By default 16 with `overlap`, 1 with `aabb`, whose components chain and leave holes with more.",
+        "By default 16 with `overlap`, 1 with `aabb`, which leaves holes with more.",
         least=1)  # fmt: skip
     cluster_size: int | None = setting(None, "Most Feature Gaussians in a star cluster.",
-        "By default as many as there are views (a cluster holds one of each view at most).", least=1)  # fmt: skip
+        "By default as many as there are views.", least=1)  # fmt: skip
 
     @property
     def num_neighbors(self) -> int:
@@ -124,14 +120,11 @@ class MatchOptions(Settings):
 class DecodeOptions(Settings):
     """Settings of decoding: how many Gaussians each Feature Gaussian becomes."""
 
-    k: int | Literal["mixed", "auto"] = setting(AUTO, "Gaussians per superpixel: finer with more; mixed: 1, 2 or 4 by "
-        "its saliency; auto: 1, and 4 for one photo without a long fit.",
-        "`mixed` is of the paper's supplement. `auto`: 4 where all views have one camera, nothing else says how many "
-        "Gaussians there are to be, and no fit follows or one of at most 60 steps.", least=1, most=MAX_CHILDREN,
-        metavar="1-8|mixed|auto")  # fmt: skip
+    k: int | Literal["mixed", "auto"] = setting(AUTO, "More detail and a larger file: Gaussians for each superpixel; "
+        "mixed: 1, 2 or 4, most where there is most to see; auto: 1, and 4 for one photo without a long fit.",
+        "`mixed` is of the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto")  # fmt: skip
     k_low: float = setting(50.0, "Percentile of `mixed` up to which groups become one Gaussian.",
-        "The paper's percentiles are 33.3 and 66.7, which give more Gaussians than K = 2 everywhere.", least=0,
-        most=100)  # fmt: skip
+        "The paper's are 33.3 and 66.7.", least=0, most=100)  # fmt: skip
     k_high: float = setting(85.0, "Percentile of `mixed` above which groups become four Gaussians.", least=0, most=100)
     k_rule: KRule = setting("saliency", "What the percentiles are of: `saliency`, the mean corner response of the "
         "group's pixels, as in the paper, or `distortion`: as many Gaussians, where they lower distortion "
@@ -162,11 +155,11 @@ class CleanOptions(Settings):
 
     crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
         "scene's world units, or inside the shape that a .json or .toml file describes; a budget is met after it.",
-        "Their centres have to be inside. Three more numbers of a box turn it about its middle: degrees about x, y and "
-        "z, in this order. The command line alone reads files.", metavar="SHAPE")  # fmt: skip
+        "Three more numbers of a box turn it about its middle: degrees about x, y and z. The command line alone reads "
+        "files.", metavar="SHAPE")  # fmt: skip
     drop: str | None = setting(None, "Leave out floaters, sky or transparent Gaussians, with commas between.",
-        "`floaters`: isolated, far beyond the scene, or hanging across it (`gsmerge.stages.clean.floaters`); `sky`: "
-        "what is sky in the photos (`gsmerge.stages.sky.sky`); `transparent`: of an opacity below 1/255.",
+        "`floaters`: isolated, far beyond the scene, or hanging across it; `sky`: what is sky in the photos; "
+        "`transparent`: of an opacity below 1/255.",
         metavar="floaters,sky,...")  # fmt: skip
 
     def __post_init__(self) -> None:

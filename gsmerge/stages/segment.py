@@ -108,6 +108,7 @@ class CountLimits:
     max_count: int  # Most Gaussians that a budget, a size or a device allows
     exact: int | None  # Gaussians that a budget or a size asks for; None without either
     num_pixels: int  # Of all views
+    num_input: int  # Gaussians that the count is one of
 
     @property
     def count(self) -> int | None:
@@ -151,6 +152,7 @@ def count_limits(
         max_count=max_count,
         exact=exact,
         num_pixels=views * scene.pixels_per_view,
+        num_input=count,
     )
 
 

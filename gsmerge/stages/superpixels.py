@@ -94,11 +94,11 @@ def superpixels(
         image: ``[h,w,3]`` sRGB, float in [0, 1] or uint8; an array or a tensor.
         count: Superpixels, 1 to h·w.
         segmentation: ``rdseg``, ``bass``, ``bass-st``, ``bass-adaptive``, ``slic`` or ``grid``.
-        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1. More take longer.
+        rectangles: Of ``rdseg``: rectangles per superpixel that it begins with, at least 1.
         early_sweeps: Of ``rdseg``: sweeps over border pixels before rectangles are merged.
         compactness: Weight of squared pixels against squared colours, in [0, 1] (not for the BASS methods).
-        adapt: Of ``bass-adaptive`` only, which changes ``count`` by a factor of a quarter to four (at most one per
-            pixel): share of the changed number to return, 1 for all. None: exactly ``count``.
+        adapt: Of ``bass-adaptive``, which changes ``count`` by a factor of a quarter to four: share of the changed
+            number to return. None: exactly ``count``.
 
     Returns:
         ``[h,w]`` int32, dense from 0, a tensor for a tensor; the same on every run.

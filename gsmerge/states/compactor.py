@@ -21,8 +21,8 @@ class Compactor:
     """Compact views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
 
     After one batch ``decode(k=2, fit="none")`` equals ``compact(scene, k=2, fit="none", poses="fixed",
-    exposure="fixed")`` bit for bit, as does any other ``k`` up to ``max_k``, with two exceptions: a budget or the size
-    of the input limits the number of superpixels; or Gaussians that no view sees are kept, which are merged for one K.
+    exposure="fixed")`` bit for bit, unless a budget or the size of the input limits the number of superpixels, or
+    Gaussians that no view sees are kept.
 
     Args:
         **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of

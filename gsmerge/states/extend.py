@@ -104,7 +104,7 @@ def extend(
             counts |= others
         if has_latents:
             choose(groups=counts["num_new"], clusters=len(state), **plan.network_facts)
-        if prepared.reference.score_views:
+        if prepared.reference.of_views:
             state = _with_photos(state, batch)
     numbers = {"num_views": len(prepared.scene), "num_input": scene.num_gaussians, **counts, "num_groups": len(state)}
     settings = options.to_dict() | asdict(extend_options)

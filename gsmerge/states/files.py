@@ -129,7 +129,6 @@ def compact_file(
     mixed: Mapping[str, Any] | None = None,
     always_fit: bool = False,
     normals: bool = True,
-    spz_version: int = 3,
     overwrite: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -142,11 +141,11 @@ def compact_file(
     :func:`gsmerge.compaction.files.compact_files`.
     """
     start, state = perf_counter(), load_state(path)
-    lost, read = lost_harmonics(out, state.sh_degree, spz_version), perf_counter()
+    lost, read = lost_harmonics(out, state.sh_degree), perf_counter()
     notes = [lost] if lost else []
     fit_options = resolve_fit(settings) if always_fit or len(state.replay) else FitOptions(fit="none")
     check_fit(state, fit_options)
-    size = _file_size(budget, out, spz_version)
+    size = _file_size(budget, out)
     count = budget if size is None else count_for_bytes(size.file, size.num_bytes, state.sh_degree)
     document: dict[str, Any] = {
         **document_head(),
@@ -176,7 +175,7 @@ def compact_file(
             raise SceneError(path, "expected Gaussians of finite numbers, found others", REMEDY)
         write_gaussians(
             temporary, gaussians, overwrite=True, comments=_comments(state), ending=output_format(out).ending,
-            normals=normals, spz_version=spz_version,
+            normals=normals,
         )  # fmt: skip
     seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
     return document | {
@@ -188,10 +187,10 @@ def compact_file(
     }
 
 
-def _file_size(budget: int | str | None, out: Path, spz_version: int) -> FileSize | None:
+def _file_size(budget: int | str | None, out: Path) -> FileSize | None:
     """Return the size in bytes that a budget asks for; None for any other budget."""
     try:
-        return None if budget is None else file_size(BudgetOptions(budget, output=out.name, spz_version=spz_version))
+        return None if budget is None else file_size(BudgetOptions(budget, output=out.name))
     except ValueError as error:
         raise UsageError(str(error)) from error
 

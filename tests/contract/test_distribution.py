@@ -20,6 +20,7 @@ import pytest
 import tomllib
 
 import gsmerge
+from gsmerge.errors import NO_TORCH
 from gsmerge.io.formats import spz, usd
 from gsmerge.kernels.build import find_platform
 
@@ -111,9 +112,11 @@ def test_metadata(built: Path, root: Path, project: dict[str, Any]) -> None:
 
 def test_messages_install_what_the_extras_ask_for(root: Path, project: dict[str, Any]) -> None:
     extras = project["optional-dependencies"]
-    hints = [spz.INSTALL, usd.INSTALL]
-    assert [f'pip install "{extras[name][0]}"' for name in ("spz4", "usd")] == hints
-    assert f"pip install '{extras['ray'][0]}'" in (root / "gsmerge" / "runtime" / "work.py").read_text()
+    for name, hint in {"spz4": spz.INSTALL, "usd": usd.INSTALL}.items():
+        assert hint == f'install gsmerge[{name}], or pip install "{extras[name][0]}"'
+    hint = f"install gsmerge[ray], or pip install '{extras['ray'][0]}'"
+    assert hint in (root / "gsmerge" / "runtime" / "work.py").read_text()
+    assert "install gsmerge[torch], or" in NO_TORCH
     pages = (*root.glob("*.md"), *(root / "docs").rglob("*.md"), *(root / "gsmerge").rglob("*.py"))
     assert [str(page) for page in pages if re.search(r"""pip install ["']gsmerge""", page.read_text())] == []
 

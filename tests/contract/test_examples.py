@@ -70,7 +70,7 @@ def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.Monke
         assert isinstance(last, ast.Expr)
         exec(compile(ast.Module(body, []), "notebook.ipynb", "exec"), namespace)
         shown.append(show(eval(compile(ast.Expression(last.value), "notebook.ipynb", "eval"), namespace)))
-    texts = ("Scene(24,576", "data:image/png;base64,", "fit", "3 target views", "png", "png", "GaussianFile(")
+    texts = ("Scene(24,576", "data:image/png;base64,", "<iframe", "fit", "3 target views", "<iframe", "GaussianFile(")
     assert len(shown) == len(texts)
     assert all(text in value for text, value in zip(texts, shown, strict=True)), shown
 

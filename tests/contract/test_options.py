@@ -13,11 +13,18 @@ import typer.main
 from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
+from gsmerge.cli.parameters import OPTIONS
+from gsmerge.cli.paths import FileOptions
 from gsmerge.research.generate import GenerateOptions
-from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
+from gsmerge.settings.stages import Engine
 
-COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+TOP: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+LAB: dict[str, Any] = TOP["lab"].commands
+COMMANDS = {name: command for name, command in TOP.items() if name != "lab"}
+COMMANDS |= {f"lab {name}": command for name, command in LAB.items()}
+FEW, OF_COMPACT = 120, 22  # options of all commands, and of compact
 
 
 def shown(command: str, name: str) -> Any:
@@ -29,26 +36,31 @@ def shown(command: str, name: str) -> Any:
 
 
 def test_defaults_of_single_commands_are_the_library_s() -> None:
-    assert shown("extend", "max_k") == flat_settings(ExtendOptions)["max_k"].shown
     assert shown("batch", "engine") == BatchOptions().engine == "local"
     assert shown("batch", "name") == BatchOptions().output
     made = GenerateOptions()
-    assert [shown("generate", name) for name in ("style", "path", "noise")] == [made.style, made.path, made.noise]
-    assert (shown("generate", "views"), shown("generate", "size")) == ("6", "320x240")
+    assert (shown("lab generate", "views"), shown("lab generate", "size")) == ("6", "320x240")
     assert (made.views, made.width, made.height) == ((6, 6), 320, 240)
 
 
-def test_default_of_training_is_the_preset_s() -> None:
-    pytest.importorskip("torch", reason="the package's training imports it")
-    from gsmerge.research.training import preset_options
+def test_commands_are_eight_and_those_of_research() -> None:
+    assert set(TOP) == {"compact", "batch", "convert", "extend", "inspect", "render", "view", "evaluate", "lab"}
+    assert set(LAB) == {"chart", "generate", "stress", "train"}
 
-    assert shown("train", "steps") == str(preset_options("default").steps)
+
+def options_of(command: str) -> list[str]:
+    return [p.name for p in COMMANDS[command].params if p.param_type_name == "option" and p.name != "help"]
 
 
 def test_there_are_few_options() -> None:
-    """401 before settings and hints were given by name; 248 before ``convert``, which 20 more are for."""
-    assert sum(len(command.params) for command in COMMANDS.values()) <= 267
-    assert sum(not getattr(p, "hidden", False) for p in COMMANDS["compact"].params) <= 15
+    assert sum(len(options_of(command)) for command in COMMANDS) <= FEW
+    assert len(options_of("compact")) <= OF_COMPACT
+    assert not any(getattr(p, "hidden", False) for command in COMMANDS.values() for p in command.params)
+
+
+def test_what_is_declared_is_used() -> None:
+    used = {name for command in COMMANDS for name in options_of(command)}
+    assert set(OPTIONS) - used == set()
 
 
 def flags_of(command: str) -> dict[str, str]:
@@ -69,7 +81,9 @@ def test_output_is_one_option_everywhere(command: str) -> None:
         ("compact a.gsm --no-normals", "--set normals=false"),
         ("inspect scene --order none", "--hint order=VALUE"),
         ("inspect scene --poses fixed", ": --poses"),
-        ("generate -o rooms --segmentation grid", ": --segmentation"),
+        ("lab generate -o rooms --style room", "--set style=VALUE"),
+        ("lab train --data a -o b --steps 3", "--set steps=VALUE"),
+        ("extend a.gsm b --seed 3", "--set seed=VALUE"),
     ],
 )
 def test_settings_without_an_option_say_how_to_give_them(
@@ -94,17 +108,31 @@ def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-def test_short_help_and_all_of_it(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_shows_all_options_in_panels(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
-    brief, full = help_of(capsys, "compact", "--help"), help_of(capsys, "compact", "--help-all")
-    listed = [set(re.findall(r"^│ (--[\w-]+)", text, re.MULTILINE)) for text in (brief, full)]
-    assert len(listed[0] - {"--help"}) == 13  # and the argument SCENE
-    every = {p.opts[0] for p in COMMANDS["compact"].params if p.opts[0].startswith("--")}
-    assert listed[1] - {"--help"} == every
-    named = set(re.findall(r"--[a-z-]+", brief.partition("─ Input ─")[0]))
-    assert named - {"--help", "--help-all"} == every - listed[0]  # what the short help leaves out is named in it
-    assert all(title in brief for title in ("─ Input ─", "─ How many Gaussians ─", "─ Method ─", "─ Output ─"))
-    assert help_of(capsys, "compact", "--help") == brief
+    text = help_of(capsys, "compact", "--help")
+    listed = set(re.findall(r"^│ (--[\w-]+)", text, re.MULTILINE))
+    assert listed - {"--help"} == {f"--{name.replace('_', '-')}" for name in options_of("compact")}
+    assert all(title in text for title in ("─ Input ─", "─ How many Gaussians ─", "─ Method ─", "─ Output ─"))
+
+
+def test_set_help_lists_all_settings(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    for command in ("compact", "extend", "convert", "lab chart"):
+        text = help_of(capsys, *command.split(), "--set", "help")
+        assert max(map(len, text.splitlines())) <= 60
+    text = help_of(capsys, "compact", "--set", "help")
+    assert {name.partition("=")[0] for name in re.findall(r"^\S+", text, re.MULTILINE)} == {
+        *flat_settings(CompactOptions), *flat_settings(FileOptions), *flat_settings(Engine)
+    }  # fmt: skip
+    assert "superpixels=4.4%\n    Superpixels per view" in text
+
+
+def test_the_name_alone_prints_twelve_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = help_of(capsys).splitlines()
+    assert (len(lines), max(map(len, lines)) <= 40) == (12, True)
+    assert lines[0].startswith("gsmerge scene.ply ")
+    assert {line.split()[0] for line in lines[3:]} == set(TOP)
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -112,7 +140,7 @@ def test_help_fits_a_terminal(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    text = help_of(capsys, command, "--help")
+    text = help_of(capsys, *command.split(), "--help")
     assert max(map(len, text.splitlines())) <= 80
     usage = next(line.split() for line in text.splitlines() if "Usage:" in line)
     assert usage[-1] == "[OPTIONS]"
@@ -122,7 +150,7 @@ def test_help_fits_a_terminal(
 
 def test_help_prints_brackets(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "160")
-    assert "gsmerge[ray]" in help_of(capsys, "batch", "--help-all")
+    assert "gsmerge[ray]" in help_of(capsys, "batch", "--help")
 
 
 def test_commands_are_grouped(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""The worked example of docs/guide/plugins.md, laid out as an installer leaves it, adds its method and its command."""
+"""The example of docs/internals/plugins.md, laid out as an installer leaves it, adds its method and its command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from gsmerge import read_ply
 
-PAGE = Path(__file__).parents[2] / "docs" / "guide" / "plugins.md"
+PAGE = Path(__file__).parents[2] / "docs" / "internals" / "plugins.md"
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_broken_package_stops_no_other(site: Path, made_scene: Path) -> None:
     (site / "gsmerge_nth.py").write_text("import no_such_module\n")
     done = run(site, "--help")
     assert done.returncode == 0
-    assert "generate" in done.stdout
+    assert "lab" in done.stdout
     assert "gsmerge-nth" in done.stderr
     refused = run(site, "compact", str(made_scene), "--set", "method=nth", "--dry-run")
     assert refused.returncode == 2

@@ -52,18 +52,19 @@ def report_of(run: Any, *words: Any) -> dict[str, Any]:
 
 def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     report = report_of(run, "compact", bare, "-o", tmp_path / "small.ply", "--budget", "20%")
-    assert [note for note in report["notes"] if noted([note], *PLACED)] == [report["notes"][-1]]
+    assert sum(noted([note], *PLACED) for note in report["notes"]) == 1
     assert report["output"]["num_gaussians"] == report["input"]["num_gaussians"] // 5
     judged = report["choices"]["fidelity"]
     assert judged["views"] == 8
     assert judged["psnr"] > 20
+    assert judged["held_out"]
     assert report["psnr_input_views"] == {"before": None, "after": None}
     assert "unseen" not in report["choices"]
     hinted = report_of(run, "compact", bare, "-o", tmp_path / "b.ply", "--budget", "20%", "--hint", "order=none")
     assert (tmp_path / "small.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert hinted["notes"] == report["notes"]
     line = run("compact", bare, "-o", tmp_path / "c.ply", code=0).out
-    assert "against the input from 8 held-out views" in line
+    assert "dB from the input in 8 held-out views" in line
 
 
 def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
@@ -90,10 +91,9 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--quality", "22dB")
     assert report["choices"]["search"]["met"]
     assert report["choices"]["search"]["psnr"] >= 22
-    knee = report_of(run, "compact", bare, "-o", tmp_path / "b.ply", "--budget", "auto")
-    points = knee["choices"]["curve"]
-    assert [p["count"] for p in points] == sorted(p["count"] for p in points)
-    assert points[0]["psnr"] < points[-1]["psnr"]
+    for words in ((), ("--budget", "auto")):
+        kept = report_of(run, "compact", bare, "-o", tmp_path / "b.ply", *words, "--overwrite")
+        assert kept["choices"]["fidelity"]["psnr"] >= 32.5
 
 
 def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:

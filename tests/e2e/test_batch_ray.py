@@ -78,5 +78,8 @@ def test_without_ray_one_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     done = run("batch", small_scene, "--output", tmp_path / "out", "--engine", "ray", code=2)
-    assert done.err == "gsmerge: error: engine ray: Ray is not installed; pip install 'ray>=2.9,<3'\n"
+    assert (
+        done.err
+        == "gsmerge: error: engine ray: Ray is not installed; install gsmerge[ray], or pip install 'ray>=2.9,<3'\n"
+    )
     assert not (tmp_path / "out").exists()

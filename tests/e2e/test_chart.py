@@ -1,4 +1,4 @@
-"""``gsmerge chart`` on small made scenes: runs, resumes, draws, tells what failed."""
+"""``gsmerge lab chart`` on small made scenes: runs, resumes, draws, tells what failed."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bare_files import write_without_grid
 from batches import InlinePool
 from messages import names, noted
 
@@ -52,6 +51,9 @@ def budgets(merges: list[CompactOptions]) -> list[object]:
     return [settings.budget.budget for settings in merges]
 
 
+NO_PROXIES = ("--set", "proxy_views=0")
+
+
 def runs(folder: Path) -> dict[str, RunRecord]:
     """All runs by their label; none may be left out."""
     records, notes = read_runs(folder)
@@ -60,7 +62,9 @@ def runs(folder: Path) -> dict[str, RunRecord]:
 
 
 def again(run: Run, folder: Path, *options: object) -> Outcome:
-    return run("chart", folder / "room", "--output", folder / "out", *CHART_TARGETS, *CHART_FAST, *options)
+    fast = CHART_FAST[2 * ("--grid" in options) :]
+    where = ("--output", folder / "out") if "--output" not in options else ()
+    return run("lab", "chart", folder / "room", *where, *CHART_TARGETS, *fast, *NO_PROXIES, *options)
 
 
 def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
@@ -76,8 +80,8 @@ def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
         assert record.value("lpips_vgg_target") is None
         assert (record.render_ms or 0) > 0
         assert record.environment["gsmerge"] == gsmerge.__version__
-        assert record.command.startswith("gsmerge chart ")
-        assert "--budgets 1%,2% --fit none" in record.command
+        assert record.command.startswith("gsmerge lab chart ")
+        assert "--grid budget=1%,2% --set fit=none" in record.command
     assert len(proxies.scores) == 30
     assert (first.ratio, one.count, two.count) == (1.0, pixels // 100, pixels // 50)
     assert first.seconds == 0
@@ -126,10 +130,10 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
 
 @pytest.mark.slow
 def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[CompactOptions], run: Run) -> None:
-    assert again(run, copied, "--rerun").code == 0
+    assert again(run, copied, "--set", "rerun=true").code == 0
     assert budgets(merges)[-2:] == ["1%", "2%"]
     count = len(merges)
-    assert again(run, copied, "--seed", 1).code == 0
+    assert again(run, copied, "--set", "seed=1").code == 0
     assert {settings.seed for settings in merges[count:]} == {1}
     ply = copied / "room" / "scene.ply"
     data = bytearray(ply.read_bytes())
@@ -142,30 +146,15 @@ def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: li
 @pytest.mark.slow
 def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> None:
     before = runs(copied / "out")["input"]
-    assert again(run, copied, "--budgets", "2%", "--photo-side", 48).code == 0
+    assert again(run, copied, "--grid", "budget=2%", "--set", "photo_side=48").code == 0
     after = runs(copied / "out")["input"]
     assert after.value("psnr_target_visible") != before.value("psnr_target_visible")
-    assert "--photo-side 48" in after.command
+    assert "--set photo_side=48" in after.command
     scene = load_scene(copied / "room")
     targets = read_held_out(scene, copied / "room" / "targets")
     options = gsmerge.EvaluateOptions(lpips=(), photo_side=48)
     expected = gsmerge.evaluate(scene.scene, {}, targets, options).results[0].mean("target")[1].psnr
     assert after.value("psnr_target_visible") == expected
-
-
-@pytest.mark.slow
-def test_hints_count_for_all_scenes(copied: Path, run: Run) -> None:
-    (copied / "room" / "transforms.json").unlink()  # no pixels can be found, and views have to be placed
-    shutil.rmtree(copied / "room" / "images")
-    write_without_grid(copied / "room" / "scene.ply", copied / "room" / "scene.ply")
-    said = ("--hint", "order=none", "--fit", "none", "--budgets", "2%", "--proxy-views", "0", "--lpips", "none")
-    run("chart", copied / "room", "--output", copied / "unaligned", *said, code=5)
-    shutil.copyfile(copied / "room" / "targets" / "transforms.json", copied / "room" / "transforms.json")
-    shutil.copytree(copied / "room" / "targets" / "images", copied / "room" / "images")
-    assert run("chart", copied / "room", "--output", copied / "unaligned", *said).code == 0
-    records = runs(copied / "unaligned").values()
-    assert {(record.views, record.error) for record in records} == {(2, None)}
-    assert all("--hint order=none" in record.command for record in records)
 
 
 def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +166,7 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
         return compact(scene, settings)
 
     monkeypatch.setattr(running, "compact", broken)
-    options = ("--budgets", "3%,1%", "--output", copied / "new")
+    options = ("--grid", "budget=3%,1%", "--output", copied / "new")
     outcome = again(run, copied, *options)
     assert outcome.code == 5
     last = outcome.err.splitlines()[-1]
@@ -195,7 +184,17 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
     bad = Path(shutil.copytree(copied / "room", copied / "bad"))
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
     outcome = run(
-        "chart", bad, copied / "room", "--output", copied / "out", *CHART_TARGETS, *CHART_FAST, "--quiet", code=5
+        "lab",
+        "chart",
+        bad,
+        copied / "room",
+        "--output",
+        copied / "out",
+        *CHART_TARGETS,
+        *CHART_FAST,
+        *NO_PROXIES,
+        "--quiet",
+        code=5,
     )
     assert names(outcome.err, "3 of 3", "bad/input")
     assert outcome.err.count("\n") == 1
@@ -203,7 +202,7 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
 
 @pytest.mark.slow
 def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) -> None:
-    outcome = again(run, copied, "--views", "2,9", "--json")
+    outcome = again(run, copied, "--grid", "views=2,9", "--grid", "budget=1%,2%", "--json")
     assert outcome.code == 0
     document = json.loads(outcome.out)
     assert document["num_done"] == 3
@@ -213,33 +212,23 @@ def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) ->
 
 def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
     before = listing(copied)
-    outcome = again(run, copied, "--budgets", "1%,5%", "--dry-run")
+    outcome = again(run, copied, "--grid", "budget=1%,5%", "--dry-run")
     assert outcome.code == 0
     assert f"{copied / 'room'} -> {copied / 'out'}/room/gsmerge, budget 5%" in outcome.out
     assert "budget 1%" not in outcome.out
     assert f"{copied / 'out'}: 1 of 3 runs" in outcome.out
     assert listing(copied) == before
-    assert run("chart", copied / "room", "--output", copied / "none", "--dry-run").code == 0
+    assert run("lab", "chart", copied / "room", "--output", copied / "none", "--dry-run").code == 0
     assert not (copied / "none").exists()
 
 
 def test_drawing_alone(copied: Path, run: Run) -> None:
     shutil.rmtree(copied / "out" / "charts")
     shutil.rmtree(copied / "room")
-    outcome = run("chart", "--draw-only", "--output", copied / "out", "--json")
+    outcome = run("lab", "chart", "--output", copied / "out", "--json")
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
     assert document["schema_version"] == 1
     assert (document["num_runs"], document["num_done"], document["num_failed"]) == (4, 0, 0)
     assert all(Path(path).stat().st_size > 1000 for path in document["charts"])
     assert Path(document["page"]).is_file()
-
-
-@pytest.mark.slow
-def test_a_grid_from_a_file(copied: Path, merges: list[CompactOptions], run: Run) -> None:
-    grid = copied / "grid.json"
-    grid.write_text('{"budgets": ["1%"], "superpixels": ["2%"], "fit": "none"}')
-    options = ("--grid", grid, "--proxy-views", 0, "--lpips", "none", "--json")
-    outcome = run("chart", copied / "room", "--output", copied / "out", *CHART_TARGETS, *options, code=0)
-    assert {settings.segment.superpixels for settings in merges} == {"2%"}
-    assert json.loads(outcome.out)["num_done"] == 1

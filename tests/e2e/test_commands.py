@@ -15,6 +15,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.measure.preview import BAND, GAP
 
 from .conftest import Run, listing
 
@@ -41,11 +42,10 @@ def test_compact_of_a_folder_does_not_take_its_own_output_for_the_input(small_co
 
 
 def test_json_report(scene_copy: Path, run: Run) -> None:
-    out, report = scene_copy / "small.ply", scene_copy / "report.json"
-    outcome = run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", "--report", report, code=0)
+    out = scene_copy / "small.ply"
+    outcome = run("compact", scene_copy, "-o", out, *SMALL, "--k", 2, "--seed", 3, "--json", code=0)
     assert outcome.err == ""
     document = json.loads(outcome.out)
-    assert document == json.loads(report.read_text())
     ply = scene_copy / "scene.ply"
     assert document["schema_version"] == 1
     assert document["tool"] == {"name": "gsmerge", "version": gsmerge.__version__}
@@ -117,17 +117,6 @@ def test_inspect_of_an_unaligned_file_is_no_error(compacted_scene: Path, run: Ru
     assert "pixel" in run("inspect", compacted_scene / "small.ply", code=0).out
 
 
-def test_superpixels(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("render", made_scene, "--as", "superpixels", "-o", tmp_path / "overlays", *SMALL, code=0)
-    assert "200 to 200 " in outcome.err
-    pictures = sorted((tmp_path / "overlays").iterdir())
-    assert len(pictures) == 3 * VIEWS
-    assert {cv2.imread(str(path)).shape for path in pictures} == {(HEIGHT, WIDTH, 3)}
-    photo = cv2.imread(str(made_scene / "images" / "view_000.png")).astype(float)
-    means = cv2.imread(str(tmp_path / "overlays" / "view_000.means.png")).astype(float)
-    assert np.abs(photo - means).mean() < 12  # the pictures belong to the views that they are named after
-
-
 def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
     cameras = made_scene / "transforms.json"
     run("render", made_scene / "scene.ply", "--cameras", cameras, "-o", tmp_path / "frames", code=0)
@@ -139,12 +128,13 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
         errors = [np.abs(photo - render).mean() for photo in photos]
         assert int(np.argmin(errors)) == i
         assert errors[i] < 20
-    run("render", made_scene, "-o", tmp_path / "alone", "--threads", 1, code=0)
-    run("render", made_scene, "-o", tmp_path / "two", "--threads", 2, code=0)
-    for path in (tmp_path / "alone").iterdir():
-        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
-    assert run("render", made_scene, "-o", tmp_path / "some", "--views", 2).code == 0
-    assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]
+    more = ("--views", 2, "--size", "64x64")
+    run("render", made_scene, made_scene / "scene.ply", "-o", tmp_path / "some", *more, code=0)
+    assert list(listing(tmp_path / "some")) == ["view_001.png", "view_003.png"]  # of two scenes, side by side
+    both = cv2.imread(str(tmp_path / "some" / "view_001.png"))
+    assert both.shape[1] >= 2 * 320
+    half = both.shape[1] // 2 - 2
+    assert (both[22:, :half] == both[22:, half + 4 :]).all()
 
 
 @pytest.mark.parametrize(("hint", "width"), [((), 1920), (("--hint", "max_side=1200"), 1200)])
@@ -157,7 +147,8 @@ def test_pictures_of_views_are_as_large_as_asked(
         for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             document[name] *= 20
     call = ("render", scene_copy / "scene.ply", "-o", tmp_path / "out", "--hint", "order=none", *hint)
-    assert json.loads(run(*call, "--dry-run", "--json", code=0).out)["width"] == width
+    document = json.loads(run(*call, "--views", 1, "--json", code=0).out)
+    assert document["width"] == width == cv2.imread(document["pictures"][0]).shape[1]
 
 
 def test_panel(scene_copy: Path, run: Run) -> None:
@@ -170,6 +161,20 @@ def test_panel(scene_copy: Path, run: Run) -> None:
     alone = scene_copy / "alone.png"  # in the frame, and with the photos, of what it was compacted from
     assert run("render", scene_copy / "scene.compact.ply", "-o", alone, "--views", 1).code == 0
     assert 2 * WIDTH <= cv2.imread(str(alone)).shape[1] < sheet.shape[1]
+
+
+def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(scene_copy: Path, run: Run) -> None:
+    out, call = scene_copy / "wide.jpg", ("render", scene_copy, "--views", 1, "--size", "480x160")
+    run(*call, "-o", out, code=0)
+    assert out.read_bytes()[:2] == b"\xff\xd8"
+    sheet = cv2.imread(str(out)).astype(float)
+    assert sheet.shape == (2 * (160 + BAND) + GAP, 2 * 480 + GAP, 3)
+    photo, view = sheet[BAND : BAND + 160, :480], sheet[BAND : BAND + 160, 480 + GAP :]
+    whole = cv2.imread(str(scene_copy / "images" / "view_002.png"))
+    whole = cv2.resize(whole, (480, 320), interpolation=cv2.INTER_CUBIC)
+    run(*call, "-o", scene_copy / "views", code=0)
+    alone = cv2.imread(str(scene_copy / "views" / "view_002.png"))
+    assert [np.abs(photo - whole[80:240]).mean() < 4, np.abs(view - alone).mean() < 4] == [True, True]
 
 
 def test_a_view_of_one_scene(small_copy: Path, run: Run) -> None:

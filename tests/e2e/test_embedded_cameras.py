@@ -1,4 +1,4 @@
-"""``compact --embed-cameras``: a result that needs no other file to be looked at, measured, compacted or extended."""
+"""A file that holds its cameras needs no other to be looked at, measured, compacted or extended."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bare_files import write_without_grid
+from saved_cameras import embed
 from sweeps import sweep
 
 import gsmerge
 from gsmerge.io import read_cameras
 from gsmerge.scene.read import load_scene
 
-from .conftest import Run, assert_refused
+from .conftest import Run
 
 FAST = ("--effort", "draft", "--set", "fit_steps=5", "--threads", 1)
 
@@ -26,8 +26,11 @@ def alone(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from gsmerge.cli import main
 
     folder = tmp_path_factory.mktemp("alone")
-    call = ["compact", small_scene, "-o", folder / "small.ply", *FAST, "--embed-cameras", "--levels", 2]
+    call = ["compact", small_scene, "-o", folder / "small.ply", *FAST, "--levels", 2]
     assert main([str(word) for word in [*call, "--set", "viewer_cameras=false", "--set", "superpixels=200", "-q"]]) == 0
+    scene = gsmerge.read_scene(small_scene)
+    for path in folder.glob("*.ply"):
+        embed(path, scene.cameras, scene.names)
     shutil.copytree(small_scene / "images", folder / "images")
     return folder
 
@@ -42,14 +45,6 @@ def test_the_cameras_are_those_of_the_scene(alone: Path, small_scene: Path) -> N
         assert np.array_equal(actual.scene.images, expected.images)
 
 
-def test_the_rows_are_the_same_with_and_without(alone: Path, small_scene: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "small.ply"
-    run("compact", small_scene, "-o", out, *FAST, "--levels", 2, "--set", "superpixels=200", code=0)
-    one, other = ((path / "small.ply").read_bytes() for path in (tmp_path, alone))
-    assert one.partition(b"end_header")[2] == other.partition(b"end_header")[2]
-    assert b"gsmerge cameras" not in one
-
-
 @sweep("command", ["compact", "evaluate", "view", "extend", "inspect", "render"], often=2)
 def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str) -> None:
     small, state = alone / "small.ply", tmp_path / "room.gsm"
@@ -57,7 +52,7 @@ def test_commands_read_them(alone: Path, tmp_path: Path, run: Run, command: str)
         "compact": (small, "-o", tmp_path / "x.ply", *FAST, "--budget", 100),
         "evaluate": (small, alone / "small.level1.ply", "--lpips", "none"),
         "view": (small, alone / "small.level1.ply", "-o", tmp_path / "x.html", "--no-open"),
-        "extend": (state, small, "--effort", "draft", "--set", "checkpoint=none", "--threads", 1),
+        "extend": (state, small, "--set", "effort=draft", "--set", "checkpoint=none"),
         "inspect": (small,),
         "render": (small, "-o", tmp_path / "x.png"),
     }
@@ -84,25 +79,3 @@ def test_named_cameras_go_before(alone: Path, small_scene: Path, run: Run) -> No
     said = run("inspect", alone / "small.ply", "--cameras", small_scene / "transforms.json", code=0)
     assert "transforms.json" in said.out
     assert len(read_cameras(alone / "small.ply")) == 5
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (("-o", "x.spz"), ".ply"),
-        (("-o", "x.ply", "--budget", "20KB"), "--budget"),
-    ],
-    ids=["spz", "bytes"],
-)
-def test_where_they_have_no_place_they_are_refused(
-    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert_refused(run("compact", small_scene, *options, "--embed-cameras"), 2, "--embed-cameras", said)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_scene_without_cameras_has_none_to_embed(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    bare = write_without_grid(small_scene / "scene.ply", tmp_path / "bare.ply")
-    call = ("compact", bare, "--embed-cameras")
-    assert_refused(run(*call), 2, "--embed-cameras", "cameras")

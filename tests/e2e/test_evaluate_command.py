@@ -14,7 +14,7 @@ from messages import ERROR, says
 
 import gsmerge
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 
 @pytest.fixture
@@ -53,27 +53,42 @@ def test_table_and_files(
 
 
 def test_other_sizes(scene_copy: Path, run: Run) -> None:
-    call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--no-context", "--lpips", "none")
-    outcome = run(*call, "--zoom", ".5,1,2", "--antialiased", "--json")
+    call = ("evaluate", scene_copy, "--targets", scene_copy / "targets", "--set", "context=false", "--lpips", "none")
+    outcome = run(*call, "--set", "zoom=.5,1,2", "--set", "antialiased=true", "--json")
     document = json.loads(outcome.out)
     sizes = document["results"][0]["mean"]["target"]["zooms"]
     assert [one["zoom"] for one in sizes] == [0.5, 1, 2]
     assert sizes[1]["psnr"] == document["results"][0]["mean"]["target"]["psnr"]
-    assert "PSNR 0.5x" in run(*call, "--zoom", ".5").out
+    assert "PSNR 0.5x" in run(*call, "--set", "zoom=.5").out
+
+
+@pytest.mark.parametrize("setting", ["context=false", "photo_side=48", "views=3"])
+def test_a_page_shows_what_was_measured(setting: str, scene_copy: Path, small: Path, run: Run) -> None:
+    page = scene_copy / "page.html"
+    call = ("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none", "-o", page)
+    if setting == "views=3":
+        call = (*call[:3], *call[5:])
+    document = json.loads(run(*call, "--set", setting, "--json", code=0).out)
+    split = "context" if setting == "views=3" else "target"
+    text = page.read_text()
+    assert f"{document['results'][1]['mean'][split]['psnr_visible']:.2f}" in text
+    shown = sum(document["num_views"].values())
+    assert text.count('"held_out":true') == document["num_views"].get("target", 0)
+    assert text.count('"held_out":') == shown + 1  # and the view from outside
 
 
 def test_photos_of_a_given_size(scene_copy: Path, small: Path, run: Run) -> None:
     call = ("evaluate", scene_copy, small, "--targets", scene_copy / "targets", "--lpips", "none")
-    document = json.loads(run(*call, "--photo-side", "48", "--speed", "--zoom", "1", "--json").out)
+    document = json.loads(run(*call, "--set", "photo_side=48", "--set", "speed=true", "--json").out)
     assert document["photo_side"] == 48
-    assert [speed["width"] for speed in document["results"][1]["speeds"]] == [48]
+    assert [speed["width"] for speed in document["results"][1]["speeds"]] == [48, 96]
     usual = json.loads(run(*call, "--json").out)
     assert "photo_side" not in usual
     assert usual["results"][1]["mean"] != document["results"][1]["mean"]
 
 
 def test_fewer_views(scene_copy: Path, run: Run) -> None:
-    outcome = run("evaluate", scene_copy, "--views", "3", "--lpips", "none", "--json")
+    outcome = run("evaluate", scene_copy, "--set", "views=3", "--lpips", "none", "--json")
     assert json.loads(outcome.out)["num_views"] == {"context": 3}
 
 
@@ -92,7 +107,7 @@ def test_a_trajectory_with_both_kinds_of_views(scene_copy: Path, run: Run) -> No
         frame["file_path"] = new
     trajectory = scene_copy / "all.json"
     trajectory.write_text(json.dumps(context | {"frames": frames}))
-    outcome = run("evaluate", scene_copy, "--targets", trajectory, "--views", "3", "--lpips", "none", "--json")
+    outcome = run("evaluate", scene_copy, "--targets", trajectory, "--set", "views=3", "--lpips", "none", "--json")
     document = json.loads(outcome.out)
     assert document["num_views"] == {"context": 3, "target": 2}
     held = [view["view"] for view in document["results"][0]["views"] if view["split"] == "target"]
@@ -105,22 +120,45 @@ def test_networks_that_are_not_installed(scene_copy: Path, run: Run, monkeypatch
     assert says(outcome.err.removeprefix(ERROR), "--lpips", "installed")
 
 
+def test_lpips_is_measured_with_alexnet_on_four_views(
+    scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = []
+    monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: True)
+    monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: looked.append(net) or 0.25)
+    monkeypatch.setattr("gsmerge.measure.lpips.min_size", lambda net: 1)
+    outcome = run("evaluate", scene_copy, "--json", code=0)
+    assert set(looked) == {"alex"}
+    document = json.loads(outcome.out)
+    assert document["lpips_views"] == 4
+    assert [view["lpips_alex"] for view in document["results"][0]["views"]].count(0.25) == 4
+    assert "LPIPS on 4 views" in run("evaluate", scene_copy).out
+    every = json.loads(run("evaluate", scene_copy, "--lpips", "both", "--set", "lpips_views=null", "--json").out)
+    assert "lpips_views" not in every
+    assert [view["lpips_vgg"] for view in every["results"][0]["views"]].count(0.25) == 5
+
+
 def test_costs_and_files_of_every_kind(scene_copy: Path, small: Path, run: Run) -> None:
     outputs = {suffix: scene_copy / f"page.{suffix}" for suffix in ("json", "csv", "md", "html")}
     flags = [part for path in outputs.values() for part in ("-o", path)]
     call = ("evaluate", scene_copy / "scene.ply", small, "--lpips", "none")
-    outcome = run(*call, *flags, "--zoom", "1,.5", "--merge-seconds", scene_copy / "run.json", code=0)
+    outcome = run(*call, *flags, "--set", "zoom=1,.5", "--set", f"merge_seconds={scene_copy / 'run.json'}", code=0)
     document = json.loads(outputs["json"].read_text())
     before, after = document["results"]
     assert [speed["width"] for speed in before["speeds"][:2]] == [96, 48]
     assert 1 < after["overdraw"] < before["overdraw"]
     assert after["merge_seconds"] == json.loads((scene_copy / "run.json").read_text())["total_seconds"]
     assert "| small.ply |" in outputs["md"].read_text()
-    assert "data:image/webp;base64," in outputs["html"].read_text()
+    page = outputs["html"].read_text()
+    assert "% of the Gaussians, " in page.replace("\u00a0", " ")
+    assert 'id="splats-1"' in page  # the page of view
     assert "Render time" in outcome.out
     assert "overdraw" not in run(*call).out
-    again = run(*call, "-o", outputs["md"])
-    assert (again.code, "--overwrite" in again.err) == (2, True)
+    run(*call, *flags, code=0)  # what it made is replaced
+    for path in outputs.values():
+        path.write_text("mine")
+        assert_refused(run(*call, "-o", path), 2, path, "exists already")
+        assert path.read_text() == "mine"
 
 
 def test_views_are_placed_in_a_scene_without_cameras(small_scene: Path, tmp_path: Path, run: Run) -> None:

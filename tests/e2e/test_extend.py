@@ -70,7 +70,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
-    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL, "--threads", 1)
+    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
     assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
     first, second = outcome.out.splitlines()
     assert "state.gsm: batch 1, 3 views, 4,608 Gaussians ->" in first
@@ -104,7 +104,19 @@ def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: 
 
 def test_settings_are_those_of_the_state(walks: list[Path], tmp_path: Path, run: Run) -> None:
     state = tmp_path / "state.gsm"
-    said = (*SMALL, "--set", "fit_colors=false", "--set", "tolerance=0", "--max-k", 2, "--set", "replay=2", "--seed", 5)
+    said = (
+        *SMALL,
+        "--set",
+        "fit_colors=false",
+        "--set",
+        "tolerance=0",
+        "--set",
+        "max_k=2",
+        "--set",
+        "replay=2",
+        "--set",
+        "seed=5",
+    )
     assert run("extend", state, walks[0], *said).code == 0
     first = load_state(state).about["options"]
     document = json.loads(run("extend", state, walks[1], "--json").out)["batches"][0]

@@ -1,4 +1,4 @@
-"""``gsmerge generate``, and its scenes in other commands."""
+"""``gsmerge lab generate``, and its scenes in other commands."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SMALL = ("--scenes", 2, "--views", "3", "--size", "48x36")
 def generated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two scenes. Read only."""
     folder = tmp_path_factory.mktemp("generate") / "made"
-    assert main(["generate", "-o", str(folder), *map(str, SMALL), "--quiet"]) == 0
+    assert main(["lab", "generate", "-o", str(folder), *map(str, SMALL), "--quiet"]) == 0
     return folder
 
 
@@ -31,7 +31,7 @@ def made(generated: Path, tmp_path: Path) -> Path:
 
 
 def test_scenes_are_made_and_counted(generated: Path, tmp_path: Path, run: Run) -> None:
-    outcome = run("generate", "-o", tmp_path / "made", *SMALL, code=0)
+    outcome = run("lab", "generate", "-o", tmp_path / "made", *SMALL, code=0)
     assert outcome.err == ""
     assert outcome.out == f"{tmp_path / 'made'}: 2 scenes\n"
     assert listing(tmp_path / "made") == listing(generated)
@@ -47,23 +47,36 @@ def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
 
 def test_a_second_call_keeps_and_adds(made: Path, run: Run) -> None:
     before = listing(made)
-    assert names(run("generate", "-o", made, *SMALL).out, "0 scenes", 2)
+    assert names(run("lab", "generate", "-o", made, *SMALL).out, "0 scenes", 2)
     assert listing(made) == before
-    more = json.loads(run("generate", "-o", made, *SMALL, "--scenes", 3, "--json").out)
+    more = json.loads(run("lab", "generate", "-o", made, *SMALL, "--scenes", 3, "--json").out)
     assert [scene["kept"] for scene in more["scenes"]] == [True, True, False]
     assert more["options"]["views"] == [3, 3]
 
 
 def test_scenes_of_other_settings_are_not_replaced(made: Path, run: Run) -> None:
     before = listing(made)
-    assert_refused(run("generate", "-o", made, *SMALL, "--seed", 1), 2, made / "scene_0000", "--overwrite")
+    assert_refused(run("lab", "generate", "-o", made, *SMALL, "--set", "seed=1"), 2, made / "scene_0000", "overwrite")
     assert listing(made) == before
 
 
 def test_ranges_and_noise_are_taken(tmp_path: Path, run: Run) -> None:
     ranges = tmp_path / "ranges.json"
     ranges.write_text('{"scale": [0.7, 0.7], "sh_degrees": [1]}')
-    run("generate", "-o", tmp_path / "made", *SMALL, "--scenes", 1, "--ranges", ranges, "--noise", 0, code=0)
+    run(
+        "lab",
+        "generate",
+        "-o",
+        tmp_path / "made",
+        *SMALL,
+        "--scenes",
+        1,
+        "--set",
+        f"ranges={ranges}",
+        "--set",
+        "noise=0",
+        code=0,
+    )
     record = json.loads((tmp_path / "made" / "scene_0000" / "generated.json").read_text())
     drawn = record["noise"]
     assert (drawn["scale"], drawn["sh_degree"], drawn["grain"]) == (0.7, 1, 0)
@@ -71,6 +84,7 @@ def test_ranges_and_noise_are_taken(tmp_path: Path, run: Run) -> None:
 
 def test_a_building_is_made_and_read(tmp_path: Path, run: Run) -> None:
     run(
+        "lab",
         "generate",
         "-o",
         tmp_path / "made",
@@ -80,8 +94,8 @@ def test_a_building_is_made_and_read(tmp_path: Path, run: Run) -> None:
         4,
         "--size",
         "48x36",
-        "--style",
-        "building",
+        "--set",
+        "style=building",
         code=0,
     )
     folder = tmp_path / "made" / "scene_0000"

@@ -1,6 +1,6 @@
 """Every hostile input ends in a result or in one clear line: in bounded time and memory, and nothing is executed.
 
-Each runs in a process of its own. What ``compact`` refuses, ``check`` refuses by the same line.
+Each runs in a process of its own. What ``compact`` refuses, ``inspect`` refuses by the same line.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import cv2
 import pytest
-from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_check, run_forked
+from forked_commands import FAILED, CommandServer, Limits, Outcome, refused_by_inspect, run_forked
 from hostile import CASES, MARKER
 from messages import ERROR, names
 from sweeps import sweep
@@ -27,7 +27,7 @@ FREE_SECONDS, SECONDS_PER_BYTE = 5, 2e-6
 SANITIZED = "libasan" in os.environ.get("LD_PRELOAD", "")  # which keeps what is freed
 MEMORY_MARGIN, SECONDS_MARGIN = 20 if SANITIZED else 2, 10  # a scene is read and placed; a slow machine
 MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more than a machine has
-OPTIONS = {"-o", "--images"}  # what they name is nothing for ``check``
+OPTIONS = {"-o", "--images"}  # what they name is nothing for ``inspect``
 FOR_OTHER_REASONS = ("nothing where the scene was", "the ply as cameras")  # sound files of another kind than expected
 SLOW = ("transforms.json: 3000 frames", "glb: nodes in one another")  # seconds of processor time
 FEW = 12  # of a kind, all of which are in the default run
@@ -103,7 +103,7 @@ def test_hostile_input_is_read_or_refused_in_one_line(name: str, scene: Path, se
         files = [argument for argument in arguments if argument != "--cameras"]
         check = server.run(["inspect", "--quiet", "--", *files], limits(num_bytes))
         within_budget(check, num_bytes)
-        refused_by_check(outcome, check)
+        refused_by_inspect(outcome, check)
 
 
 @sweep("name", ["ply: 600000 rows of one place", *list(CASES)[::9]], often=10)

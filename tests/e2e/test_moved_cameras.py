@@ -47,14 +47,15 @@ def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -
 
 
 def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) -> None:
-    """A compact scene that went elsewhere tells no frame by itself, without photos."""
+    """A compact scene without photos tells no frame by itself, and has that of the scene beside it."""
     elsewhere, alone = tmp_path / "small.ply", tmp_path / "cameras" / "transforms.json"
     alone.parent.mkdir()
     shutil.copy(moved_scene / "transforms.json", alone)
     assert run("compact", moved_scene, "--fit", "none", "-o", elsewhere, "--quiet").code == 0
     actual = {}
-    for name, more in (("own", ("--cameras", alone)), ("like", ("--frame-of", moved_scene))):
-        run("render", elsewhere, "-o", tmp_path / name, *more, code=0)
+    beside = Path(shutil.copy(elsewhere, moved_scene / "scene.compact.ply"))
+    for name, scene, more in (("own", elsewhere, ("--cameras", alone)), ("like", beside, ())):
+        run("render", scene, "-o", tmp_path / name, *more, code=0)
         actual[name] = psnr(tmp_path / name, moved_scene / "images")
     assert actual["like"] > actual["own"] + 3
 

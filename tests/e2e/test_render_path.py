@@ -1,4 +1,4 @@
-"""`render --path`: videos and frames along a path, of one scene or several side by side."""
+"""Clips of `render`: videos, GIFs and frames along a path, of one scene, or of several under lines that move."""
 
 from __future__ import annotations
 
@@ -34,16 +34,14 @@ def error(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.abs(one.astype(float) - other).mean())
 
 
-@sweep(("kind", "name"), [("orbit", "walk.mp4"), ("orbit:45", "a.mp4"), ("spline", "walk.webm")])
+@sweep(("kind", "name"), [("orbit", "a.mp4"), ("turntable", "a.gif"), ("spline", "a.webm")])
 def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     call = ("render", made_scene, "--path", kind, "--frames", 8)
-    outcome = run(*call, "-o", tmp_path / name, "--fps", 4, code=0)
-    assert says(outcome.err.splitlines()[-1], tmp_path / name, "8 frames", f"{WIDTH} x {HEIGHT}", "2.0 s")
-    run(*call, "-o", tmp_path / "frames", "--threads", 1, code=0)
-    run(*call, "-o", tmp_path / "again", "--threads", 2, code=0)
+    outcome = run(*call, "-o", tmp_path / name, code=0)
+    seconds = "0.6 s" if name.endswith(".gif") else "0.3 s"
+    assert says(outcome.err.splitlines()[-1], tmp_path / name, "8 frames", f"{WIDTH} x {HEIGHT}", seconds)
+    run(*call, "-o", tmp_path / "frames", code=0)
     assert list(listing(tmp_path / "frames")) == [f"frame_{i:05d}.png" for i in range(8)]
-    for path in (tmp_path / "frames").iterdir():
-        assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes()
     drawn = [cv2.imread(str(path)) for path in sorted((tmp_path / "frames").iterdir())]
     shown = read(tmp_path / name)
     assert [picture.shape for picture in shown] == [(HEIGHT, WIDTH, 3)] * 8
@@ -68,20 +66,60 @@ def test_a_folder_may_have_the_name_of_a_path(
     assert list(listing(tmp_path / "orbit")) == ["frame_00000.png", "frame_00001.png"]
 
 
-def test_scenes_are_side_by_side(scene_copy: Path, tmp_path: Path, run: Run) -> None:
-    scene = scene_copy / "scene.ply"
-    shutil.copy(scene, tmp_path / "small.ply")
-    video = tmp_path / "both.mp4"
-    document = json.loads(
-        run("render", scene, tmp_path / "small.ply", "--path", "orbit", "--frames", 3, "-o", video, "--json").out
-    )
-    assert document["scenes"] == {str(scene): 30720, str(tmp_path / "small.ply"): 30720}
-    assert (document["frames"], document["fps"], document["pictures"]) == (3, 30, [str(video)])
-    for picture in read(video):
-        half = picture.shape[1] // 2 - 2
-        assert half >= 320
-        assert error(picture[22:, :half], picture[22:, half + 4 :]) < 3
-        assert picture[22:].std() > 10
+def test_a_line_moves_between_two_scenes(scene_copy: Path, tmp_path: Path, run: Run) -> None:
+    """Left of it is the first, right of it the second, each with its caption; it starts in the middle."""
+    scene, dark = scene_copy / "scene.ply", tmp_path / "dark.ply"
+    gaussians = gsmerge.read_ply(scene).gaussians[::2]
+    gsmerge.write_ply(dark, replace(gaussians, sh0=gaussians.sh0 * 0 - 3, shN=gaussians.shN * 0))
+    call = ("render", scene, dark, "--path", "orbit", "--frames", 8, "--size", "320x240")
+    document = json.loads(run(*call, "-o", tmp_path / "a.mp4", "--json", code=0).out)
+    assert document["scenes"] == {str(scene): 30720, str(dark): 15360}
+    assert (document["frames"], document["fps"], document["pictures"]) == (8, 30, [str(tmp_path / "a.mp4")])
+    run(*call, "-o", tmp_path / "frames", code=0)
+    run("render", scene, *call[3:], "-o", tmp_path / "alone", code=0)
+    places = []
+    for i, shown in enumerate(read(tmp_path / "a.mp4")):
+        frame, alone = (cv2.imread(str(tmp_path / name / f"frame_{i:05d}.png")) for name in ("frames", "alone"))
+        assert frame.shape == shown.shape == (240, 320, 3)
+        assert error(frame, shown) < 12
+        above = frame[:180].astype(float)  # the captions
+        places.append(min(place for place in range(320) if (above[:, place] == 255).all()))
+        assert (above[:, : places[-1] - 2] == alone[:180, : places[-1] - 2]).all()
+        assert above[:, places[-1] + 6 :].max() < 30
+    assert places[0] == pytest.approx(160, abs=2)
+    assert places[2] == max(places) > 290
+    assert places[6] == min(places) < 30
+    captions = cv2.imread(str(tmp_path / "frames" / "frame_00000.png"))[190:]
+    assert [int((half > 200).sum()) > 300 for half in (captions[:, :150], captions[:, 170:])] == [True, True]
+
+
+def test_captions_of_files_of_one_name_have_their_folders(
+    scene_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr("gsmerge.measure.drawings.make_captions", lambda texts, *_: asked.append(texts) or [])
+    monkeypatch.setattr("gsmerge.measure.drawings.draw_swipe", lambda pictures, *_: pictures[0])
+    scene, other = scene_copy / "scene.ply", tmp_path / "other" / "scene.ply"
+    other.parent.mkdir()
+    shutil.copy(scene, other)
+    run("render", scene, other, "--frames", 2, "-o", tmp_path / "a.gif", code=0)
+    run("render", scene, other.rename(other.with_name("b.ply")), "--frames", 2, "-o", tmp_path / "b.gif", code=0)
+    assert [[text[0] for text in texts] for texts in asked] == [
+        [f"{scene_copy.name}/scene.ply", "other/scene.ply"],
+        ["scene.ply", "b.ply"],
+    ]
+    assert asked[0][0][1:] == ("30,720 Gaussians", f"{scene.stat().st_size / 1e6:.1f} MB")
+
+
+def test_a_clip_is_an_orbit_by_default(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    document = json.loads(run("render", made_scene, "-o", tmp_path / "a.gif", "--frames", 2, "--json", code=0).out)
+    assert (document["path"], document["fps"], document["encoding"]) == ("orbit", 12.5, "GIF")
+    assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
+
+
+def test_a_turntable_beyond_the_photos_is_said(made_scene: Path, tmp_path: Path, run: Run) -> None:
+    said = run("render", made_scene, "--path", "turntable", "--frames", 4, "-o", tmp_path / "out", code=0).err
+    assert names(said, "degrees about the scene's middle", "--path orbit")
 
 
 def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -100,8 +138,8 @@ def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tm
     for i, picture in enumerate(drawn):
         errors = [error(picture, photo) for photo in photos]
         assert errors[i] == min(errors) < 20
-    some = run("render", scene_copy, "--path", targets, "--views", 2, "-o", tmp_path / "x.mp4", "--dry-run", code=0)
-    assert names(some.out, "x.mp4", "2 frames", f"{WIDTH} x {HEIGHT}", "0.1 s")
+    some = run("render", scene_copy, "--path", targets, "--views", 2, "-o", tmp_path / "x.mp4", code=0)
+    assert names(some.err, "x.mp4", "2 frames", f"{WIDTH} x {HEIGHT}", "0.1 s")
 
 
 def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -114,14 +152,19 @@ def test_a_scene_without_cameras_takes_those_of_the_path(scene_copy: Path, tmp_p
     assert len(read(tmp_path / "x.mp4")) == 2
 
 
-def test_frames_too_large_for_a_video_go_to_a_folder(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    shutil.copy(made_scene / "transforms.json", tmp_path / "path.json")
-    with edited_json(tmp_path / "path.json") as data:
-        data["w"], data["h"] = 4096, 4096
-    call = ("render", made_scene, "--path", tmp_path / "path.json", "--dry-run")
-    outcome = run(*call, "-o", tmp_path / "a.mp4", code=3)
-    assert says(outcome.err.removeprefix(ERROR), tmp_path / "a.mp4", "8,388,608", "4096 x 4096", "folder")
-    run(*call, "-o", tmp_path / "out", code=0)
+@pytest.mark.parametrize(
+    ("name", "more", "parts"),
+    [
+        ("a.mp4", ("--size", "4096x4096"), ("8,388,608", "4096 x 4096", "folder")),
+        ("a.gif", ("--size", "1920x1080", "--frames", 100), ("134,217,728", "100 x 1920 x 1080", ".mp4")),
+    ],
+)
+def test_clips_too_large_for_the_memory_are_refused(
+    name: str, more: tuple[object, ...], parts: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    outcome = run("render", made_scene, "-o", tmp_path / name, *more, code=3)
+    assert says(outcome.err.removeprefix(ERROR), tmp_path / name, *parts)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path, run: Run) -> None:
@@ -135,9 +178,9 @@ def test_one_camera_has_an_orbit_but_no_spline(made_scene: Path, tmp_path: Path,
 def test_frames_grow_with_the_views_of_a_spline(
     made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.measure.drawings.PATH_FRAMES", 12)
+    monkeypatch.setattr("gsmerge.measure.drawings.SECONDS", {"spline": 0.4, "orbit": 0.4})
     for kind, count in (("spline,back:0.5", 20), ("orbit", 12)):
-        outcome = run("render", made_scene, "--path", kind, "-o", tmp_path / "x", "--dry-run", "--json", code=0)
+        outcome = run("render", made_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
         assert json.loads(outcome.out)["frames"] == count
 
 

@@ -65,7 +65,7 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     assert len(json.loads((tmp_path / "place.cameras.json").read_text())) == 3  # one for both layers of a view
     inside = tmp_path / "inside" / "place.ply"
     inside.parent.mkdir()
-    more = ("--embed-cameras", "--set", "viewer_cameras=false", *FIT[:-1], 2, "-q")
+    more = (*FIT[:-1], 2, "-q")
     run(*words, "-o", inside, *more, code=0)
     assert inside.read_bytes().partition(b"end_header")[2] == out.read_bytes().partition(b"end_header")[2]
     scores = json.loads(run("evaluate", inside, "--images", sharp / "photos", "--json", "--lpips", "none", code=0).out)

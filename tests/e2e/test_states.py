@@ -64,19 +64,14 @@ def test_mixed_k_in_other_shares(state: Path, made_scene: Path, tmp_path: Path, 
 
 @sweep(
     "wish",
-    [
-        ("--budget", 700, "--k", 2),
-        ("--k", "mixed"),
-        ("--budget", "auto"),
-        ("--set", "recipe=paper"),
-        ("--budget", "3%"),
-    ],
+    [("budget=700", "k=2"), ("k=mixed",), ("budget=auto",), ("recipe=paper",), ("budget=3%",)],
     ids=str,
     often=3,
 )
 def test_what_the_batch_was_asked_for_is_the_default(
-    wish: tuple[str | int, ...], made_scene: Path, tmp_path: Path, run: Run
+    wish: tuple[str, ...], made_scene: Path, tmp_path: Path, run: Run
 ) -> None:
+    wish = tuple(word for pair in wish for word in ("--set", pair))
     kept, one, other = tmp_path / "scene.gsm", tmp_path / "one.ply", tmp_path / "other.ply"
     assert run("extend", kept, made_scene, *SMALL, *wish).code == 0
     assert run("compact", kept, *PLAIN, "-o", one).code == 0
@@ -154,7 +149,7 @@ def test_comments_of_the_source_are_copied_as_by_compact(state: Path, tmp_path: 
     run("inspect", out, code=0)
 
 
-@sweep("ending", [".compressed.ply", ".spz", ".sog", ".splat", ".glb"], often=2)
+@sweep("ending", [".spz", ".sog", ".splat", ".glb"], often=2)
 def test_other_formats_by_name(ending: str, state: Path, made_scene: Path, tmp_path: Path, run: Run) -> None:
     one, other = tmp_path / f"one{ending}", tmp_path / f"other{ending}"
     assert run("compact", state, *PLAIN, "-o", one).code == 0
@@ -164,7 +159,7 @@ def test_other_formats_by_name(ending: str, state: Path, made_scene: Path, tmp_p
     assert not one.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment opacity")
 
 
-@sweep("ending", [".sog", ".compressed.ply", ".spz", ".splat"])
+@sweep("ending", [".sog", ".spz", ".splat"])
 def test_results_are_read_in_any_format(ending: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / f"a{ending}"
     assert run("compact", made_scene, "--fit", "none", *SMALL, "-o", out).code == 0

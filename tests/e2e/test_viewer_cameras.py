@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,28 @@ def test_a_second_format_shares_them(small_copy: Path, run: Run, tmp_path: Path)
     assert (out / "a.cameras.json").read_bytes() == before
 
 
+@pytest.mark.parametrize("names", [("a.ply", "a.sog"), ("b.spz", "b.glb", "b.splat", "b.ply", "a.ply")])
+def test_conversions_beside_a_result_share_its_cameras(
+    small_copy: Path, run: Run, tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    """Reading and writing them again may change their last digits, and is no reason to refuse."""
+    run("compact", small_copy, "-o", tmp_path / names[0], *QUICK, "-q", code=0)
+    beside = (tmp_path / names[0]).with_suffix(".cameras.json")
+    before = beside.read_text()
+    for source, output in pairwise(names):
+        run("convert", tmp_path / source, tmp_path / output, "-q", code=0)
+    assert beside.read_text() == before
+    assert_same_cameras(beside, (tmp_path / names[-1]).with_suffix(".cameras.json"))
+    done = run("convert", tmp_path / names[0], tmp_path / "a.spz", "--scale", 2)
+    assert says(done.err.removeprefix(ERROR), "a.cameras.json", "other cameras", "--overwrite")
+
+
+def assert_same_cameras(first: Path, second: Path) -> None:
+    one, other = (gsmerge.read_cameras(path) for path in (first, second))
+    assert one.names == other.names
+    np.testing.assert_allclose(one.viewmats, other.viewmats, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("output", "expected"),
     [
@@ -119,7 +142,7 @@ def test_a_folder_with_a_result_and_its_cameras_needs_no_options(small_copy: Pat
     for place in (out, out / "small.ply"):
         facts = json.loads(run("inspect", place, "--json", code=0).out)
         assert (facts["cameras"], facts["num_views"]) == (str(out / "small.cameras.json"), count)
-    run("render", out, "--as", "views", "-o", tmp_path / "pictures", code=0)
+    run("render", out, "-o", tmp_path / "pictures", code=0)
     assert len(list((tmp_path / "pictures").iterdir())) == count
     document = json.loads(run("evaluate", out, "--lpips", "none", "--json", code=0).out)
     assert document["num_views"]["context"] == count

@@ -66,9 +66,9 @@ def test_as_good_as_with_photos(
 
 
 def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
-    out, report = tmp_path / "small.ply", tmp_path / "report.json"
-    said = run("compact", bare, "-o", out, *QUICK, "--report", report, code=0)
-    psnr = json.loads(report.read_text())["psnr_input_views"]
+    out = tmp_path / "small.ply"
+    psnr = json.loads(run("compact", bare, "-o", out, *QUICK, "--json", code=0).out)["psnr_input_views"]
+    said = run("compact", bare, "-o", out, *QUICK, "--overwrite", code=0)
     assert psnr["after"] > psnr["before"] + 1
     assert f"dB against {ROW_COLORS}" in said.out
     assert NO_PHOTOS in said.err

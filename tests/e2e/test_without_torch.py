@@ -33,8 +33,8 @@ COMMANDS = {
     "view": ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
     "evaluate": ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.html"),
     "render": ("render", "scene", "small.ply", "-o", "new.png"),
-    "chart": ("chart", "scene", "--budgets", "5%", "--fit", "none", "--proxy-views", "1", "-o", "new"),
-    "generate": ("generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
+    "chart": ("lab", "chart", "scene", "--grid", "budget=5%", "--set", "fit=none", "-o", "new"),
+    "generate": ("lab", "generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
 }
 OFTEN = ("compact with networks",)  # the others are in the sweep
 
@@ -91,7 +91,7 @@ def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
     rows = np.concatenate([np.tile([*head, 0, 0], (len(w2c), 1)), w2c[:, :3].reshape(-1, 12)], 1)
     torch.save([{"key": "scene", "cameras": torch.from_numpy(rows).float()}], scene / "a.torch")
     (scene / "transforms.json").unlink()
-    done = call("-m", "gsmerge", "inspect", "scene", "--json")
+    done = call("-m", "gsmerge", "inspect", "scene/a.torch", "--json")
     assert done.returncode == 0, done.stderr
     assert "re10k chunk" in done.stdout
 
@@ -118,7 +118,7 @@ def test_lpips_needs_no_torch(call: Call, tmp_path: Path) -> None:
 
 
 def test_training_says_how_to_install_it(call: Call) -> None:
-    done = call("-m", "gsmerge", "train", "--data", "scene", "-o", "run")
+    done = call("-m", "gsmerge", "lab", "train", "--data", "scene", "-o", "run")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert TORCH_INSTALL in done.stderr
 

@@ -19,7 +19,7 @@ from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
-FEW = ("--budget", 30, "--fit", "none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
+FEW = ("--budget", 30, "--set", "fit=none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
 SAID = "worse"
 
 
@@ -80,8 +80,8 @@ def test_several_cameras_change_no_k(small_scene: Path) -> None:
 
 def test_a_worse_result_is_named(made_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
-    said = run("compact", made_scene, "-o", out, *FEW, "--report", tmp_path / "report.json", code=0)
-    document = json.loads((tmp_path / "report.json").read_text())
+    said = run("compact", made_scene, "-o", out, *FEW, code=0)
+    document = json.loads(run("compact", made_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
     psnr = document["psnr_input_views"]
     assert psnr["after"] < psnr["before"] - 0.5
     assert names(document["worse"], f"{psnr['after']:.2f} dB", f"{psnr['before']:.2f} dB")

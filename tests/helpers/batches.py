@@ -19,7 +19,7 @@ from gsmerge.settings.compact import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
 PATIENCE = 180  # seconds, on a machine that is busy with other things
-FAST = ("--effort", "draft", "--fit", "none")
+FAST = ("--effort", "draft", "--set", "fit=none")
 QUICK = BatchOptions(CompactOptions().with_settings({"effort": "draft", "fit": "none", "threads": 1}))
 
 

@@ -51,8 +51,8 @@ class Outcome:
         return "".join(line for line in lines if line.startswith(ours) or "Warning: " in line)
 
 
-def refused_by_check(refusal: Outcome, outcome: Outcome) -> None:
-    """Check that ``gsmerge check`` ended with the cause by which another command refused."""
+def refused_by_inspect(refusal: Outcome, outcome: Outcome) -> None:
+    """Check that ``gsmerge inspect`` ended with the cause by which another command refused."""
     cause = refusal.error.removeprefix(ERROR).strip()
     assert outcome.code == 3, f"{cause}: {outcome.out}"
     place, _, problem = cause.partition(": ")

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .case import EITHER, READ, USAGE, Case, Spoil, remove
+from .case import EITHER, READ, Case, Spoil, remove
 
 
 def renamed(name: str) -> Spoil:
@@ -168,7 +168,6 @@ CASES |= {
     "a spz of a million equal points and one": Case(equal_points),
     "output in a file": Case(given("-o", "{}/scene.ply/a.ply")),
     "output below a file": Case(given("-o", "{}/transforms.json/a.ply")),
-    "report is the output": Case(given("-o", "{}/a.ply", "--report", "{}/a.ply"), USAGE),
     "a device as the scene": Case(lambda folder: ["/dev/zero"]),
     "nothing as the scene": Case(lambda folder: ["/dev/null"]),
     "a device as cameras": Case(given("--cameras", "/dev/zero")),

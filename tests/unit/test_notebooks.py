@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import gc
+import html
+import pickle
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +67,44 @@ def test_results_show_their_report_and_a_picture(scene: gsmerge.Scene, result: g
     photo = 255 * scene.images[len(scene) // 2]
     assert picture.shape == photo.shape
     assert np.abs(picture - photo).mean() < 32
+
+
+def test_a_result_shows_its_scene_beside_it(
+    scene: gsmerge.Scene, result: gsmerge.CompactResult, tmp_path: Path
+) -> None:
+    page = result.show()
+    assert re.match(r"Page\(0.98 % of the Gaussians, \d.\d dB closer to the photos, \d", repr(page))
+    shown = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*" allowfullscreen></iframe>', page._repr_html_())
+    assert shown is not None
+    assert html.unescape(shown[1]) == page.text
+    assert page.text.count('class="card"') >= len(scene)
+    path = page.save(tmp_path / "page.html")
+    assert path.read_text(encoding="utf-8") == page.text
+    with pytest.raises(gsmerge.SceneError, match="exists already"):
+        page.save(path)
+
+
+def test_a_result_does_not_keep_its_scene(made_scene: Path, result: gsmerge.CompactResult) -> None:
+    copy = pickle.loads(pickle.dumps(result))
+    assert repr(copy.show()).startswith("Page(300 Gaussians")  # alone: the other process has no scene
+    assert "dB closer" in repr(copy.show(made_scene)) or "dB farther" in repr(copy.show(made_scene))
+    other = gsmerge.compact(made_scene, effort="draft", budget=300)
+    assert other.scene == made_scene
+    held = gsmerge.compact(gsmerge.read_scene(made_scene), effort="draft", budget=300)
+    gc.collect()
+    assert not isinstance(held.scene, str | Path)
+    assert held.scene is not None
+    assert held.scene() is None
+
+
+def test_views_are_of_paths_gaussians_and_results(made_scene: Path, scene: gsmerge.Scene, tmp_path: Path) -> None:
+    few = scene.gaussians[::10]
+    gsmerge.write_ply(tmp_path / "few.ply", few)
+    pages = [gsmerge.view(made_scene, {"few": one}) for one in (few, tmp_path / "few.ply")]
+    assert repr(pages[0]).split(",")[:2] == repr(pages[1]).split(",")[:2]
+    assert "few" in pages[0].text
+    alone = gsmerge.view(gsmerge.Scene(few, scene.cameras[[]], None, None, ()))
+    assert repr(alone).startswith(f"Page({len(few):,} Gaussians")
 
 
 def test_notes_cannot_leave_their_cells(result: gsmerge.CompactResult) -> None:

@@ -15,7 +15,7 @@ from gsmerge.compaction.estimate import estimate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
-from gsmerge.plan import EFFORTS, Plan, choose_for_scene, choose_networks, make_plan, resolve_fit, steps_for
+from gsmerge.plan import EFFORTS, KEPT_PSNR, Plan, choose_for_scene, choose_networks, make_plan, resolve_fit, steps_for
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES
 
@@ -167,11 +167,30 @@ def test_what_no_view_sees_takes_its_share_of_a_budget(scene: Scene) -> None:
     assert len(plan_of(hidden, budget=400).unseen) == 0
 
 
-@pytest.mark.parametrize(("settings", "reason"), [({"quality": "20dB"}, "quality"), ({"drop": "sky"}, "drop sky")])
+@pytest.mark.parametrize(("settings", "reason"), [({"quality": "-1dB"}, "35dB"), ({"drop": "sky"}, "drop sky")])
 def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason: str, scene: Scene) -> None:
     """Where no pixel is known, whose colour could stand in."""
     with pytest.raises(UsageError, match=reason):
         plan_of(unaligned_scenes.without_order(replace(scene, images=None)), **settings)
+
+
+@pytest.mark.parametrize("settings", [{}, {"budget": "auto"}, {"effort": "draft"}, {"crop": "sphere:0,0,0,1"}], ids=str)
+def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
+    rows = unaligned_scenes.without_order(replace(scene, images=None))
+    kept = plan_of(rows, **settings)
+    assert (kept.target_psnr, kept.keeps_psnr) == (KEPT_PSNR, True)
+    assert len(kept.scored_views) == len(rows)
+    assert estimate(rows, options_of(**settings))["psnr_kept"] == KEPT_PSNR
+    assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
+
+
+@pytest.mark.parametrize("settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}], ids=str)
+def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene) -> None:
+    rows = unaligned_scenes.without_order(replace(scene, images=None))
+    assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
+    assert not plan_of(rows, **settings).keeps_psnr
+    for known in (scene, unaligned_scenes.without_order(scene), replace(scene, images=None)):
+        assert plan_of(known).target_psnr is None
 
 
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
@@ -209,6 +228,13 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     settings = options_of(effort="draft")
     settled = choose_for_scene(measure_size(scene), settings).settings(settings)
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
+
+
+def test_a_scene_without_pixels_and_photos_is_planned_as_it_is_fitted(scene: Scene) -> None:
+    bare = replace(unaligned_scenes.without_order(scene), images=None)
+    options = options_of(budget=200, fit_steps=9)
+    run, made = estimate(bare, options), compact(bare, options).report.options
+    assert (run["fit"], run["fit_steps"]) == (made["fit"], made["fit_steps"]) == ("full", 9)
 
 
 SETTLED = [{}, {"budget": 200}, {"budget": "3%", "effort": "fast"}, {"budget": "30kB", "effort": "draft"}]

@@ -6,6 +6,7 @@ import io
 import pytest
 
 from gsmerge import report
+from gsmerge.report import text_table
 from gsmerge.runtime.memory import human_bytes
 
 
@@ -22,3 +23,19 @@ def test_text_in_tables_is_no_formula() -> None:
     rows = csv.DictReader(io.StringIO(report.csv_text(["name", "count"], [{"name": x, "count": -1} for x in text])))
     actual = [(row["name"], row["count"]) for row in rows]
     assert actual == [(f"'{x}" if x != "plain-1.ply" else x, "-1") for x in text]
+
+
+def test_tables_leave_out_columns_that_a_terminal_has_no_room_for() -> None:
+    rows = [("result", "Gaussians", "of", "dB"), ("room/small.ply", "52,038", "1,182,720", "28.36")]
+    whole = ["result          Gaussians         of     dB", "room/small.ply     52,038  1,182,720  28.36"]
+    assert text_table(rows) == text_table(rows, columns=43) == whole
+    assert text_table(rows, columns=42, least=(2,)) == [
+        "result          Gaussians     dB",
+        "room/small.ply     52,038  28.36",
+    ]
+    assert text_table(rows, columns=42) == [
+        "result          Gaussians         of",
+        "room/small.ply     52,038  1,182,720",
+    ]
+    assert text_table(rows, "  ", columns=25) == ["  result        Gaussians", "  room/....ply     52,038"]
+    assert text_table(rows, columns=3)[1] == "room/....ply     52,038"  # the first two always

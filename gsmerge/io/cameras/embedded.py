@@ -4,48 +4,26 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
-import textwrap
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from plyfile import PlyListProperty
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, check_file, parse_json, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.cameras.json_files import transforms_document, transforms_views
+from gsmerge.io.cameras.json_files import transforms_views
 from gsmerge.io.formats.ply import MAX_HEADER_BYTES
 from gsmerge.io.formats.table import PLY, input_format
-from gsmerge.types import Cameras
 
 EMBEDDED = "inside the .ply"  # source of such cameras
 PREFIX = "gsmerge cameras: "
-LINE = 900  # characters of a comment: readers in C keep lines of 1,024
-MAX_CHARS = 96 << 10  # of all: splat-transform looks for the end of a header in 128 KiB
 _TEXT_COPIES = 8  # bytes of memory for each of unpacked JSON: as it comes, and four for each character
-DIGITS = 10  # of each number: 1e-9 of a pixel or of the scene, in half the space of all
 SHARP = "SHARP"  # the same
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
-
-
-def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
-    """Write cameras as comments for a ``.ply``: a compressed ``transforms.json`` in base64.
-
-    UsageError if there are so many that other programs would not read the header.
-    """
-    text = json.dumps(transforms_document(cameras, names, digits=DIGITS), separators=(",", ":"))
-    packed = base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")
-    if len(packed) > MAX_CHARS:
-        raise UsageError(
-            f"--embed-cameras: expected at most {MAX_CHARS:,} characters in the header, got {len(packed):,} of"
-            f" {len(names):,} views; write them to a file with --save-cameras"
-        )
-    return [PREFIX + line for line in textwrap.wrap(packed, LINE)]
 
 
 def holds_cameras(path: Path) -> bool:

@@ -16,13 +16,11 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, normalize
 from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
 from gsmerge.io.cameras.camera_file import (
-    C2W_OPENGL,
     MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
     Lens,
     View,
     check_count,
-    from_viewmats,
     is_orthonormal,
     make_lens,
     make_pinhole,
@@ -322,29 +320,6 @@ def viewer_cameras_path(output: Path) -> Path:
     stem = name[: -len(".compressed.ply")] if name.lower().endswith(".compressed.ply") else output.stem
     stem = os.fsencode(stem)[: _MAX_NAME - len(VIEWER_CAMERAS)].decode("utf-8", "ignore")
     return output.with_name(stem + VIEWER_CAMERAS)
-
-
-def transforms_document(cameras: Cameras, names: Sequence[str], *, digits: int = 17) -> dict[str, Any]:
-    """Make nerfstudio's ``transforms.json`` with all intrinsics, rounded to ``digits`` significant digits."""
-
-    def rounded(value: float) -> float:
-        return float(f"{value:.{digits}g}")
-
-    poses = from_viewmats(cameras.viewmats.astype(np.float64), C2W_OPENGL)
-    frames = [
-        {
-            "file_path": name, "w": cameras.width, "h": cameras.height,
-            "fl_x": rounded(K[0, 0]), "fl_y": rounded(K[1, 1]), "cx": rounded(K[0, 2]), "cy": rounded(K[1, 2]),
-            "transform_matrix": [[rounded(value) for value in row] for row in pose],
-        }
-        for name, K, pose in zip(names, cameras.Ks, poses, strict=True)
-    ]  # fmt: skip
-    return {"camera_model": "PINHOLE", "frames": frames}
-
-
-def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras as nerfstudio's ``transforms.json``, with all intrinsics; :func:`read_transforms` reads it."""
-    path.write_text(json.dumps(transforms_document(cameras, names), indent=1) + "\n", encoding="utf-8")
 
 
 def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:

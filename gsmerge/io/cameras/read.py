@@ -183,5 +183,5 @@ CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy
     "": ("expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file",),
     ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),
-    ".ply": ("expected cameras inside it (compact --embed-cameras), found none", "name another file"),
+    ".ply": ("expected cameras inside it, found none", "name another file"),
 }

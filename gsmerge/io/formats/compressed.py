@@ -6,7 +6,6 @@ rotations as their three smaller components at 10 bits, colours and opacity at 8
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p
-from gsmerge.types import Gaussians
 
 CHUNK = 256  # Gaussians that share a range
 RANGES = (
@@ -27,7 +25,6 @@ RANGES = (
 COLORS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
 SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
 _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE  # of each byte
-MAX_DEGREE = 3  # of the harmonics that are written
 
 
 def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
@@ -94,44 +91,3 @@ def _shares(words: np.ndarray, bits: tuple[int, ...]) -> list[np.ndarray]:
         shifted = words >> np.uint32(sum(bits[i + 1 :]))
         out.append((shifted & np.uint32(2**width - 1)) / float(2**width - 1))
     return out
-
-
-def compressed_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.compressed.ply`` file along a space-filling curve; ValueError if there is NaN or inf."""
-    columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
-    count, num_rest = len(columns), 3 * columns.harmonics.shape[1]
-    ranged = [_ranged(values) for values in (columns.means, columns.log_scales, columns.colors)]
-    chunks = np.concatenate([end for low, high, _ in ranged for end in (low, high)], 1)
-    means, scales, colors = (shares for _, _, shares in ranged)
-    words = np.empty((count, 4), "<u4")
-    words[:, 0], words[:, 2] = _packed(means, (11, 10, 11)), _packed(scales, (11, 10, 11))
-    largest, smallest = arrays.smallest_three(columns.quats)
-    words[:, 1] = largest.astype(np.uint32) << np.uint32(30) | _packed(smallest / np.sqrt(2.0) + 0.5, (10, 10, 10))
-    words[:, 3] = _packed(np.concatenate([colors, columns.opacities[:, None]], 1), (8, 8, 8, 8))
-    harmonics = np.floor((columns.harmonics / SH_RANGE + 0.5) * 256).transpose(0, 2, 1)
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    header += [f"element chunk {len(chunks)}", *(f"property float {name}" for name in (*RANGES, *COLORS))]
-    header += [f"element vertex {count}", *(f"property uint {name}" for name in PACKED)]
-    if num_rest:
-        header += [f"element sh {count}", *(f"property uchar f_rest_{i}" for i in range(num_rest))]
-    text = "\n".join([*header, "end_header", ""])
-    return (
-        text.encode("ascii") + chunks.astype("<f4").tobytes() + words.tobytes() + arrays.to_bytes(harmonics).tobytes()
-    )
-
-
-def _ranged(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the float32 minima and maxima ``[c,3]`` of each chunk, and all values between 0 and 1."""
-    starts = np.arange(0, len(values), CHUNK)
-    low, high = (end.reduceat(values, starts).astype(np.float32).astype(float) for end in (np.minimum, np.maximum))
-    ids, span = np.arange(len(values)) // CHUNK, high - low
-    return low, high, (values - low[ids]) / np.where(span > 0, span, 1)[ids]
-
-
-def _packed(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Pack numbers between 0 and 1 into words; the first number is in the highest bits."""
-    words = np.zeros(len(shares), np.uint32)
-    for column, width in zip(shares.T, bits, strict=True):
-        top = 2**width - 1
-        words = words << np.uint32(width) | np.clip(np.floor(column * top + 0.5), 0, top).astype(np.uint32)
-    return words

@@ -29,8 +29,7 @@ from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.types import SH_C0, Gaussians
 
-VERSIONS = (3, 4)  # that are written; Spark 2.2 does not read 4
-MAX_DEGREES = {3: 3, 4: 4}  # of the harmonics, by version
+VERSION, MAX_DEGREE = 3, 3  # that are written, and the harmonics of that; Spark 2.2 does not read 4
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags; zero, or number of streams
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
@@ -39,8 +38,8 @@ MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
 GZIP_MAGIC = b"\x1f\x8b"
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
-ZSTD_LEVEL = 12
-INSTALL = 'pip install "zstandard>=0.23,<1"'  # as the extra spz4 asks for; works beside a wheel and in a checkout
+# As the extra asks for; the second works beside a wheel and in a checkout
+INSTALL = 'install gsmerge[spz4], or pip install "zstandard>=0.23,<1"'
 LARGEST = 2**23 - 1
 COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
@@ -195,21 +194,8 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
 class SpzColumns:
     """The content of a ``.spz`` of n Gaussians, with ``parts [n,bytes]`` uint8 in the order of the file."""
 
-    count: int
-    degree: int  # of the harmonics
-    fraction: int  # bits of a position behind the point
-    mip: bool
+    header: bytes  # which version 3 compresses with the rest
     parts: tuple[np.ndarray, ...]
-
-    def header(self, version: int) -> bytes:
-        """Return the 16 bytes of the header; version 3 compresses them with the rest."""
-        last = len(self.streams) if version == 4 else 0
-        return HEADER.pack(MAGIC, version, self.count, self.degree, self.fraction, MIP_FLAG * self.mip, last)
-
-    @property
-    def streams(self) -> list[bytes]:
-        """Return the bytes of each part, without harmonics if there are none."""
-        return [part.tobytes() for part in self.parts if part.shape[1]]
 
 
 def _octave(size: float) -> int:
@@ -246,25 +232,17 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fin
         np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
     )
     degree = arrays.sh_degree(columns.harmonics.shape[1])
-    return SpzColumns(len(columns), degree, fraction, mip, parts)
+    return SpzColumns(HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0), parts)
 
 
-def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = (), *, version: int = 3) -> bytes:
-    """Encode a ``.spz`` file; one of the ``comments`` may mark the Gaussians as antialiased.
+def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
+    """Encode a ``.spz`` file of version 3; one of the ``comments`` may mark the Gaussians as antialiased.
 
-    ValueError if there is NaN or inf, or if the version is not 3 or 4; UsageError if ``zstandard`` is missing for
-    version 4.
+    ValueError if there is NaN or inf.
     """
-    if version not in VERSIONS:
-        raise ValueError(f"spz_version: expected 3 or 4, got {version}")
-    columns = spz_columns(gaussians, MAX_DEGREES[version], mip=arrays.MIP_COMMENT in comments)
-    if version == 3:
-        return gzip.compress(columns.header(3) + b"".join(columns.streams), mtime=0)  # the same bytes at any time
-    compressor = zstandard().ZstdCompressor(level=ZSTD_LEVEL)
-    packed = [compressor.compress(stream) for stream in columns.streams]
-    sizes = [TABLE_ROW.pack(*map(len, pair)) for pair in zip(packed, columns.streams, strict=True)]
-    start = TABLE_START.pack(HEADER.size + TABLE_START.size)
-    return b"".join([columns.header(4), start, *sizes, *packed])
+    columns = spz_columns(gaussians, MAX_DEGREE, mip=arrays.MIP_COMMENT in comments)
+    parts = (part.tobytes() for part in columns.parts)
+    return gzip.compress(b"".join([columns.header, *parts]), mtime=0)  # the same bytes at any time
 
 
 def zstandard() -> ModuleType:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from gsmerge.errors import UsageError
@@ -29,8 +28,7 @@ class Format:
     read: Callable[[Path], StoredRows] | None  # None: it is only written
     # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
-    max_degree: int  # of the harmonics that there is room for; -1: it is only read
-    version: int | None = None  # where several are written
+    max_degree: int  # of the harmonics that are written; -1: it is only read
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
     each: Sequence[float] = ()  # bytes of a Gaussian by degree: of a .sog or .spz those of results, as measured
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
@@ -47,7 +45,7 @@ def _lazy(place: str) -> LazyFunction:
     return LazyFunction(f"{__package__}.{module}", name)
 
 
-_SPZ, _SOG = (17.0, 18.5, 18.9, 19.2, 20.0), (13.0, 22.0, 36.5, 56.5)
+_SOG = 13.0, 22.0, 36.5, 56.5
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
@@ -62,14 +60,12 @@ SITE = Format("index.html", "a web site: a page with a viewer, and the .sog that
 SITE_SCENE = "scene.sog"
 FILES = (  # of endings that end alike the longest first
     Format(
-        ".compressed.ply", "ranges for every 256 neighbours; rows in another order", ply.read_rows,
-        _lazy("compressed.compressed_bytes"), 3, each=(16.3, 25.3, 40.4, 61.4),
+        ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
     ),
     PLY,
-    Format(".spz", "Niantic's format, version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3, 3, each=_SPZ),
     Format(
-        ".spz", "Niantic's format, version 4, compressed with Zstandard", _lazy("spz.read_rows"),
-        partial(_lazy("spz.spz_bytes"), version=4), 4, 4, _lazy("spz.zstandard"), _SPZ,
+        ".spz", "Niantic's format; written as version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
+        each=(17.0, 18.5, 18.9, 19.2),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
@@ -85,10 +81,6 @@ FILES = (  # of endings that end alike the longest first
         require=_REQUIRE_USD, each=_USD,
     ),
     Format(
-        ".usda", "USD as text", None, _lazy("usd.usda_bytes"), 3,
-        require=_REQUIRE_USD, each=(176.0, 301.0, 509.0, 801.0),
-    ),
-    Format(
         ".usdz", "USD, a .usdc in an archive", None, _lazy("usd.usdz_bytes"), 3, require=_REQUIRE_USD, each=_USD,
     ),
 )  # fmt: skip
@@ -98,7 +90,8 @@ DEPTHS = Format(
 )  # fmt: skip
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS)
-OUTPUT_FORMATS = tuple(dict.fromkeys(row.ending for row in FILES))
+OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
+FORMER_ENDINGS = ".compressed.ply", ".usda"  # which versions before 0.2 wrote
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
 
 
@@ -150,25 +143,24 @@ def may_hold_gaussians(path: Path) -> bool:
     return path.suffix.lower() in SCENE_SUFFIXES and input_format(path).holds(path)
 
 
-def output_format(path: StrPath, spz_version: int = 3, *, levels: bool = False, cameras: bool = False) -> Format:
+def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
     ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a web site, which have cameras.
-    ValueError for an unknown version of ``.spz``.
     """
-    rows = [row for row in (*FORMATS, SITE) if row.names(path) and row.max_degree >= 0]
-    if (rows == [LEVELS] and not levels) or (rows in ([COLMAP], [SITE]) and not cameras):
-        rows = []
-    if not rows and not cameras and Path(path).name in (FOLDER, POINTS):
+    allowed = {LEVELS: levels, COLMAP: cameras, SITE: cameras}
+    chosen = next((row for row in (*FORMATS, SITE) if row.names(path)), None)
+    if chosen is not None and (chosen.max_degree < 0 or not allowed.get(chosen, True)):
+        chosen = None
+    if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
-    if not rows:
+    if chosen is None:
         *first, last = OUTPUT_FORMATS
         index = f", or the name {INDEX}" if levels else ""
         folder = f", a new folder for a web site, or one named {FOLDER}" if cameras else ""
-        raise UsageError(f"{path}: expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
-    chosen = next((row for row in rows if row.version in (None, spz_version)), None)
-    if chosen is None:
-        raise ValueError(f"spz_version: expected {' or '.join(str(row.version) for row in rows)}, got {spz_version}")
+        former = next((ending for ending in FORMER_ENDINGS if Path(path).name.lower().endswith(ending)), None)
+        gone = "" if former is None else f"{former} is no longer written; "
+        raise UsageError(f"{path}: {gone}expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
     chosen.require()
     return chosen

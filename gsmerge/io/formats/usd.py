@@ -23,21 +23,27 @@ from gsmerge.kernels.elementary import exp
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3  # as far as renderers go
-PRIM = "Gaussians"
-INSTALL = 'pip install "usd-core>=26.3,<27"'  # as the extra usd asks for; works beside a wheel and in a checkout
+PRIM, LAYER = "Gaussians", "scene.usdc"
+# As the extra asks for; the second works beside a wheel and in a checkout
+INSTALL = 'install gsmerge[usd], or pip install "usd-core>=26.3,<27"'
 # USDZ: contents begin at multiples of 64 bytes, behind an extra field of this kind; a file's header has 30 bytes
 _ALIGNMENT, _PADDING, _ZIP_HEADER, _UNIX, _EXTRA = 64, 0x1986, 30, 3, struct.Struct("<HH")
 _REACH = 3.0  # standard deviations about a centre that the extent holds
 
 
-def usda_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.usda``, which is text, without comments; ValueError if there is NaN or inf."""
-    return _export(gaussians, ".usda")
-
-
 def usdc_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
     """Encode a ``.usdc``, which is binary, without comments; ValueError if there is NaN or inf."""
-    return _export(gaussians, ".usdc")
+    usd, columns = require_usd(), turn_half(to_columns(gaussians, MAX_DEGREE))
+    stage = usd.Usd.Stage.CreateInMemory(LAYER)
+    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # what most scenes of feed-forward models have, about
+    splats = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/{PRIM}")
+    stage.SetDefaultPrim(splats.GetPrim())
+    _fill(splats, columns, usd.Vt)
+    with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
+        path = Path(folder) / LAYER
+        stage.GetRootLayer().Export(str(path))
+        return path.read_bytes()
 
 
 def usdz_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
@@ -45,7 +51,7 @@ def usdz_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
     The archive is written here, since USD's own writer puts the time of day into it.
     """
-    package, layer = BytesIO(), ZipInfo("scene.usdc")  # at the first time that the format knows
+    package, layer = BytesIO(), ZipInfo(LAYER)  # at the first time that the format knows
     padding = -(_ZIP_HEADER + len(layer.filename) + _EXTRA.size) % _ALIGNMENT
     layer.extra, layer.create_system = _EXTRA.pack(_PADDING, padding) + bytes(padding), _UNIX
     with ZipFile(package, "w", ZIP_STORED) as archive:
@@ -63,20 +69,6 @@ def require_usd() -> SimpleNamespace:
         version = ".".join(map(str, Usd.GetVersion()[1:]))
         raise UsageError(f"USD: expected usd-core 26.3 or later, which knows Gaussians, found {version}; {INSTALL}")
     return SimpleNamespace(Sdf=Sdf, Usd=Usd, UsdGeom=UsdGeom, UsdVol=UsdVol, Vt=Vt)
-
-
-def _export(gaussians: Gaussians, ending: str) -> bytes:
-    usd, columns = require_usd(), turn_half(to_columns(gaussians, MAX_DEGREE))
-    stage = usd.Usd.Stage.CreateInMemory(f"scene{ending}")
-    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
-    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # what most scenes of feed-forward models have, about
-    splats = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/{PRIM}")
-    stage.SetDefaultPrim(splats.GetPrim())
-    _fill(splats, columns, usd.Vt)
-    with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
-        path = Path(folder) / f"scene{ending}"
-        stage.GetRootLayer().Export(str(path))
-        return path.read_bytes()
 
 
 def _fill(splats: Any, columns: Columns, vt: Any) -> None:

@@ -10,10 +10,12 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
+Photos = Sequence[tuple[str, Path | None]]  # names of views below a model's folder of photos, and their files if known
 
-def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str | None:
+
+def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
     """Describe the harmonics that a format leaves out; None if it keeps all. UsageError for an unknown ending."""
-    chosen = output_format(path, spz_version, levels=True, cameras=True)
+    chosen = output_format(path, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
     if chosen is COLMAP:
@@ -23,13 +25,19 @@ def lost_harmonics(path: StrPath, sh_degree: int, spz_version: int = 3) -> str |
     return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
 
 
-def output_notes(out: Path, sh_degree: int, spz_version: int, photos: Path | None) -> list[str]:
-    """Describe what an output lacks: harmonics that are not written, and the photos of a COLMAP model."""
-    lost = lost_harmonics(out, sh_degree, spz_version)
-    notes, place = [lost] if lost else [], out.parent.parent.parent / "images"
-    if COLMAP.names(out) and not place.is_dir():
-        files = "the photos" if photos is None or not photos.is_dir() else photos
-        notes.append(f"trainers look for photos in {place}: copy or link {files} there")
+def photo_folder(points: Path) -> Path:
+    """Return the folder in which trainers look for the photos of a COLMAP model, given the path of its points."""
+    return points.parent.parent.parent / "images"
+
+
+def output_notes(out: Path, sh_degree: int, photos: Photos) -> list[str]:
+    """Describe what an output lacks: harmonics that are not written, and the ``photos`` of a COLMAP model."""
+    lost, place = lost_harmonics(out, sh_degree), photo_folder(out)
+    notes = [lost] if lost else []
+    if COLMAP.names(out) and (place.exists() or any(photo is None for _, photo in photos)):
+        absent = len({name for name, _ in photos if not (place / name).is_file()})
+        more = f"trainers look for photos in {place}: copy or link the {absent:,} that it lacks there"
+        notes += [more] if absent else []
     return notes
 
 
@@ -41,12 +49,11 @@ def write_gaussians(
     comments: Sequence[str] = (),
     ending: str | None = None,
     normals: bool = True,
-    spz_version: int = 3,
 ) -> None:
     """Write Gaussians to a file; the ending of its name, one of ``OUTPUT_FORMATS``, chooses the format.
 
     All but ``.ply`` and USD quantise. ``.glb`` and USD have y upward, so Gaussians are turned by half a turn about z in
-    them. Harmonics of degree 4 are left out, except in a ``.spz`` of version 4 and by :func:`write_ply`.
+    them. Harmonics of degree 4 are left out, except by :func:`write_ply`.
 
     Args:
         path: The file; complete or not there at all.
@@ -55,20 +62,18 @@ def write_gaussians(
         comments: Lines for the header of the two that have one; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
         ending: Format to write instead of the name's.
         normals: Of a ``.ply``, as in :func:`write_ply`.
-        spz_version: Of a ``.spz``: 3, which most programs read, or 4, which has room for harmonics of degree 4 and
-            needs ``zstandard``.
 
     Raises:
-        UsageError: If the name ends in none of these, or ``zstandard`` or ``usd-core`` is needed and not installed.
+        UsageError: If the name ends in none of these, or ``usd-core`` is needed and not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is no Gaussian, NaN or inf, a comment is no line of ASCII, or there are half a million
-            characters of them, or there is no such version.
+            characters of them.
 
     Example:
         >>> gaussians = gsmerge.compact("demo", effort="draft", budget=300).gaussians
         >>> gsmerge.write_gaussians("demo/small.splat", gaussians, overwrite=True)
     """
-    chosen = output_format(ending or path, spz_version)
+    chosen = output_format(ending or path)
     if chosen.encode is None:
         degree = min(gaussians.sh_degree, chosen.max_degree)
         write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)

@@ -20,7 +20,6 @@ OPTIONS = LazyFunction("gsmerge.research.training", "TrainOptions")
 class RunOptions(Settings):
     """Settings of a run that say nothing of its networks."""
 
-    config: str | None = setting(None, "TOML or JSON file with settings, over those of `--preset`.")
     cache: str | None = setting(None, "Folder for the prepared examples, which several runs may share; by default in "
         "the output.")  # fmt: skip
     device: str = setting("cpu", "Where the networks run; windows are rendered on the CPU. auto: CUDA where torch "
@@ -52,7 +51,6 @@ def train(args: opt.Args) -> None:
         join_processes,
         prepare_shards,
         preset_options,
-        read_config,
     )
     from gsmerge.research.training import train as train_networks
     from gsmerge.research.training.processes import local_count
@@ -61,9 +59,7 @@ def train(args: opt.Args) -> None:
     out, values = args.output, args.values(TrainOptions, RunOptions)
     with opt.usage_errors():
         run = RunOptions(**{name: values.pop(name) for name in flat_settings(RunOptions) if name in values})
-        options = preset_options(args.preset)
-        options = options if run.config is None else read_config(Path(run.config), options)
-        options, device = change_settings(options, values), choose_device(run.device)
+        options, device = change_settings(preset_options(args.preset), values), choose_device(run.device)
     options.require_weights()
     threads = max(1, available_threads() // local_count())
     with join_processes(device) as processes:

@@ -140,7 +140,7 @@ def check_replaceable(folder: Path, *, overwrite: bool) -> None:
         problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
         raise UsageError(f"{folder}: {problem}")
     if os.path.lexists(folder) and not overwrite:
-        problem = "holds a scene of other options; pass --overwrite to replace it, or choose another OUT"
+        problem = "holds a scene of other options; pass --set overwrite=true to replace it, or choose another OUT"
         raise UsageError(f"{folder}: {problem}")
 
 

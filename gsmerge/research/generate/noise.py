@@ -20,7 +20,7 @@ from gsmerge.research.generate.textures import enlarge
 from gsmerge.types import SH_C0, Gaussians
 
 Range = tuple[float, float]
-ERRORS = (  # ranges that --noise scales; the others are habits of the exporter
+ERRORS = (  # ranges that the setting noise scales; the others are habits of the exporter
     *("view_bias", "drift", "patches", "patch_error", "grain", "bleed", "floaters", "turn", "shift"),
     *("exposure", "tint", "oversized", "tilt"),
 )
@@ -32,7 +32,7 @@ POSITIVE = (*SPREAD, "far", "scale", "bleed_width", "flatness", "blur")
 class NoiseOptions:
     """Ranges of an exporter's errors and habits; each scene draws its values from them.
 
-    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/laboratory/generator.md
+    Depth errors are deviations of the logarithm of depth, so about parts of the depth. docs/internals/lab.md
     compares them with real exports. A ValueError if a range is empty or impossible.
     """
 
@@ -92,12 +92,12 @@ def read_ranges(path: Path) -> NoiseOptions:
     table = read_table(path)
     unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
     if unknown:
-        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/laboratory/generator.md has the names")
+        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/lab.md has the names")
     values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
     try:
         return NoiseOptions(**values)
     except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error), "docs/laboratory/generator.md has the ranges") from error
+        raise SceneError(path, str(error), "docs/internals/lab.md has the ranges") from error
 
 
 RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]

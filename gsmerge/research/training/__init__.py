@@ -6,7 +6,7 @@ from gsmerge.research.training.loop import TrainResult, choose_device, train
 from gsmerge.research.training.processes import Processes, join_processes
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.research.training.shards import Shard, prepare_shards, read_shard, write_shard
-from gsmerge.research.training.train_options import TrainOptions, preset_options, read_config
+from gsmerge.research.training.train_options import TrainOptions, preset_options
 
 __all__ = [
     "Backbone",
@@ -22,7 +22,6 @@ __all__ = [
     "make_training_scene",
     "prepare_shards",
     "preset_options",
-    "read_config",
     "read_shard",
     "train",
     "write_shard",

@@ -79,7 +79,7 @@ def _fit_level(
     photos: tuple[Photos, Photos],
     start: Gaussians,
     options: TrainOptions,
-    progress: Callable[[int, int, float], None],
+    progress: Callable[..., None],
 ) -> tuple[Gaussians, np.ndarray]:
     """Fit Gaussians fully without growth; return them with a mask ``[n]`` of those that a photo shows."""
     fit = FitOptions(fit_steps=options.fit_steps)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from gsmerge.errors import SceneError
 from gsmerge.fit.loss import LOSS_WINDOW
-from gsmerge.io.bounds import read_table
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.setting import Settings, change_settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchOptions, Method
 
 COUNT: dict[str, Any] = {"least": 1, "most": 10**9}
@@ -170,45 +167,15 @@ class TrainOptions(Settings):
         """Convert all settings to plain values."""
         return asdict(self) | {name: list(getattr(self, name)) for name in LISTS}
 
-    def with_settings(self, values: Mapping[str, Any]) -> TrainOptions:
-        """Change settings by name, including those in the tables ``network`` and ``bounds``.
-
-        A ValueError if a name is unknown or a value out of range.
-        """
-        unknown = sorted(values.keys() - {f.name for f in fields(TrainOptions)})
-        if unknown:
-            raise ValueError(f"unknown setting {unknown[0]!r}")
-        table = values.get("network", {})
-        if not isinstance(table, Mapping):
-            raise ValueError(f"network: expected a table, got {table!r}")
-        present, bounds = asdict(self.network), table.get("bounds", {})
-        if isinstance(bounds, Mapping):
-            table = {**table, "bounds": present["bounds"] | dict(bounds)}
-        return replace(self, **{**values, "network": NetworkOptions.from_dict(present | dict(table))})
-
-
-def read_config(path: Path, start: TrainOptions | None = None) -> TrainOptions:
-    """Change ``start``, or the defaults, by the settings in a TOML or JSON file, named as in :class:`TrainOptions`.
-
-    A SceneError if the file cannot be read or a setting is unknown or out of range.
-    """
-    table = read_table(path)
-    try:
-        return (start or TrainOptions()).with_settings(table)
-    except (TypeError, ValueError) as error:
-        raise SceneError(path, str(error).splitlines()[0]) from error
-
 
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
 # for the densities, of which the fit alone needs two.
 PAPER: Mapping[str, Any] = {
-    "network": {
-        "outputs": "absolute",
-        "merger_start": "first",
-        "geometry": "carried",
-        "group_numbers": False,
-        "members": 256,
-    },
+    "outputs": "absolute",
+    "merger_start": "first",
+    "geometry": "carried",
+    "group_numbers": False,
+    "members": 256,
     "random_views": (1, 12),
     "densities": (0.053,),
     "segmentation": "bass-st",
@@ -236,9 +203,11 @@ PAPER: Mapping[str, Any] = {
     "diversity_steps": 50_000,
 }
 # What the package ships is trained with. Encoder and merger gained nothing that validation showed; colour corrections
-# learnt the exposure of the training photos. docs/laboratory/networks.md has the figures.
+# learnt the exposure of the training photos. docs/internals/networks.md has the figures.
 SHIPPED: Mapping[str, Any] = {
-    "network": {"encoder": False, "merger": False, "bounds": {"color": 0.0}},
+    "encoder": False,
+    "merger": False,
+    "color": 0.0,  # the bound of corrections
     "recolor": True,
     "views": (3, 0),
     "fit_steps": 100,
@@ -280,4 +249,4 @@ def preset_options(name: str) -> TrainOptions:
     """Return the settings of a named preset; ValueError if the name is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
-    return TrainOptions().with_settings(PRESETS[name])
+    return change_settings(TrainOptions(), PRESETS[name])

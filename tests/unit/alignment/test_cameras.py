@@ -10,6 +10,7 @@ import motions
 import numpy as np
 import pytest
 from messages import names, noted, refuses
+from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge import compact_tensors
@@ -17,7 +18,6 @@ from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
-from gsmerge.io.cameras.json_files import write_transforms
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras

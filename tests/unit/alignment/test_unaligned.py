@@ -49,7 +49,7 @@ def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.aligned
     assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
-    assert any("rows that only fill the file up are left out" in note for note in loaded.notes)
+    assert any("Gaussians that only fill the file up are left out" in note for note in loaded.notes)
     viewmats = loaded.scene.cameras.viewmats
     assert np.allclose(viewmats[0, :3, :3], np.eye(3), atol=1e-6)
     assert np.allclose(viewmats[:, :3, 3], SMOOTH.w2c[:, :3, 3], atol=1e-6)

@@ -50,8 +50,23 @@ def test_bars_of_stages_replace_the_first_line() -> None:
     with redirect_stderr(Terminal()) as terminal, opening_line(quiet=False), stage_progress(quiet=False) as progress:
         progress("examples: room", 2, 6)
     bars = [line for line in terminal.lines() if line.startswith("examples")]
-    assert "2/6" in bars[-1]
+    assert "6/6" in bars[-1]
     assert bars[-1].endswith("room")
+
+
+@pytest.mark.parametrize(("columns", "bar"), [("80", 16), ("40", 8)])
+def test_bars_end_full(monkeypatch: pytest.MonkeyPatch, columns: str, bar: int) -> None:
+    """Also the last one, whose stage says where it is before each of its parts."""
+    monkeypatch.setenv("COLUMNS", columns)
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
+        progress("read: small.ply", 1, 3)
+        progress("superpixels and the view from outside: input", 11, 12)
+    lines = terminal.lines()
+    for name, count in (("read", "3/3"), ("superpixels and", "12/12")):
+        last = [line for line in lines if line.startswith(name)][-1]
+        assert "━" * bar in last
+        assert count in last
+        assert len(last) < int(columns)
 
 
 def test_the_last_failure_stands_below_the_bar_of_a_batch() -> None:

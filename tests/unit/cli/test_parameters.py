@@ -10,10 +10,11 @@ from messages import refuse_all, refuses
 from gsmerge.cli.parameters import Args, parse_pairs
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.setting import flat_settings
 
-KNOWN = flat_settings(CompactOptions)
+KNOWN = flat_settings(EvaluateOptions) | flat_settings(CompactOptions)
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,9 @@ KNOWN = flat_settings(CompactOptions)
         ("checkpoint=a=b", {"checkpoint": "a=b"}),
         ("crop=", {"crop": ""}),
         ("photo_scale=2.5", {"photo_scale": 2.5}),
+        ("overlap=.5", {"overlap": 0.5}),
+        ("zoom=.5,1,2", {"zoom": [0.5, 1, 2]}),
+        ("lpips=alex", {"lpips": ["alex"]}),
     ],
 )
 def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
@@ -42,7 +46,7 @@ def test_values_are_json_or_text(pair: str, expected: dict[str, Any]) -> None:
     ("pairs", "place", "found"),
     [
         (["k"], "--set", ["NAME=VALUE", "'k'"]), (["=2"], "--set ", ["unknown"]),
-        (["pose=free"], "--set pose", ["unknown", "poses", "docs/reference/settings.md"]),
+        (["pose=free"], "--set pose", ["unknown", "poses", "--set help"]),
         (["k=1", "k=2"], "--set k", ["twice"]), (["require_checkpoint=1"], "--set require_checkpoint", ["'1'"]),
         (["neighbors=true"], "--set neighbors", ["'true'"]), (["neighbors=2.5"], "--set neighbors", ["'2.5'"]),
         (["match=all"], "--set match", ["overlap", "'all'"]), (["k=" + "[" * 100_000], "--set k", ["[["]),
@@ -59,13 +63,27 @@ def test_options_and_set_are_one() -> None:
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
     refuse_all(UsageError, [
         (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "iou", "0 to 1", 2),
-        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "settings.md"),
+        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "--set help"),
     ])  # fmt: skip
 
 
 def test_several_kinds_of_settings() -> None:
-    assert Args(set=["k=2", "replay=3"], max_k=4).values(CompactOptions, ExtendOptions) == {
+    assert Args(set=["k=2", "replay=3", "max_k=4"]).values(CompactOptions, ExtendOptions) == {
         "k": 2, "replay": 3, "max_k": 4,
     }  # fmt: skip
     made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, ExtendOptions)
     assert (made.segment.segmentation, online.replay) == ("bass-st", 3)
+
+
+def test_the_seed_may_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GSMERGE_SEED", "7")
+    assert Args().settings().seed == 7
+    assert Args(seed=3).settings().seed == Args(set=["seed=3"]).settings().seed == 3
+    monkeypatch.setenv("GSMERGE_SEED", "many")
+    with refuses(UsageError, "GSMERGE_SEED", "'many'"):
+        Args().settings()
+
+
+def test_unknown_names_have_near_ones() -> None:
+    with refuses(UsageError, "--set superpixel", "superpixels"):
+        parse_pairs("--set", ["superpixel=3"], KNOWN)

@@ -27,7 +27,7 @@ def folder(tmp_path: Path, tiny: Tiny) -> Path:
     return replace(tiny, gaussians=replace(tiny.gaussians, shN=shN)).save(tmp_path)
 
 
-@pytest.mark.parametrize(("name", "degree"), [("x.ply", 3), ("x.compressed.ply", 3), ("x.glb", 3)])
+@pytest.mark.parametrize(("name", "degree"), [("x.ply", 3), ("x.spz", 3), ("x.glb", 3)])
 def test_results_have_harmonics_of_three_degrees(folder: Path, name: str, degree: int) -> None:
     document = compact_files(find_scene_files(folder), PLAIN, Outputs(folder / name))
     assert read_gaussians(folder / name).info.sh_degree == degree

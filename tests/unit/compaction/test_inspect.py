@@ -151,7 +151,7 @@ def test_a_scene_without_pixels_or_without_views(tmp_path: Path) -> None:
     none = inspect(folder)
     assert none["compact"] is None
     lines = "\n".join(inspection_lines(none))
-    assert "alignment  not " in lines
+    assert "alignment " not in lines  # the command's error says why
     assert "compact    would refuse" in lines
 
 
@@ -235,7 +235,6 @@ def test_what_compact_would_refuse(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     (tmp_path / "transforms.json").write_text("nonsense")
     lines = said(tmp_path)
-    assert lines["alignment"].startswith("not ")
     assert "refuse" in lines["compact"]
     assert lines["exporter"].startswith("not known")
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from messages import refuses
+from messages import noted, refuses
 
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.compaction.search import (
@@ -22,6 +22,7 @@ from gsmerge.compaction.search import (
     search_count,
 )
 from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
@@ -32,11 +33,22 @@ def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
 
 
 def make_plan(
-    target_psnr: float | None = None, least: int = 1, most: int = 10**6, default: int | None = None, levels: int = 1
+    target_psnr: float | None = None,
+    least: int = 1,
+    most: int = 10**6,
+    default: int | None = None,
+    levels: int = 1,
+    *,
+    keeps_psnr: bool = False,
 ) -> Plan:
     """What a search reads of a plan."""
-    limits = SimpleNamespace(min_count=least, max_count=most, default=most if default is None else default)
-    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels))
+    limits = SimpleNamespace(
+        min_count=least, max_count=most, default=most if default is None else default, num_input=most
+    )
+    return cast(
+        "Plan",
+        SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, keeps_psnr=keeps_psnr, auto_count=False),
+    )
 
 
 @pytest.mark.parametrize(
@@ -187,7 +199,40 @@ def test_search_stays_within_its_limits() -> None:
 @pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
 def test_search_begins_within_its_limits(default: int, first: int) -> None:
     plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
-    assert search_count(cast("Prepared", None), plan, cast("Build", None)).first == first
+    prepared = cast("Prepared", SimpleNamespace(reference=SimpleNamespace(name=PHOTOS)))
+    assert search_count(prepared, plan, cast("Build", None)).first == first
+
+
+def keep(curve: Callable[[int], float], default: int, most: int) -> CountSearch:
+    """Run the search that keeps 32.5 dB from the input by default."""
+    plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_psnr=True)
+    counts = CountSearch(plan, default, rendered=True)
+    for count in counts:
+        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))
+    return counts
+
+
+def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
+    actual = keep(lambda _: 40.0, 1000, 20_000)
+    assert list(actual.tried) == [1000]  # not fewer, and no further run
+    assert actual.notes == []
+
+
+@pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
+@pytest.mark.parametrize("needed", [1.1, 2.0, 7.0])
+def test_more_are_taken_until_the_input_is_kept(slope: float, needed: float) -> None:
+    actual = keep(lambda count: 32.5 + slope * math.log2(count / (1000 * needed)), 1000, 20_000)
+    assert actual.best.psnr >= 32.5
+    assert actual.best.count <= 1.4 * 1000 * needed
+    assert len(actual.tried) <= 5
+    assert noted(actual.notes, f"{actual.best.count:,} of 20,000")
+
+
+def test_what_is_compact_already_is_kept() -> None:
+    actual = keep(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
+    assert actual.best.count == 5000
+    assert noted(actual.notes, "compact already", "5,000 of 5,000")
+    assert actual.unmet is None
 
 
 def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.fit import FitJob, FitOptions, start_share, steps
+from gsmerge.fit import FitJob, FitOptions, report_steps, start_share, steps
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full, limit_moves
 from gsmerge.fit.schedule import (
@@ -27,6 +27,7 @@ from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.fit.survey import score_state, survey_photos
 from gsmerge.raster import splat_adjoint, tile_view
 from gsmerge.raster.photos import Photos
+from gsmerge.runtime.record import record_run
 from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
@@ -305,11 +306,29 @@ def test_rates_decay() -> None:
 
 
 def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
-    calls: list[tuple[int, int, float]] = []
+    calls: list[tuple[int, int, float, bool]] = []
     fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK, progress=lambda *call: calls.append(call)))
     assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
     assert calls[-1][2] > calls[0][2]  # of the photos
     assert np.isfinite(np.array(calls, float)).all()
+
+
+def test_photos_of_full_size_have_a_mean_and_a_name_of_their_own(
+    truth: Gaussians, photos: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half-size photos are easier to show: a mean over both would seem to get worse half-way."""
+    monkeypatch.setattr(Optimiser, "step", lambda self, state, step: 0.01 if step.mode.size else 0.1)
+    calls: list[tuple[int, int, float, bool]] = []
+    options = FitOptions(fit_steps=30, half_res_share=0.5, judged=False)
+    fit_full(scenes.spoil(truth), scenes.run_for(photos, options, progress=lambda *call: calls.append(call)))
+    assert [call[3] for call in calls] == [True] * 15 + [False] * 15  # half-size photos first
+    assert {round(call[2]) for call in calls[:15]} == {20}
+    assert {round(call[2]) for call in calls[15:]} == {10}
+    said: list[str] = []
+    with record_run(lambda stage, done, total: said.append(stage)):
+        report_steps(1, 2, 20.0, True)
+        report_steps(2, 2, 10.0, False)
+    assert said[:2] == ["fit: half-size photos 20.0 dB", "fit: photos 10.0 dB"]
 
 
 # the same again

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from messages import refuses
+from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.measure import preview
+from gsmerge.measure import clip
 from gsmerge.measure.preview import Picture
 
 
@@ -67,27 +68,27 @@ def ffmpeg(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
 def test_h264_where_ffmpeg_is_at_hand(ffmpeg: Path, tmp_path: Path) -> None:
-    assert preview.write_video(tmp_path / "a.webm", frames(2), 24) in ("VP8", "VP9")
-    assert preview.write_video(tmp_path / "a.mp4", frames(12, 47, 63), 24) == "H.264"
+    assert clip.write_clip(tmp_path / "a.webm", frames(2), 24) in ("VP8", "VP9")
+    assert clip.write_clip(tmp_path / "a.mp4", frames(12, 47, 63), 24) == "H.264"
     shown = read(tmp_path / "a.mp4")
     assert len(shown) == 12
     for drawn, picture in zip(frames(12, 48, 64), shown, strict=True):
         assert np.abs(drawn.astype(float) - picture).mean() < 12
     ffmpeg.write_text(FFMPEG.replace("libx264", "libx265"), encoding="utf-8")
-    assert preview.write_video(tmp_path / "b.mp4", frames(2), 24) != "H.264"
+    assert clip.write_clip(tmp_path / "b.mp4", frames(2), 24) != "H.264"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="programs are no scripts there")
 def test_an_ffmpeg_that_fails_leaves_nothing(ffmpeg: Path, tmp_path: Path) -> None:
     ffmpeg.write_text(FFMPEG.replace("width, height", "sys.exit(1)  # ", 1), encoding="utf-8")
     with refuses(SceneError, "a.mp4", 12):
-        preview.write_video(tmp_path / "a.mp4", frames(12), 24)
+        clip.write_clip(tmp_path / "a.mp4", frames(12), 24)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "A.MP4"])
 def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    encoding = preview.write_video(tmp_path / name, frames(12), 24)
+    encoding = clip.write_clip(tmp_path / name, frames(12), 24)
     assert encoding in ("VP9", "VP8", "MPEG-4")
     shown = read(tmp_path / name)
     assert len(shown) == 12
@@ -99,22 +100,22 @@ def test_a_video_is_what_was_drawn(name: str, tmp_path: Path, capfd: pytest.Capt
 
 
 def test_odd_sides_get_one_more(tmp_path: Path) -> None:
-    preview.write_video(tmp_path / "a.mp4", frames(3, 47, 63), 30)
+    clip.write_clip(tmp_path / "a.mp4", frames(3, 47, 63), 30)
     assert [picture.shape for picture in read(tmp_path / "a.mp4")] == [(48, 64, 3)] * 3
 
 
 def test_another_encoder_stands_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(preview.ENCODERS, ".mp4", (("none", "None"), ("mp4v", "MPEG-4")))
-    assert preview.write_video(tmp_path / "a.mp4", frames(3), 30) == "MPEG-4"
+    monkeypatch.setitem(clip.ENCODERS, ".mp4", (("none", "None"), ("mp4v", "MPEG-4")))
+    assert clip.write_clip(tmp_path / "a.mp4", frames(3), 30) == "MPEG-4"
     assert len(read(tmp_path / "a.mp4")) == 3
 
 
 def test_without_an_encoder_nothing_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(preview.ENCODERS, ".mp4", (("none", "VP9"), ("nope", "MPEG-4")))
+    monkeypatch.setitem(clip.ENCODERS, ".mp4", (("none", "VP9"), ("nope", "MPEG-4")))
     with refuses(SceneError, "a.mp4", "VP9", "MPEG-4"):
-        preview.write_video(tmp_path / "a.mp4", frames(3), 30)
+        clip.write_clip(tmp_path / "a.mp4", frames(3), 30)
     assert list(tmp_path.iterdir()) == []
     assert capfd.readouterr().err == ""
 
@@ -131,22 +132,22 @@ def test_a_folder_that_vanishes_is_not_blamed_on_opencv(before: int, tmp_path: P
             yield picture
 
     with refuses(SceneError, "a.mp4", "No such file or directory"):
-        preview.write_video(folder / "a.mp4", vanishing(), 24)
+        clip.write_clip(folder / "a.mp4", vanishing(), 24)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm"])
 def test_a_cut_video_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As of a full disk, about which the encoders say nothing: the last frames are not in the file."""
-    whole = preview._check_frames
+    whole = clip._check_frames
 
     def cut(path: Path, temporary: Path, count: int) -> None:
         temporary.write_bytes(temporary.read_bytes()[:-700])
         whole(path, temporary, count)
 
-    monkeypatch.setattr(preview, "_check_frames", cut)
+    monkeypatch.setattr(clip, "_check_frames", cut)
     with refuses(SceneError, name, 12):
-        preview.write_video(tmp_path / name, frames(12), 24)
+        clip.write_clip(tmp_path / name, frames(12), 24)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -158,15 +159,51 @@ def test_a_failure_while_drawing_leaves_the_old_file(tmp_path: Path) -> None:
     old = tmp_path / "a.mp4"
     old.write_bytes(b"old")
     with pytest.raises(RuntimeError, match="drawing failed"):
-        preview.write_video(old, broken(), 30, overwrite=True)
+        clip.write_clip(old, broken(), 30, overwrite=True)
     assert old.read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_endings() -> None:
-    assert [preview.is_video(Path(name)) for name in ("a.mp4", "a.WEBM", "a.png", "folder")] == [
-        True,
-        True,
-        False,
-        False,
-    ]
+def test_a_gif_has_one_palette_and_plays_again(tmp_path: Path) -> None:
+    drawn = list(frames(5))
+    assert clip.write_clip(tmp_path / "a.gif", iter(drawn), 12.5) == "GIF"
+    with Image.open(tmp_path / "a.gif") as gif:
+        assert (gif.n_frames, gif.info["loop"], gif.info["duration"]) == (5, 0, 80)
+        for i, frame in enumerate(drawn):
+            gif.seek(i)
+            assert np.abs(np.asarray(gif.convert("RGB")).astype(float) - frame).mean() < 3
+    header = (tmp_path / "a.gif").read_bytes()
+    assert header[10] & 0x80  # a palette for all; a frame with one of its own has the same bit in its descriptor
+    assert [block[8] & 0x80 for block in header.split(b"\x21\xf9\x04")[1:] if len(block) > 14 and block[5] == 0x2C] == [
+        0
+    ] * 5
+
+
+def test_lines_between_scenes_start_evenly_and_stay_inside() -> None:
+    for count in (2, 3):
+        places = np.array(clip.swipe_places(count, 48, 8.0, 600))
+        np.testing.assert_array_equal(places[0], np.arange(count + 1) * 600 // count)
+        assert (np.diff(places, axis=1) > 0).all()
+        assert places[:, 1].min() <= 60 // count < 300 < places[:, -2].max()
+        steps = np.diff(np.vstack([places, places[:1]]), axis=0)
+        assert np.abs(steps).max() < 60  # also from the last frame to the first
+    assert clip.swipe_places(1, 2, 8.0, 10) == [[0, 10], [0, 10]]
+
+
+def test_captions_stay_in_their_scene_s_part() -> None:
+    name = "a name that is longer than its part of the frame has room for.ply"
+    texts = [(name, "1,182,720 Gaussians", "80.4 MB"), ("small.ply", "52,038 Gaussians", "3.5 MB")]
+    tall = {}
+    for width, height in ((480, 352), (1920, 1080), (256, 480), (64, 48)):
+        left, right = clip.make_captions(texts, width, height)
+        for caption, start, end in ((left, 0, width // 2), (right, width // 2, width)):
+            box = caption.text.shape
+            assert start <= caption.left < caption.left + box[1] <= end or width == 64
+            assert caption.top >= 0
+            tall[width] = box[0] / height
+        frame = np.full((height, width, 3), 128, np.uint8)
+        left.draw(frame)
+        assert (frame == 245).any() or width == 64  # text
+        assert (frame[: left.top] == 128).all()
+    assert tall[480] == pytest.approx(tall[1920], abs=0.03)  # as large a part of a small frame
+    assert tall[256] > tall[480]  # a line more, for there is less room

@@ -337,6 +337,18 @@ def test_tables_for_people(actual: Evaluation) -> None:
     assert "smaller" not in lines[1]
 
 
+def test_narrow_terminals_keep_psnr_and_whole_words(actual: Evaluation) -> None:
+    wide = evaluation_lines(document_of(actual))
+    assert max(map(len, wide)) == 80
+    words = {word for line in wide for word in line.split()}
+    for columns in (79, 40):
+        lines = evaluation_lines(document_of(actual), columns)
+        assert max(map(len, lines)) <= columns
+        assert {word for line in lines for word in line.split()} <= words
+        assert any("PSNR (dB)" in line for line in lines)
+        assert not any("bytes each" in line for line in lines)
+
+
 def test_costs_are_columns(actual: Evaluation) -> None:
     text = "\n".join(evaluation_lines(document_of(actual)))
     assert "4.0 x" in text
@@ -397,7 +409,7 @@ def test_progress_is_reported(scene: Scene, half: Gaussians) -> None:
     names = list(dict.fromkeys(name for name, _, _ in said))
     assert names[-2:] == ["evaluate: input", "evaluate: half"]
     count = 2 * (len(scene) + len(held_out()))
-    assert [step[1:] for step in said if step[0] in names[-2:]] == [(done, count) for done in range(count)]
+    assert [step[1:] for step in said if step[0] in names[-2:]] == [(done, count) for done in range(1, count + 1)]
     outside = [step for step in said if step[0] == "views from outside"]
     assert [done for _, done, _ in outside] == list(range(outside[0][2]))
 
@@ -423,7 +435,7 @@ def test_pictures_too_small_for_lpips(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
     monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
-    score = evaluate(scene, {}, None, EvaluateOptions()).results[0].scores[0]
+    score = evaluate(scene, {}, None, EvaluateOptions(("vgg", "alex"))).results[0].scores[0]
     assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)
     assert looked == ["vgg"]
 

@@ -24,13 +24,6 @@ def cameras(count: int) -> Cameras:
     return Cameras(np.tile(np.eye(4), (count, 1, 1)), np.tile(K, (count, 1, 1)), 20, 12)
 
 
-@pytest.mark.parametrize(
-    ("views", "most", "ids"), [(1, 4, [0]), (3, 4, [0, 1, 2]), (12, 4, [1, 4, 7, 10]), (5, 1, [2])]
-)
-def test_pick_views(views: int, most: int, ids: list[int]) -> None:
-    assert preview.pick_views(views, most) == ids
-
-
 def test_contact_sheet_shows_scenes_left_to_right_below_their_labels() -> None:
     photos = np.full((2, 12, 20, 3), 0.2, np.float32)
     sheet = preview.contact_sheet(
@@ -63,22 +56,14 @@ def test_small_renders_are_enlarged_by_whole_pixels() -> None:
 def test_labels_never_widen_a_tile() -> None:
     picture = np.zeros((4, 30, 3), np.uint8)
     assert preview.label(picture, "a label that is far too long for it").shape == (4 + preview.BAND, 30, 3)
-
-
-def test_draw_borders_marks_where_labels_change() -> None:
-    image, labels = np.zeros((2, 4, 3), np.float32), np.array([[0, 0, 1, 1], [0, 0, 1, 1]])
-    drawn = preview.draw_borders(image, labels).any(-1)
-    assert drawn.tolist() == [[False, False, True, False]] * 2
+    wide = np.zeros((4, 1920, 3), np.uint8)
+    assert preview.label(wide, "larger on a large tile").shape == (4 + 3 * preview.BAND, 1920, 3)
 
 
 def test_draw_means() -> None:
     image = np.repeat(np.array([[0.0, 1.0, 0.2]], np.float32)[..., None], 3, 2)
     drawn = preview.draw_means(image, np.array([[0, 0, 1]]))
     assert drawn[0, :, 0].tolist() == [128, 128, 51]
-
-
-def test_draw_heat_of_nothing_is_even() -> None:
-    assert len(np.unique(preview.draw_heat(np.zeros((3, 4), np.float32)).reshape(-1, 3), axis=0)) == 1
 
 
 def test_to_picture_clamps() -> None:

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
+from gsmerge.measure.sizes import (
+    fill_cameras,
+    fill_photo,
+    resize_mask,
+    resize_photo,
+    shrink_cameras,
+    shrink_views,
+    zoom_cameras,
+)
 from gsmerge.types import Views
 
 
@@ -19,6 +27,26 @@ def test_intrinsics_go_with_the_size() -> None:
     odd = zoom_cameras(cameras, 7 / 48)
     assert (odd.width, odd.height) == (7, 5)
     assert zoom_cameras(scenes.arc(1, 48, 2), 1 / 16).height == 1
+
+
+@pytest.mark.parametrize("size", [(96, 54), (40, 80), (49, 36), (20, 9), (48, 36)])
+def test_what_fills_a_frame_is_cut_evenly(size: tuple[int, int]) -> None:
+    """A photo whose colours are its positions shows that its camera's pixels still are where they were."""
+    cameras, (width, height) = scenes.arc(2, 48, 36), size
+    rows, columns = np.mgrid[:36, :48] + 0.5
+    photo = np.stack([columns / 48, rows / 36, 0 * rows], 2).astype(np.float32)
+    filled, cut = fill_cameras(cameras, width, height), fill_photo(photo, width, height)
+    assert cut.shape == (height, width, 3)
+    assert (filled.width, filled.height) == size
+    (fx, fy), (cx, cy) = filled.Ks[0, [0, 1], [0, 1]], filled.Ks[0, :2, 2]
+    assert fx == pytest.approx(fy, rel=0.02)
+    np.testing.assert_allclose([cx, cy], [width / 2, height / 2], atol=0.51)
+    rays = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy  # of the new pixels
+    old = cameras.Ks[0]
+    inner = slice(4, -4), slice(4, -4)  # enlarging flattens the borders
+    shown = cut[inner][..., 0] * 48, cut[inner][..., 1] * 36
+    np.testing.assert_allclose(shown[0], np.tile((rays[0] * old[0, 0] + old[0, 2])[4:-4], (height - 8, 1)), atol=0.3)
+    np.testing.assert_allclose(shown[1].T, np.tile((rays[1] * old[1, 1] + old[1, 2])[4:-4], (width - 8, 1)), atol=0.3)
 
 
 @pytest.mark.parametrize("size", [(24, 18), (96, 72), (31, 40), (48, 36), (1, 1)])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import html
 import json
 import re
 from dataclasses import replace
@@ -13,13 +12,12 @@ from importlib.resources import files
 
 import pytest
 import scenes
+from page_policy import check_policy
 
-from gsmerge.measure.evaluate import EvaluateOptions, Quality, evaluate
+from gsmerge.measure.evaluate import Quality
 from gsmerge.measure.fog import Fog
-from gsmerge.measure.preview import view_pictures
-from gsmerge.measure.scores import evaluation_document
 from gsmerge.pages.data import ViewData, collect
-from gsmerge.pages.page import headline, report_page, results_table, view_page
+from gsmerge.pages.page import headline, results_table, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 WEBP = "data:image/webp;base64,"
@@ -51,26 +49,9 @@ def test_it_loads_nothing(page: str) -> None:
     assert "default-src &#x27;none&#x27;" in page
 
 
-@pytest.mark.parametrize("name", ["page", "report"])
-def test_its_own_scripts_and_styles_alone_may_run(name: str, request: pytest.FixtureRequest) -> None:
+def test_its_own_scripts_and_styles_alone_may_run(page: str) -> None:
     """The policy names them by their hashes, and nothing needs more: no attribute holds a style or a script."""
-    text: str = request.getfixturevalue(name)
-    check_policy(text)
-
-
-def check_policy(page: str) -> None:
-    policy = html.unescape(re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[0])
-    rules = {words.split()[0]: words.split()[1:] for words in policy.split(";")}
-    for kind in ("script", "style"):
-        contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
-        digests = [hashlib.sha256(content.encode()).digest() for content in contents]
-        expected = {f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests}
-        assert expected
-        assert expected == {word for word in rules[f"{kind}-src"] if word.startswith("'sha256-")}
-    assert "unsafe-inline" not in policy
-    assert "{" not in policy
-    tags = re.findall("<[a-z][^>]*>", re.sub("<(script|style)[^>]*>.*?</", "", page, flags=re.DOTALL))
-    assert [tag for tag in tags if re.search(r'\s(style|on\w+)="', tag)] == []
+    check_policy(page)
 
 
 def _written(page: str) -> str:
@@ -291,47 +272,3 @@ def test_the_renderer_is_the_one_that_was_vendored() -> None:
     assert set(sources["packages"]) >= {"@sparkjsdev/spark", "three"}
     for package in ("spark", "three", "fflate"):
         assert "MIT" in vendor.joinpath(f"LICENSE.{package}").read_text()
-
-
-NAME = "a|b<i>"
-
-
-@pytest.fixture(scope="module")
-def report() -> str:
-    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
-    half = scene.gaussians[::2]
-    sizes = {"input": {"path": "/home/me/rooms/in.ply", "bytes": 2000}, NAME: {"path": "out.ply", "bytes": 1000}}
-    evaluation = evaluate(scene, {NAME: half}, None, EvaluateOptions(lpips=()))
-    pictures = view_pictures([("in", scene.gaussians), (NAME, half)], scene.cameras, scene.images, max_views=2)
-    return report_page(evaluation_document(evaluation, sizes, ["first <note>", "/home/me/rooms/a.json: odd"]), pictures)
-
-
-def test_a_report_loads_nothing_and_escapes_names(report: str) -> None:
-    assert "a|b&lt;i&gt;" in report
-    assert "first &lt;note&gt;" in report
-    assert re.findall("<i>|<note>|https?:", report) == []
-    addresses = re.findall(r"""(?:src|href)=["']?([^"'> ]*)""", report)
-    assert len(addresses) >= 6
-    assert all(address.startswith("data:") for address in addresses)
-
-
-def test_a_report_shows_no_folders_of_the_machine(report: str) -> None:
-    assert "/home" not in report
-    assert "rooms/in.ply: before and after" in report
-    assert "rooms/a.json: odd" in report
-
-
-def test_in_a_report_the_headline_comes_first_then_pictures(report: str) -> None:
-    places = [
-        report.index(words) for words in ("50.0\u00a0% of the Gaussians", "2.0 kB", "data:image/webp", "<h2>Size</h2>")
-    ]
-    assert places == sorted(places)
-    assert report.count('class="compare"') == 2
-    assert report.count("<img") == 2 * 3
-
-
-def test_columns_of_a_report_without_a_figure_are_left_out(report: str) -> None:
-    assert "LPIPS" not in report
-    assert "earned back after" not in report
-    assert "PSNR (dB)" in report
-    assert "2.0 x" in report

@@ -169,7 +169,7 @@ def test_rows_that_only_fill_a_file_up_are_left_out(tmp_path: Path) -> None:
     rows["f_dc_1"][-1] = 0.7  # another one at the origin
     loaded = load_scene(save_export(tmp_path, smooth, rows), order="none")
     assert len(loaded.scene.gaussians) == len(rows) - 39
-    assert noted(loaded.notes, "39 rows")
+    assert noted(loaded.notes, "39 Gaussians")
 
 
 def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

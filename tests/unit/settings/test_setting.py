@@ -93,5 +93,5 @@ def test_every_default_is_possible() -> None:
 
 def test_options_leave_their_defaults_to_the_library() -> None:
     named = [OPTIONS[name] for name in OPTIONS if name in SETTINGS and name not in ("engine", "lpips")]
-    assert len(named) > 15
-    assert {parameter.default for parameter in named} == {None, False}
+    assert len(named) > 12
+    assert {parameter.default for parameter in named} <= {None, False}

@@ -1,4 +1,4 @@
-"""``.spz`` of all versions: what Niantic's own program writes, what this one writes, damage, and a missing library."""
+"""``.spz`` of all versions: what Niantic's own program writes, older and newer ones, damage, and a missing library."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from former_formats import spz4_bytes
 from messages import refuses
 from slow_readers import assert_damage_is_one_line, corners
 
 from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import kept_comments, lost_harmonics, read_gaussians, write_gaussians
-from gsmerge.io.formats.arrays import MIP_COMMENT
+from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.spz import spz_bytes
 
 zstandard = pytest.importorskip("zstandard")
@@ -46,19 +46,6 @@ def some(degree: int, count: int = 50) -> Gaussians:
         rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2 - 1, 3)),
     )
     return Gaussians(*(column.astype(np.float32) for column in columns))
-
-
-def columns_of(content: bytes) -> tuple[tuple[int, ...], bytes]:
-    """Numbers of the header of a file of version 4, and all its columns."""
-    *header, num_streams, start = struct.unpack_from("<3I4BI12x", content)
-    sizes = [struct.unpack_from("<QQ", content, start + 16 * i) for i in range(num_streams)]
-    at, parts = start + 16 * num_streams, []
-    for packed, size in sizes:
-        parts.append(zstandard.ZstdDecompressor().decompress(content[at : at + packed]))
-        assert len(parts[-1]) == size
-        at += packed
-    assert at == len(content)
-    return (*header, num_streams), b"".join(parts)
 
 
 def test_what_niantic_writes(tmp_path: Path) -> None:
@@ -92,29 +79,20 @@ def test_older_spz(version: int, tmp_path: Path) -> None:
     assert actual.opacities[0] == 1
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
-def test_columns_are_those_of_version_3(degree: int) -> None:
-    older = gzip.decompress(spz_bytes(some(degree)))
-    header, columns = columns_of(spz_bytes(some(degree), [MIP_COMMENT], version=4))
-    assert columns == older[16:]
-    fraction = older[13]
-    assert header == (0x5053474E, 4, 50, degree, fraction, 1, 6 if degree else 5)
-
-
 def test_harmonics_of_degree_4(tmp_path: Path) -> None:
     path, gaussians = tmp_path / "a.spz", some(4)
-    write_gaussians(path, gaussians, spz_version=4, comments=["SplatRenderMode: mip"])
+    path.write_bytes(spz4_bytes(gaussians, mip=True))
     ply = read_gaussians(path)
     assert ply.info.bytes_by_attribute["shN"] == 72 * len(gaussians)
     assert float(np.abs(ply.gaussians.shN - gaussians.shN).max()) <= 8.5 / 128
     np.testing.assert_allclose(ply.gaussians.means, gaussians.means, atol=1e-4)
     assert list(kept_comments(ply.info)) == ["SplatRenderMode: mip"]
-    assert lost_harmonics("a.spz", 4, 4) is None
-    assert "above degree 3" in str(lost_harmonics("a.spz", 4))
+    write_gaussians(tmp_path / "b.spz", gaussians)
+    assert read_gaussians(tmp_path / "b.spz").info.layout == ".spz version 3, SH degree 3"
 
 
 def test_extensions_are_passed_over(tmp_path: Path) -> None:
-    content, more = spz_bytes(some(1), version=4), struct.pack("<II4x", 0xADBE0003, 4)
+    content, more = spz4_bytes(some(1)), struct.pack("<II4x", 0xADBE0003, 4)
     moved = content[:16] + struct.pack("<I", 32 + len(more)) + content[20:32] + more + content[32:]
     for name, data in {"plain": content, "more": moved}.items():
         (tmp_path / f"{name}.spz").write_bytes(data)
@@ -130,7 +108,7 @@ def spz_with(**changes: int) -> bytes:
     return gzip.compress(struct.pack("<3I4B", *header.values()) + data[16:])
 
 
-WHOLE = spz_bytes(some(1), version=4)
+WHOLE = spz4_bytes(some(1))
 
 
 OLDER = {
@@ -194,19 +172,14 @@ def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
     assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
 
 
-def test_another_version_is_refused() -> None:
-    with refuses(ValueError, "spz_version", "3 or 4", 2):
-        spz_bytes(some(0), version=2)
-
-
 def test_without_the_library(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.spz"
     path.write_bytes(NIANTIC)
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(UsageError, match=r'pip install "zstandard'):
-        write_gaussians(tmp_path / "b.spz", some(0), spz_version=4)
+    with refuses(UsageError, ".spz of version 4", "gsmerge[spz4]", 'pip install "zstandard'):
+        read_gaussians(path)
     assert main(["inspect", str(path)]) == 2
     assert "zstandard is" in capsys.readouterr().err
     write_gaussians(tmp_path / "b.spz", some(0))

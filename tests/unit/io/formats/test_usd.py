@@ -18,7 +18,7 @@ from gsmerge.geometry import covariances
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.arrays import to_columns, turn_half
 
-ENDINGS = (".usdc", ".usda", ".usdz")
+ENDINGS = (".usdc", ".usdz")
 
 
 def read_usd(path: Path) -> Gaussians:
@@ -55,8 +55,8 @@ def test_usd_core_reads_the_same_upright(ending: str, degree: int, tmp_path: Pat
 
 def test_the_stage_says_what_viewers_ask_for(tmp_path: Path) -> None:
     gaussians = random_gaussians(50, 1)
-    write_gaussians(tmp_path / "a.usda", gaussians)
-    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    write_gaussians(tmp_path / "a.usdc", gaussians)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     prim = stage.GetDefaultPrim()
     assert (str(prim.GetPath()), prim.GetTypeName()) == ("/Gaussians", "ParticleField3DGaussianSplat")
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)

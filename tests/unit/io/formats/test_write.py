@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from former_formats import compressed_bytes
 from messages import noted, refuses
 from plyfile import PlyData
 from slow_readers import corners, drawn, read_back
@@ -22,15 +23,12 @@ from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, 
 from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Gaussians
 
-QUANTISED = (".compressed.ply", ".spz", ".sog", ".splat")
+QUANTISED = (".spz", ".sog", ".splat")
 
 
 # dB between a render of the .ply and one of the file, of Gaussians with every parameter drawn at random; with rows in
 # another order alone, as in .compressed.ply and .sog, 44 of degree 0 and 37 of degree 3
-FLOORS = {
-    (".compressed.ply", 0): 40, (".spz", 0): 48, (".splat", 0): 48, (".sog", 0): 42,
-    (".compressed.ply", 3): 34, (".spz", 3): 32, (".sog", 3): 35,
-}  # fmt: skip
+FLOORS = {(".spz", 0): 48, (".splat", 0): 48, (".sog", 0): 42, (".spz", 3): 32, (".sog", 3): 35}
 
 
 def program() -> str | None:
@@ -60,6 +58,19 @@ def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene
     actual = read_back(path)
     assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
     assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
+
+
+@pytest.mark.parametrize(("degree", "floor"), [(0, 40), (3, 34)])
+def test_a_compressed_ply_is_read_and_no_longer_written(degree: int, floor: int, scene: Scene, tmp_path: Path) -> None:
+    gaussians, path = drawn(scene, degree), tmp_path / "a.compressed.ply"
+    path.write_bytes(compressed_bytes(gaussians, ["SplatRenderMode: mip"]))
+    actual = read_ply(path)
+    assert (actual.info.layout, actual.info.comments) == (f"compressed, SH degree {degree}", ("SplatRenderMode: mip",))
+    assert psnr(scene, gaussians, actual.gaussians) > floor
+    for name in ("b.compressed.ply", "B.USDA"):
+        with refuses(UsageError, name, "no longer written", ".usdz"):
+            write_gaussians(tmp_path / name, gaussians)
+    assert [one.name for one in tmp_path.iterdir()] == ["a.compressed.ply"]
 
 
 @needs_program
@@ -111,9 +122,7 @@ def test_rotations_are_the_same_up_to_a_sign(ending: str, tmp_path: Path) -> Non
     write_gaussians(tmp_path / f"a{ending}", gaussians)
     actual = read_back(tmp_path / f"a{ending}")
     cosines = np.abs((actual.quats * quats).sum(1))
-    assert (
-        float(cosines.min()) > {".splat": 0.9998, ".sog": 0.9998, ".spz": 0.99999, ".compressed.ply": 0.99999}[ending]
-    )
+    assert float(cosines.min()) > {".splat": 0.9998, ".sog": 0.9998, ".spz": 0.99999}[ending]
     assert float(np.abs(actual.means - means).max()) < 0.5
 
 
@@ -123,19 +132,19 @@ def test_harmonics_without_room_are_noted() -> None:
     assert lost_harmonics("a.spz", 3) is None
     note = lost_harmonics("a.splat", 1)
     assert note == ".splat has no room for harmonics above degree 0: left out"
-    assert "above degree 3" in str(lost_harmonics("a.COMPRESSED.ply", 4))
+    assert "above degree 3" in str(lost_harmonics("a.SPZ", 4))
     assert "COLMAP" in str(lost_harmonics("colmap/sparse/0/points3D.bin", 1))
 
 
 def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
-    for ending, degree in ((".ply", 3), (".spz", 3), (".sog", 3), (".compressed.ply", 3), (".splat", 0)):
+    for ending, degree in ((".ply", 3), (".spz", 3), (".sog", 3), (".splat", 0)):
         write_gaussians(tmp_path / f"a{ending}", drawn(scene, 4))
         assert read_back(tmp_path / f"a{ending}").sh_degree == degree
 
 
 @pytest.mark.parametrize(
     ("name", "ending"),
-    [("a.ply", ".ply"), ("a.compressed.ply", ".compressed.ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")],
+    [("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")],
 )
 def test_names_ask_for_formats(name: str, ending: str) -> None:
     assert output_format(name).ending == ending
@@ -143,7 +152,7 @@ def test_names_ask_for_formats(name: str, ending: str) -> None:
 
 @pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
 def test_other_names_are_refused(name: str) -> None:
-    with refuses(UsageError, name, ".compressed.ply, .ply, .spz, .sog, .splat, .glb, .usdc, .usda or .usdz"):
+    with refuses(UsageError, name, ".ply, .spz, .sog, .splat, .glb, .usdc or .usdz"):
         output_format(name)
 
 
@@ -176,19 +185,18 @@ def test_no_gaussians(ending: str, tmp_path: Path) -> None:
 
 
 def test_comments_reach_the_headers(tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "a.compressed.ply", corners(), comments=["SplatRenderMode: mip"])
-    assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.compressed.ply").info.comments
+    write_gaussians(tmp_path / "a.ply", corners(), comments=["SplatRenderMode: mip"])
+    assert "SplatRenderMode: mip" in read_ply(tmp_path / "a.ply").info.comments
     with refuses(ValueError, "comments", "ASCII"):
-        write_gaussians(tmp_path / "b.compressed.ply", corners(), comments=["two\nlines"])
+        write_gaussians(tmp_path / "b.spz", corners(), comments=["two\nlines"])
 
 
-@pytest.mark.parametrize("ending", [".ply", ".compressed.ply"])
-def test_comments_that_no_reader_takes(ending: str, tmp_path: Path) -> None:
+def test_comments_that_no_reader_takes(tmp_path: Path) -> None:
     lines = ["gsmerge cameras: " + "A" * 900] * 500
-    write_gaussians(tmp_path / f"a{ending}", corners(), comments=lines)
-    assert len(read_ply(tmp_path / f"a{ending}").gaussians) == len(corners())
+    write_gaussians(tmp_path / "a.ply", corners(), comments=lines)
+    assert len(read_ply(tmp_path / "a.ply").gaussians) == len(corners())
     with refuses(ValueError, "comments", "524,288"):
-        write_gaussians(tmp_path / f"b{ending}", corners(), comments=2 * lines)
+        write_gaussians(tmp_path / "b.ply", corners(), comments=2 * lines)
 
 
 def test_no_normals_is_the_same_without_twelve_bytes(scene: Scene, tmp_path: Path) -> None:

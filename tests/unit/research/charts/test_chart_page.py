@@ -61,7 +61,7 @@ def outline(page: str) -> Outline:
 def page_of(records: list[RunRecord], folder: Path, most_figures: int = 1) -> str:
     records = [*records, *make_proxies()]
     figures = make_figures(Results(records))[-most_figures:]
-    return make_page(records, figures, draw_figures(figures, folder / "charts"), folder, "gsmerge chart --draw-only")
+    return make_page(records, figures, draw_figures(figures, folder / "charts"), folder, "gsmerge lab chart")
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_every_reference_inside_the_page_is_there(page: str) -> None:
 def test_the_page_says_what_was_found(page: str) -> None:
     assert f"{54 + len(make_proxies())} runs on 3 scene(s): apples, fern, fox" in page
     assert "PSNR (dB) at equal size: no baseline&#39;s point lies above ours (6 points; 6 below ours" in page
-    assert "gsmerge chart scenes --budgets 1%,4.4%" in page
+    assert "gsmerge lab chart scenes --grid budget=1%,4.4%" in page
     assert "<td>processor</td><td>one</td>" in page
     assert "Failed runs" not in page
     for title in ("Results", "At equal cost", "Quality against time", "Superpixels alone", "When merging pays"):

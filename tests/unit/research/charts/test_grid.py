@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from gsmerge.research.charts.grid import (
     list_settings,
     make_jobs,
     parse_grid,
-    read_grid,
     scene_names,
 )
 from gsmerge.scene.exporters import ReadHints
@@ -29,7 +27,7 @@ def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:
 
 
 def test_the_product() -> None:
-    grid = parse_grid({"k": "1,2", "budgets": "0.5%, 2%,4000", "fit": "full,none"})
+    grid = parse_grid(["k=1,2", "budget=0.5%, 2%,4000", "fit=full,none"])
     made, notes = list_settings(grid)
     assert len(made) == 1 + 2 * 3 * 2
     assert len({(method, *sorted(settings.items())) for method, settings in made}) == len(made)
@@ -38,26 +36,26 @@ def test_the_product() -> None:
     assert ("gsmerge", {"budget": 4000, "k": 2, "fit": "none"}) in made
 
 
-@pytest.mark.parametrize("fixed", [(), ("recipe=paper",), ("effort=draft",)])
-def test_every_label_is_a_result_of_its_own(fixed: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("fixed", [{}, {"recipe": "paper"}, {"effort": "draft"}])
+def test_every_label_is_a_result_of_its_own(fixed: dict[str, str]) -> None:
     """A recipe, or an effort, decides what no list decides, and nothing else: four labels are four results."""
-    made, notes = list_settings(replace(parse_grid({"fit": "full,none", "matches": "overlap,aabb"}), fixed=fixed))
+    made, notes = list_settings(parse_grid(["fit=full,none", "match=overlap,aabb"], fixed))
     options = [CompactOptions().with_settings(settings) for method, settings in made if method == "gsmerge"]
     asked = {(one.fit.fit, one.match.match) for one in options}
     assert asked == {("full", "overlap"), ("full", "aabb"), ("none", "overlap"), ("none", "aabb")}
     assert notes == []
     (_, (_, alone)), _ = list_settings(Grid(fixed=fixed))
-    assert CompactOptions().with_settings(alone) == CompactOptions().with_settings(Grid(fixed=fixed).settings)
+    assert CompactOptions().with_settings(alone) == CompactOptions().with_settings(fixed)
 
 
 def test_a_list_goes_before_the_recipe_as_with_compact() -> None:
-    (_, (_, settings)), _ = list_settings(parse_grid({"fit": "full", "matches": "aabb"}, Grid(fixed=("recipe=paper",))))
+    (_, (_, settings)), _ = list_settings(parse_grid(["fit=full", "match=aabb"], {"recipe": "paper"}))
     assert settings == {"fit": "full", "recipe": "paper"}
 
 
 def test_baselines_run_once_per_size() -> None:
     combinations, notes = list_settings(
-        Grid(methods=("gsmerge", "voxel"), k=(1, 2), budgets=("1%",), superpixels=("10%",), fit=("full", "none"))
+        Grid(method=("gsmerge", "voxel"), k=(1, 2), budget=("1%",), superpixels=("10%",), fit=("full", "none"))
     )
     assert [settings for method, settings in combinations if method == "voxel"] == [
         {"budget": "1%"},
@@ -68,7 +66,7 @@ def test_baselines_run_once_per_size() -> None:
 
 
 def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
-    grid = Grid(methods=("unmerged", "unmerged-fit"), budgets=("1%", "2%"), efforts=("fast", "default"), fit=("none",))
+    grid = Grid(method=("unmerged", "unmerged-fit"), budget=("1%", "2%"), effort=("fast", "default"), fit=("none",))
     combinations, notes = list_settings(grid)
     assert combinations == [
         ("input", {}),
@@ -84,96 +82,51 @@ def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
     [
         ("k", "1,1", "1,1"),
         ("k", " , ", "none"),
-        ("budgets", "", "none"),
+        ("budget", "", "none"),
         ("views", "0", 0),
         ("views", "some", "'some'"),
     ],
 )
 def test_lists_that_cannot_be(name: str, text: str, found: object) -> None:
-    with refuses(UsageError, name, found):
-        parse_grid({name: text})
+    with refuses(UsageError, "", name, found):
+        parse_grid([f"{name}={text}"])
 
 
 @pytest.mark.parametrize(
     ("name", "text", "named"),
-    [("k", "9", ("k", "1 to 8", 9)), ("fit", "some", ("fit", "'some'")), ("budgets", "x", ("budget", "'x'"))],
+    [("k", "9", ("k", "1 to 8", 9)), ("fit", "some", ("fit", "'some'")), ("budget", "x", ("budget", "'x'"))],
 )
 def test_settings_that_the_library_refuses(name: str, text: str, named: tuple[object, ...]) -> None:
     with refuses(UsageError, *named):
-        make_jobs([], parse_grid({name: text}), EvaluateOptions(()))
-
-
-def test_files(tmp_path: Path) -> None:
-    grid = tmp_path / "grid.json"
-    grid.write_text('{"k": [1, 2], "budgets": ["1%", 500], "views": "all"}')
-    assert read_grid(grid) == Grid(k=(1, 2), budgets=("1%", 500), views=("all",))
-    assert parse_grid({"k": "2", "fit": None}, read_grid(grid)) == Grid(k=(2,), budgets=("1%", 500))
-
-
-def test_toml_files(tmp_path: Path) -> None:
-    pytest.importorskip("tomllib")
-    grid = tmp_path / "grid.toml"
-    grid.write_text('methods = ["gsmerge", "voxel"]\nviews = [3, 6]\n')
-    assert read_grid(grid) == Grid(methods=("gsmerge", "voxel"), views=(3, 6))
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("{", ("grid.json", "TOML", "JSON")), ("[]", ("grid.json", "table")), ('{"kk": [1]}', ("grid.json", "kk")),
-        ('{"views": [0]}', ("grid.json: views", 0)), ('{"views": [[1]]}', ("grid.json: views", 1)),
-        ('{"methods": [1]}', ("grid.json: methods", 1)),
-    ],
-)  # fmt: skip
-def test_files_that_hold_no_grid(text: str, named: tuple[object, ...], tmp_path: Path) -> None:
-    grid = tmp_path / "grid.json"
-    grid.write_text(text)
-    with refuses(SceneError, *named):
-        read_grid(grid)
+        make_jobs([], parse_grid([f"{name}={text}"]), EvaluateOptions(()))
 
 
 def test_fixed_settings_are_those_of_ours_alone() -> None:
-    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), fixed=("robust=false", "match=none", "iterations=3"))
+    grid = Grid(method=("gsmerge", "random"), budget=("1%",), fixed={"robust": False, "match": "none"})
     combinations, _ = list_settings(grid)
     assert combinations[1:] == [
-        ("gsmerge", {"budget": "1%", "robust": False, "match": "none", "iterations": 3}),
+        ("gsmerge", {"budget": "1%", "robust": False, "match": "none"}),
         ("random", {"budget": "1%"}),
     ]
 
 
-@pytest.mark.parametrize("text", ["robust", "=1", ""])
-def test_fixed_settings_are_names_and_values(text: str) -> None:
-    with pytest.raises(UsageError, match="NAME=VALUE"):
-        list_settings(Grid(fixed=(text,)))
+@pytest.mark.parametrize("pairs", [["match=none,aabb"], ["k=1"], ["budget=2%"], []])
+def test_what_is_decided_twice(pairs: list[str]) -> None:
+    name = pairs[0].partition("=")[0] if pairs else "method"
+    with refuses(UsageError, f"--set {name}", f"--grid {name}"):
+        parse_grid(pairs, {name: "voxel"})
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("method=voxel", "--methods"), ("seed=3", "--seed"), ("threads=1", "--threads"), ("min_contribution=[1]", [1]),
-        ("min_contribution={}", {}), ("min_contribution=NaN", "NaN"),
-    ],
-)  # fmt: skip
-def test_what_cannot_be_fixed(text: str, found: object) -> None:
-    with refuses(UsageError, "fixed", text.partition("=")[0], found):
-        list_settings(Grid(fixed=(text,)))
-
-
-@pytest.mark.parametrize(
-    ("name", "values", "option"),
-    [("match", "none,aabb", "--matches"), ("k", "1", "--k"), ("budget", "2%", "--budgets")],
-)
-def test_what_is_decided_twice(name: str, values: str, option: str) -> None:
-    with refuses(UsageError, "fixed", name, option):
-        list_settings(parse_grid({option.removeprefix("--"): values}, Grid(fixed=(f"{name}=3",))))
-    with refuses(UsageError, "fixed", name, "twice"):
-        list_settings(Grid(fixed=(f"{name}=3", f"{name}=3")))
+def test_lists_that_are_none() -> None:
+    for pairs in (["kk=1"], ["k=1", "k=2"], ["k"]):
+        with refuses(UsageError, f"--grid {pairs[0].partition('=')[0]}"):
+            parse_grid(pairs)
 
 
 def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
     with refuses(UsageError, "method splat-transform", "/nowhere/splat-transform", "@playcanvas/splat-transform@3.7.0"):
-        make_jobs([], Grid(methods=("gsmerge", "splat-transform"), budgets=("1%",)), EvaluateOptions(()))
+        make_jobs([], Grid(method=("gsmerge", "splat-transform"), budget=("1%",)), EvaluateOptions(()))
 
 
 def test_names_are_as_short_as_can_be() -> None:
@@ -247,8 +200,8 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 
 
 def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -> None:
-    fixed = ("checkpoint=a/b.safetensors", "min_opacity=0.1")
-    grid = Grid(methods=("gsmerge", "random"), budgets=("1%",), views=(2, 5, 9, "all"), fixed=fixed)
+    fixed = {"checkpoint": "a/b.safetensors", "min_opacity": 0.1}
+    grid = Grid(method=("gsmerge", "random"), budget=("1%",), views=(2, 5, 9, "all"), fixed=fixed)
     jobs, notes = make_jobs(sources(made_scene), grid, EvaluateOptions(()), proxy_views=1)
     assert len({job.output for job in jobs}) == len(jobs) == 2 * 3 + 1
     assert noted(notes, made_scene.name, "6 run(s)")  # of nine views, and of five, which are all
@@ -265,6 +218,6 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
 
     assert key() == key(command="another")
     others = [key(measured=EvaluateOptions(("vgg",))), key(opacity="raw"), key(seed=1)]
-    others += [key(hints=ReadHints(order="none")), key(grid=Grid(budgets=("1%",)))]
+    others += [key(hints=ReadHints(order="none")), key(grid=Grid(budget=("1%",)))]
     others += [key(measured=EvaluateOptions((), photo_side=476))]
     assert len({key(), *others}) == 7

@@ -39,7 +39,7 @@ def example() -> Example:
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Three of ``gsmerge generate``'s. Read only."""
+    """Three of ``gsmerge lab generate``'s. Read only."""
     folder = tmp_path_factory.mktemp("made")
     return [
         scene.folder for scene in generate(folder, 3, GenerateOptions(width=48, height=36, views=(2, 3)), threads=1)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from training_runs import OPTIONS, TINY, noisy_networks, torch, written
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT, residual_limits
-from gsmerge.networks.options import Bounds, NetworkOptions
+from gsmerge.networks.options import Bounds
 from gsmerge.networks.tensors import move_tensors
 from gsmerge.research.training import (
     Example,
@@ -23,7 +22,6 @@ from gsmerge.research.training import (
     choose_device,
     make_example,
     preset_options,
-    read_config,
     train,
 )
 from gsmerge.research.training.modules import Networks
@@ -31,6 +29,7 @@ from gsmerge.research.training.predict import analytic_gaussians, crop_targets, 
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.research.training.targets import corrections_between
 from gsmerge.research.training.windows import Crop, sample_crop
+from gsmerge.settings.setting import change_settings
 from gsmerge.stages.merge import merge
 from gsmerge.types import Scene
 
@@ -202,10 +201,6 @@ def test_settings_are_checked(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)
-    assert TrainOptions().with_settings(json.loads(json.dumps(OPTIONS.to_dict()))) == OPTIONS
-    for values in ({"step": 3}, {"network": {"depth": 1}}, {"network": 3}):
-        with pytest.raises(ValueError, match=r"unknown|network"):
-            TrainOptions().with_settings(values)
 
 
 def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_path: Path) -> None:
@@ -225,18 +220,15 @@ def test_checkpoints_show_more_than_the_networks_in_training(shard: Shard, tmp_p
     assert rows == (tmp_path / "0.0" / "losses.csv").read_text()
 
 
-def test_presets_are_settings_that_a_file_can_change(tmp_path: Path) -> None:
-    paper, config = preset_options("paper"), tmp_path / "run.json"
+def test_presets_are_settings() -> None:
+    paper = preset_options("paper")
     assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
     assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
     assert (paper.rate_at(1999), paper.photo_step, paper.clip) == (5e-5, 0, 10)
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
     assert preset_options("default") == TrainOptions()
-    config.write_text(json.dumps({"steps": 10, "network": {"width": 16, "bounds": {"mean": 0.5}}}))
     network = replace(paper.network, width=16, bounds=Bounds(mean=0.5))
-    assert read_config(config, paper) == replace(paper, steps=10, network=network)
-    ours = NetworkOptions(width=16, bounds=Bounds(mean=0.5))
-    assert read_config(config) == replace(TrainOptions(), steps=10, network=ours)
+    assert change_settings(paper, {"steps": 10, "width": 16, "mean": 0.5}) == replace(paper, steps=10, network=network)
     assert not paper.uses_fit
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1

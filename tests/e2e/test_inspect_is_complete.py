@@ -1,4 +1,4 @@
-"""``gsmerge check`` refuses what other commands refuse, by the same line: mutations of sound files of every kind.
+"""``gsmerge inspect`` refuses what other commands refuse, by the same line: mutations of sound files of every kind.
 
 ``test_hostile_input.py`` holds the same for the table of hostile inputs.
 """
@@ -15,18 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from forked_commands import CommandServer, Limits, refused_by_check
+from forked_commands import CommandServer, Limits, refused_by_inspect
 from fuzz.mutate import mutate
 from hostile import array_files, camera_models, places
 from hostile.case import cameras_of, without_transforms
-from messages import noted, says
+from messages import says
+from saved_cameras import embed as embed_cameras
 
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
-from gsmerge.io.cameras.embedded import camera_comments
 
 COUNT, MANY = 3, 60  # mutations of a kind
 LIMITS = Limits(1 << 30, 100)
@@ -38,9 +37,7 @@ def embed(folder: Path) -> None:
     cameras = gsmerge.read_cameras(folder / "transforms.json")
     scene = gsmerge.read_scene(folder)
     without_transforms(folder)
-    lines = "".join(f"comment {line}\n" for line in camera_comments(scene.cameras, cameras.names))
-    path = folder / "scene.ply"
-    path.write_bytes(path.read_bytes().replace(b"element", lines.encode() + b"element", 1))
+    embed_cameras(folder / "scene.ply", scene.cameras, cameras.names)
 
 
 def alone(name: str) -> Callable[[Path], None]:
@@ -136,7 +133,7 @@ def placed(words: tuple[str, ...], folder: Path) -> list[object]:
     ("name", "count"),
     [*((name, COUNT) for name in OFTEN), *(pytest.param(name, MANY, marks=pytest.mark.slow) for name in KINDS)],
 )
-def test_what_a_command_refuses_check_refuses(
+def test_what_a_command_refuses_inspect_refuses(
     name: str, count: int, smallest_scene: Path, tmp_path: Path, server: CommandServer
 ) -> None:
     kind, rng = KINDS[name], random.Random(f"{name} {count}")
@@ -154,23 +151,18 @@ def test_what_a_command_refuses_check_refuses(
         assert refusal.code in (0, 3), refusal
         if refusal.code == 3:
             num_refused += 1
-            refused_by_check(refusal, server.run(["inspect", words[-1]], LIMITS))
+            refused_by_inspect(refusal, server.run(["inspect", words[-1]], LIMITS))
         path.write_bytes(sound)
     assert num_refused or count < MANY
 
 
-def test_what_was_not_read_is_said(smallest_scene: Path, tmp_path: Path) -> None:
+def test_a_file_is_read_with_what_is_beside_it(smallest_scene: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
     whole, alone = check_content(folder), check_content(folder / "scene.ply")
     assert (whole.num_views, whole.num_photos, whole.problems, whole.notes) == (3, 3, (), ())
-    assert (alone.num_views, alone.count) == (0, whole.count)
-    assert noted(alone.notes, "not read", "transforms.json", "images")
+    assert (alone.num_views, alone.count) == (3, whole.count)
     of_views("views.npz")(folder)
-    np.savez(folder / "more.npz", **np.load(folder / "views.npz"), confidence=np.ones(3))
-    assert noted(check_content(folder / "more.npz").notes, "not read", "confidence")
     assert not check_content(folder / "views.npz").notes
-    (folder / "scene.ply").unlink()
-    assert noted(check_content(folder).notes, "no Gaussians")
 
 
 def test_all_scenes_of_a_chunk_are_read(smallest_scene: Path, tmp_path: Path) -> None:

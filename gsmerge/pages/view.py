@@ -1,0 +1,114 @@
+"""Show scenes and results in notebooks and browsers: the page of ``gsmerge view`` for what is in memory."""
+
+from __future__ import annotations
+
+import html
+import webbrowser
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING
+
+from gsmerge.facts.place_cameras import add_views
+from gsmerge.io.atomic import atomic_output
+from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.read import read_gaussians
+from gsmerge.pages.data import collect
+from gsmerge.pages.page import headline, view_page
+from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.record import Progress, record_run
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.read import as_scene
+from gsmerge.types import Gaussians, Scene, StrPath, Views
+
+if TYPE_CHECKING:
+    from gsmerge.compaction.result import CompactResult
+
+MOST_SOLID = 600_000  # Gaussians of a scene of which a page has the stills alone: 8 MB of a notebook
+HEIGHT = 820  # pixels of a page in a notebook
+
+
+@dataclass(frozen=True, repr=False)
+class Page:
+    """A page in one file, which notebooks show."""
+
+    text: str  # HTML
+    headline: str
+
+    def __repr__(self) -> str:
+        return f"Page({self.headline}, {human_bytes(len(self.text))})"
+
+    def _repr_html_(self) -> str:
+        style = f"width: 100%; height: {HEIGHT}px; border: 0"
+        return f'<iframe srcdoc="{html.escape(self.text)}" style="{style}" allowfullscreen></iframe>'
+
+    def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
+        """Write the page as an ``.html`` file that opens anywhere; return its path."""
+        with atomic_output(path, overwrite=overwrite) as temporary:
+            temporary.write_text(self.text, encoding="utf-8")
+        return Path(path)
+
+    def open(self) -> None:
+        """Open the page in the browser, from a temporary file."""
+        webbrowser.open(self.save(Path(mkdtemp(prefix="gsmerge-")) / "view.html").as_uri())
+
+
+def view(
+    scene: Scene | StrPath,
+    results: Mapping[str, CompactResult | Gaussians | StrPath] | CompactResult | Gaussians | StrPath | None = None,
+    held_out: Views | None = None,
+    *,
+    light: bool | None = None,
+    progress: Progress | None = None,
+) -> Page:
+    """Show a scene, alone or beside results: photos, a swipe, 3D and scores, as ``gsmerge view`` does.
+
+    Args:
+        scene: What :func:`gsmerge.read_scene` returns, or the path that it reads.
+        results: Results of it by name, or one: what :func:`gsmerge.compact` returns, Gaussians, or paths of files.
+        held_out: Views with photos that were no input, to score them on.
+        light: Leave out the scene's own Gaussians, whose stills remain; None: where there are more than 600,000.
+        progress: Called with (what is done, done, of how many).
+
+    Returns:
+        A page that a notebook shows as the last value of a cell; ``save(path)`` writes it as one ``.html`` file,
+        ``open()`` opens it in the browser.
+
+    Example:
+        >>> result = gsmerge.compact("demo", effort="draft", budget=300)
+        >>> page = gsmerge.view("demo", {"small": result})
+        >>> page.save("demo/small.html", overwrite=True).name
+        'small.html'
+    """
+    with record_run(progress):
+        read = as_scene(scene).numpy()
+        shown = read if read.aligned else add_views(read)
+    given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
+    gaussians = {name: _gaussians_of(value) for name, value in given.items()}
+    cameras = {
+        name: replace(shown.cameras, viewmats=moved.numpy().viewmats)
+        for name, value in given.items()
+        if (moved := getattr(value, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
+    }
+    data = collect(
+        Path(scene).stem if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
+        [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
+        progress=progress or (lambda *_: None),
+    )  # fmt: skip
+    return Page(view_page(data), headline(data))
+
+
+def _gaussians_of(result: CompactResult | Gaussians | StrPath) -> Gaussians:
+    if isinstance(result, str | PathLike):
+        return read_gaussians(result).gaussians
+    return result if isinstance(result, Gaussians) else result.gaussians
+
+
+def _num_bytes(value: Scene | CompactResult | Gaussians | StrPath) -> int:
+    """Return the size of a file; of what is in memory that of a ``.ply`` with it."""
+    if isinstance(value, str | PathLike):
+        return sum(path.stat().st_size for path in find_scene_files(value).plys)
+    gaussians = value if isinstance(value, Gaussians) else value.gaussians
+    return file_bytes(len(gaussians), gaussians.sh_degree)

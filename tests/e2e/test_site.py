@@ -1,0 +1,192 @@
+"""``-o site/``: a folder that any web server publishes, and that opens from disk once it is chosen in the browser."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from browser import CHROMIUM, Browser, browser, needs_browser
+
+import gsmerge
+from gsmerge.measure.evaluate import near_plane
+from gsmerge.raster.metrics import psnr
+
+from .conftest import Run, assert_refused
+
+FILES = ["LICENSES.txt", "index.html", "poster.webp", "scene.sog", "spark-three.bin"]
+PATIENCE = 120.0  # seconds: 3D on a processor that other tests use as well
+SETTLED = "typeof site !== 'undefined' && site !== null && stage.getAttribute('aria-busy') === 'false'"
+PLACE = "column(site.camera.matrix, 3).toArray()"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_compact_writes_a_site_whole_or_not_at_all(run: Run, small_copy: Path) -> None:
+    site = small_copy / "site"
+    document = json.loads(run("compact", small_copy, "-o", f"{site}/", "--effort", "draft", "--json", code=0).out)
+    assert names(site) == FILES
+    assert document["output"]["path"] == str(site / "index.html")
+    assert document["output"]["bytes"] == sum(path.stat().st_size for path in site.iterdir())
+    written = (site / "scene.sog").read_bytes()
+    assert_refused(run("compact", small_copy, "-o", site, "--budget", "50"), 2, site / "index.html")
+    (site / "scene.sog").write_bytes(b"")
+    (site / "index.html").unlink()  # what is left is no site: the result goes into the folder
+    run("compact", small_copy, "-o", site, "--effort", "draft", code=0)
+    assert "scene.compact.ply" in names(site)
+    assert written != b""
+
+
+def test_a_budget_in_bytes_is_that_of_the_scene(run: Run, small_copy: Path) -> None:
+    run("compact", small_copy, "-o", small_copy / "site", "--effort", "draft", "--budget", "12kB", code=0)
+    assert 10_000 < (small_copy / "site" / "scene.sog").stat().st_size <= 12_000
+
+
+def test_levels_have_no_site(run: Run, small_copy: Path) -> None:
+    assert_refused(
+        run("compact", small_copy, "-o", small_copy / "site", "--levels", "2"), 2, small_copy / "site" / "index.html"
+    )
+    assert not (small_copy / "site").exists()
+
+
+def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, small_copy: Path) -> None:
+    small, site = small_copy / "small.ply", small_copy / "site"
+    run("compact", small_copy, "-o", small, "--effort", "draft", code=0)
+    run("convert", small, site, code=0)
+    assert names(site) == FILES
+    before = (site / "index.html").read_bytes()
+    run("convert", small, site, "--scale", "2", "--overwrite", code=0)
+    assert names(site) == FILES
+    assert (site / "index.html").read_bytes() != before
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def site(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from gsmerge.cli import main
+
+    folder = tmp_path_factory.mktemp("made") / "site"
+    assert main(["compact", str(made_scene), "-o", str(folder), "--effort", "draft", "-q"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def served(site: Path) -> Iterator[str]:
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/index.html"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(CHROMIUM, tmp_path_factory.mktemp("profile"), "--enable-unsafe-swiftshader") as opened:
+        yield opened
+
+
+def wait(tab: Browser, condition: str = SETTLED) -> None:
+    end = time.monotonic() + PATIENCE
+    while not tab.run(condition):
+        assert time.monotonic() < end, tab.run("id('status').textContent")
+        time.sleep(0.05)
+
+
+def picture(tab: Browser) -> np.ndarray:
+    """``[h,w,3]`` what the stage shows, in [0, 1]."""
+    wait(tab)
+    box = tab.run("JSON.parse(JSON.stringify(stage.getBoundingClientRect()))")
+    clip = {**{name: box[name] for name in ("x", "y", "width", "height")}, "scale": 1}
+    data = tab.call("Page.captureScreenshot", format="png", clip=clip)["data"]
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(image[..., ::-1], np.float32) / 255
+
+
+@needs_browser()
+def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
+    tab: Browser, served: str, site: Path, made_scene: Path
+) -> None:
+    tab.open(served)
+    wait(tab)
+    host = served.removesuffix("index.html")
+    assert [url for url in tab.requests() if not url.startswith((host, f"blob:{host}"))] == []
+    width, height = tab.run("[data.views[0].width, data.views[0].height]")
+    tab.run(f"stage.style.flex = 'none'; stage.style.minHeight = 0; stage.style.width = '{width}px'")
+    tab.run(f"stage.style.height = '{height}px'; const usual = frame; frame = () => ({{...usual(), exact: true}}); 0")
+    tab.run("site.frame = frame; site.look(data.start); 0")
+    scene = gsmerge.read_scene(made_scene)
+    middle = tab.run("data.views[data.start].viewmat")
+    view = int(np.abs(scene.cameras.viewmats.reshape(-1, 16) - middle).sum(1).argmin())
+    gaussians = gsmerge.read_gaussians(site / "scene.sog").gaussians
+    drawn = gsmerge.render(gaussians, scene.cameras[[view]], near=near_plane(scene)).images[0].clip(0, 1)
+    assert psnr(picture(tab), drawn) > 30
+
+
+@needs_browser()
+def test_the_camera_stays_where_photos_stood(tab: Browser, served: str) -> None:
+    tab.open(served)
+    wait(tab)
+    start = tab.run(PLACE)
+    beyond = "([along, most]) => column(site.camera.matrix, 3).dot(along) > most + 1e-3 * Math.abs(most)"
+    for motion in ("site.orbit(0.3, 0.05)", "site.fly(0, 0, 1)", "site.fly(1, 1, -1)", "site.pan(0.4, 0.4)"):
+        for _ in range(15):
+            tab.run(f"{motion}; 0")
+        assert tab.run(f"site.places.some({beyond})") is False
+        assert tab.run(PLACE) != pytest.approx(start)
+    tab.run("site.nearer(1e6); 0")
+    assert tab.run("[site.lens, MOST_LENS]") == pytest.approx([5, 5])
+    tab.run("id('reset').click()")
+    assert tab.run(PLACE) == pytest.approx(start)
+    assert tab.run("site.lens") == 1
+
+
+@needs_browser()
+def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: str) -> None:
+    tab.open(served)
+    tab.call("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=True)
+    tab.call("Emulation.setTouchEmulationEnabled", enabled=True)
+    wait(tab)
+    assert tab.run("document.documentElement.scrollWidth") == 390
+    heights = tab.run("[...document.querySelectorAll('.plain')].map((one) => one.offsetHeight).filter(Boolean)")
+    assert min(heights) >= 44
+    start = tab.run(PLACE)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        marks = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+        tab.call("Input.dispatchTouchEvent", type=kind, touchPoints=marks)
+
+    touch("touchStart", (200, 300))
+    touch("touchMove", (120, 300))
+    touch("touchEnd")
+    turned = tab.run(PLACE)
+    assert np.linalg.norm(np.subtract(turned, start)) > 1e-3
+    before = tab.run("[site.lens / column(site.camera.matrix, 3).distanceTo(site.target)]")[0]
+    touch("touchStart", (180, 300), (220, 300))
+    touch("touchMove", (120, 300), (280, 300))
+    touch("touchEnd")
+    assert tab.run("[site.lens / column(site.camera.matrix, 3).distanceTo(site.target)]")[0] > 1.5 * before
+
+
+@needs_browser()
+def test_from_disk_it_shows_a_picture_and_asks_for_its_folder(tab: Browser, site: Path) -> None:
+    tab.open(site / "index.html")
+    assert tab.run("[id('disk').hidden, id('poster').naturalWidth > 0, id('status').textContent]") == [False, True, ""]
+    root = tab.call("DOM.getDocument")["root"]["nodeId"]
+    node = tab.call("DOM.querySelector", nodeId=root, selector="#folder")["nodeId"]
+    tab.call("DOM.setFileInputFiles", nodeId=node, files=[str(site)])
+    wait(tab)
+    assert tab.run("[id('disk').hidden, id('canvas').hidden, id('poster').hidden]") == [True, False, True]

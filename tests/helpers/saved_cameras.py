@@ -1,0 +1,48 @@
+"""Cameras as ``transforms.json``, in a file or in the header of a ``.ply``, where older versions wrote them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import textwrap
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, from_viewmats
+from gsmerge.io.cameras.embedded import PREFIX
+from gsmerge.types import Cameras
+
+
+def transforms_document(cameras: Cameras, names: Sequence[str]) -> dict[str, Any]:
+    """Nerfstudio's ``transforms.json`` with all intrinsics."""
+    frames = [
+        {
+            "file_path": name, "w": cameras.width, "h": cameras.height, "fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]),
+            "cx": float(K[0, 2]), "cy": float(K[1, 2]), "transform_matrix": pose.tolist(),
+        }
+        for name, K, pose in zip(
+            names, cameras.Ks, from_viewmats(cameras.viewmats.astype(np.float64), C2W_OPENGL), strict=True
+        )
+    ]  # fmt: skip
+    return {"camera_model": "PINHOLE", "frames": frames}
+
+
+def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    path.write_text(json.dumps(transforms_document(cameras, names)), encoding="utf-8")
+
+
+def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
+    """Comments for the header of a ``.ply``."""
+    text = json.dumps(transforms_document(cameras, names))
+    packed = base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")
+    return [PREFIX + line for line in textwrap.wrap(packed, 900)]
+
+
+def embed(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write cameras into the header of a ``.ply``."""
+    lines = "".join(f"comment {line}\n" for line in camera_comments(cameras, names))
+    path.write_bytes(path.read_bytes().replace(b"element", lines.encode() + b"element", 1))
