@@ -28,8 +28,10 @@ from gsmerge.pages.data import ViewData, collect, encode_still, short_names
 from gsmerge.pages.drops import draw_drops
 from gsmerge.pages.splats import pack_splats
 from gsmerge.raster.metrics import psnr
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.clean import clean
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import Views
+from gsmerge.types import PicturedScene, Views
 
 
 @pytest.fixture(scope="module")
@@ -188,24 +190,21 @@ def test_a_light_page_has_no_gaussians_of_the_scene(small: Scene) -> None:
 
 def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
     """Floaters and sky as ``compact --drop`` takes them, in the pictures that show them."""
-    half = small.gaussians[::2]
-    far = half[:2]
-    far = replace(far, means=far.means + np.array([(0, 0, 80), (0, 0, 90)], np.float32), scales=far.scales * 40)
-    both = Gaussians.concat([half, far])
-    shown = collect("room", small, {"half": half, "both": both}, (3, 2, 1))
-    assert [side.dropped for side in shown.sides] == [{}, {}, {"floaters": 2}]
-    drawn = collect("room", small, {"both": far}, (2, 1)).outside
-    assert len(drawn.drops) == 2
-    masks = {"floaters": np.arange(len(both)) >= len(half)}
-    frame = scene_frame(small)
-    camera = frame.enter_cameras(small.cameras)[[0]]
+    half, frame = small.gaussians[::2], scene_frame(small)
+    entered, camera = frame.enter(half), frame.enter_cameras(small.cameras)
+    seen = PicturedScene(entered, camera, small.images, None, small.names)
+    _, counts = clean(entered, CleanOptions(drop="floaters,sky"), seen, frame.leave)
+    shown = collect("room", small, {"half": half}, (2, 1))
+    assert [side.dropped for side in shown.sides] == [{}, {word: n for word, n in counts.items() if n}]
+    assert counts["floaters"] > 0
+    assert all(view.drops[0] is None for view in shown.shown)
+    assert any(view.drops[1] for view in shown.shown)
     near = near_plane(small) / frame.unit
-    assert draw_drops(frame.enter(both), {"sky": ~masks["floaters"]}, camera, near) is not None
-    mask = draw_drops(frame.enter(both), {"sky": ~masks["floaters"]}, camera, near)
+    mask = draw_drops(entered, {"sky": np.ones(len(half), bool)}, camera[[0]], near)
     picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (small.cameras.height, small.cameras.width, 4)
     assert set(map(tuple, picture[picture[..., 3] > 0])) == {(255, 170, 20, 255)}
-    assert draw_drops(frame.enter(half), {"floaters": np.zeros(len(half), bool)}, camera, near) is None
+    assert draw_drops(entered, {"floaters": np.zeros(len(half), bool)}, camera[[0]], near) is None
 
 
 def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
