@@ -44,7 +44,7 @@ def pack_splats(
     steps, levels = COARSE if count > MANY else EXACT
     stored = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
     means, opacities, colors, scales, _, harmonics = stored.parts
-    head: dict[str, Any] = {"count": count, "degree": degree, "fraction": stored.fraction}
+    head: dict[str, Any] = {"count": count, "degree": degree, "fraction": stored.header[13]}
     places = None
     if cameras is not None and pixel_ids is not None:
         places = _pixel_places(gaussians.means[drawn], cameras, pixel_ids[drawn])
