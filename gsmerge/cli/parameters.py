@@ -341,7 +341,6 @@ SCENE = argument("scene", Path, "SCENE", "A .ply with one Gaussian per pixel and
 COMPACT_SCENE = "The compact scene: .ply, .spz, .sog, .splat, .glb, .usdc or .usdz, by its name."
 READING = "cameras images hint"
 TARGETS = "targets target_images"
-RUN = "seed threads"
 
 _TABLE = (
     panel(

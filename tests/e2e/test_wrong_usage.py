@@ -26,6 +26,8 @@ USAGE = {
     "compact room --up y": "*--up*gsmerge convert",
     "compact room --report a.json": "*--report*--json",
     "compact room --superpixels 3%": "*--superpixels*--set superpixels=VALUE",
+    "inspect room --masks room": "*--masks*beside the photos",
+    "lab chart room --k 1,2": "*--k*--set k=VALUE*--grid k=A,B",
     "inspect room --seed 1": "*--seed*GSMERGE_SEED",
     "inspect room alone.ply --cameras room": "--cameras and --images*one scene",
     "chart room": "*chart*gsmerge lab chart",
