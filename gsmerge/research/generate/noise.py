@@ -98,7 +98,7 @@ def read_ranges(path: Path) -> NoiseOptions:
     try:
         return NoiseOptions(**values)
     except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error)) from error
+        raise SceneError(path, f"expected two numbers for each range ({error})") from error
 
 
 RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]
