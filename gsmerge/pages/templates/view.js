@@ -251,7 +251,7 @@ async function load(made) {
 
 async function startScene() {
   const probe = document.createElement("canvas");
-  if (!id("engine")) return say("Stills only: too many Gaussians for a page");
+  if (!id("engine")) return say("Stills only: this page holds no Gaussians");
   if (!window.DecompressionStream || !probe.getContext("webgl2")) return say("Stills only: this browser has no WebGL 2");
   say("3D loads …");
   const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
