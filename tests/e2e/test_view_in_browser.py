@@ -34,7 +34,8 @@ BARE = (
 FRESH = (
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('pixels', 'screen'); set('shape', 'splats');"
+    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', '');"
+    "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
 )

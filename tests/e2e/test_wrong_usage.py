@@ -119,7 +119,6 @@ USAGE = {
     "render room --path room/targets --frames 9 -o a.mp4": "--frames*--views",
     "render room --path spline --views 1 -o a.mp4": "spline*2*1",
     "render room --frames 9 -o a": "--frames*--path",
-    "view room alone.ply -o a.html --set superpixels=99999": "superpixels*1536*99999",
     "evaluate room --lpips none --no-context": "*--no-context*--set context=false",
     "evaluate room --lpips none --set context=false": "context=false*held-out*--targets",
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",

@@ -19,10 +19,8 @@ from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
 from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
-from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
-from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import Settings, join_words, setting, settings_of
 
 ALL = "all"  # word for all views
@@ -177,14 +175,11 @@ def make_jobs(
     seed: int = 0,
     proxy_views: int = 0,
     command: str = "",
-    opacity: OpacityChoice = "auto",
-    hints: ReadHints = AUTO,
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 
     ``proxy_views``: photos of each scene on which superpixels alone are measured; 0: none. ``command``: the command
-    line, for the records. ``opacity`` and ``hints``: how to read all scenes. A UsageError if the library does not take
-    a setting.
+    line, for the records. A UsageError if the library does not take a setting.
     """
     combinations, notes = list_settings(grid)
     counts = [None if count == ALL else int(count) for count in grid.views]
@@ -209,7 +204,7 @@ def make_jobs(
             name = name if name == label else f"{name} {digest({'label': label})[:6]}"
             output = f"{source.name}/{name}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
-            run = ChartRun(record, options, measured, source.targets, source.target_images, opacity, hints)
+            run = ChartRun(record, options, measured, source.targets, source.target_images)
             share = min(1.0, (views or most) / most) if source.num_views else 1.0
             jobs.append(Job(str(source.path), (output,), run, round(share * num_gaussians), num_rest))
     return jobs, notes

@@ -34,12 +34,11 @@ from gsmerge.raster.metrics import psnr
 from gsmerge.report import document_head
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.scene.content_hash import digest
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Gaussians, Scene, Views
 
@@ -180,20 +179,18 @@ class ChartRun:
     measured: EvaluateOptions  # what is measured
     targets: Path | None = None  # cameras of held-out views
     target_images: Path | None = None  # folder of their photos; None: found by their cameras
-    opacity: OpacityChoice = "auto"  # how the scene's files store it
-    hints: ReadHints = AUTO  # for reading them
 
     def key(self, files: SceneFiles) -> str:
         """Return a digest of everything that the measurements depend on; the record has the hash of the files."""
         run = asdict(replace(self.record, command=""))
         how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
-        return digest({"run": run, **how, "opacity": self.opacity, "reading": vars(self.hints)})
+        return digest({"run": run, **how, "opacity": "auto", "reading": vars(AUTO)})
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Merge, score and time a scene, and save pictures; return a batch record's report and the picture files."""
         with use_threads(threads):
             source = files, self.targets, self.target_images, self.record.scene_sha256
-            scene, held_out, notes = _load(*source, self.opacity, self.hints)
+            scene, held_out, notes = _load(*source)
             if self.record.method == SUPERPIXELS:
                 facts, pictures = self._measure_superpixels(scene, out)
             else:
@@ -260,15 +257,10 @@ def proxy_psnr(image: np.ndarray, count: int, segmentation: str) -> float:
 
 @lru_cache(maxsize=1)
 def _load(
-    files: SceneFiles,
-    targets: Path | None,
-    target_images: Path | None,
-    sha256: str,
-    opacity: OpacityChoice,
-    hints: ReadHints,
+    files: SceneFiles, targets: Path | None, target_images: Path | None, sha256: str
 ) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
     """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
-    load = load_files(files, opacity=opacity, hints=hints)
+    load = load_files(files)
     held_out = None if targets is None else read_held_out(load, targets, target_images)
     return load.scene, held_out, tuple(load.notes)
 

@@ -18,7 +18,6 @@ from gsmerge.research.charts.grid import (
     parse_grid,
     scene_names,
 )
-from gsmerge.scene.exporters import ReadHints
 from gsmerge.settings.compact import CompactOptions
 
 
@@ -217,7 +216,7 @@ def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
         return job.call.key(job.find_files())
 
     assert key() == key(command="another")
-    others = [key(measured=EvaluateOptions(("vgg",))), key(opacity="raw"), key(seed=1)]
-    others += [key(hints=ReadHints(order="none")), key(grid=Grid(budget=("1%",)))]
+    others = [key(measured=EvaluateOptions(("vgg",))), key(seed=1)]
+    others += [key(grid=Grid(budget=("1%",)))]
     others += [key(measured=EvaluateOptions((), photo_side=476))]
-    assert len({key(), *others}) == 7
+    assert len({key(), *others}) == 5
