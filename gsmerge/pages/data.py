@@ -28,6 +28,7 @@ from gsmerge.measure.evaluate import (
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
+from gsmerge.measure.speed import time_in_turns
 from gsmerge.pages.drops import draw_drops, find_drops
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.raster import render
@@ -185,11 +186,15 @@ def page_data(
     cameras = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
     drops = {name: find_drops(entered[name], cameras, pictures if len(pictures) else None) for name in looked_at}
-    split = "context" if held_out is None else "target"
+    split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
+    seconds = time_in_turns(entered, cameras[[len(cameras) // 2]], near)
     sides = [
-        _side(result, size, split, _pack(entered[result.name], result.name, scene, cameras, light), drops)
+        _side(
+            result, size, split, _pack(entered[result.name], result.name, scene, cameras, light),
+            seconds[result.name], drops,
+        )
         for result, size in zip(evaluation.results, file_bytes, strict=True)
-    ]
+    ]  # fmt: skip
     means = entered[evaluation.results[:2][-1].name].means
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
@@ -210,7 +215,6 @@ def page_data(
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
     shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
-    near = near_plane(scene) / frame.unit
     *drawn, outside = (
         replace(view, drops=tuple(
             draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
@@ -315,13 +319,12 @@ def _side(
     file_bytes: int,
     split: str,
     packed: tuple[bytes | None, int, int],
+    seconds: float,
     drops: Mapping[str, Mapping[str, np.ndarray]],
 ) -> Side:
     counts = {word: int(mask.sum()) for word, mask in drops.get(result.name, {}).items()}
     mean, fog, covered = result.mean(split)[1], result.fog.get(ALL), result.mean_covered(split)
-    return Side(
-        result.name, result.num_gaussians, file_bytes, mean, *packed, fog, *covered, result.render_seconds, counts
-    )
+    return Side(result.name, result.num_gaussians, file_bytes, mean, *packed, fog, *covered, seconds, counts)
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
