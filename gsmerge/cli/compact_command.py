@@ -172,11 +172,17 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
 
 def _compact_state(args: opt.Args, start: float) -> None:
     """Write a compact scene of a state, fitted to its photos; ``start``: the time when the command began."""
+    from gsmerge.io.formats.table import SITE
+
     path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
     args.require_scene(OF_STATES, path)
     out = output_file(args.output or default_output(path), default_output(path).name)
+    if SITE.names(out):
+        raise UsageError(
+            f"{args.output}: expected a scene for a web site, {path} is a state; name a .ply, and convert it"
+        )
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
     from gsmerge.settings.stages import DecodeOptions
