@@ -131,9 +131,7 @@ def collect(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    segmentation: SegmentOptions | None = None,
     light: bool = False,
-    threads: int | None = None,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
     """Draw and score a scene with at least one view, and its results, if any, in all views.
@@ -144,13 +142,13 @@ def collect(
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, None, threads=threads)
+    options = EvaluateOptions(nets, None)
     evaluation = evaluate(
         scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
     )
     progress("superpixels and the view from outside", 0, 0)
-    with use_threads(threads):
-        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, segmentation, light=light)
+    with use_threads():
+        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
     progress("done", 0, 0)
     return data
 
@@ -172,7 +170,6 @@ def page_data(
     held_out: Views | None,
     evaluation: Evaluation,
     stills: Stills,
-    segmentation: SegmentOptions | None = None,
     *,
     light: bool = False,
 ) -> ViewData:
@@ -214,7 +211,7 @@ def page_data(
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
-    shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
+    shown, num_superpixels = with_outlines(_shown(views), pictures)
     *drawn, outside = (
         replace(view, drops=tuple(
             draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
@@ -248,15 +245,13 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
     )
 
 
-def with_outlines(
-    views: Sequence[PageView], photos: np.ndarray, options: SegmentOptions
-) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
+def with_outlines(views: Sequence[PageView], photos: np.ndarray) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
     """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
     places = [i for i, view in enumerate(views) if view.photo and not view.held_out]
     if not places:
         return tuple(views), None
     pictures = photos[[views[i].place for i in places]]
-    groups = segment(pictures, options)
+    groups = segment(pictures, SegmentOptions())
     made = list(views)
     for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
         made[i] = replace(views[i], outlines=encode_outlines(picture, labels))

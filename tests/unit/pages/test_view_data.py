@@ -273,9 +273,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
     assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
 
 
-def test_superpixels_as_asked_for(small: Scene) -> None:
-    asked = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), segmentation=SegmentOptions(superpixels=50))
-    assert asked.num_superpixels == (50, 50)
+def test_without_photos_there_are_no_superpixels(small: Scene) -> None:
     none = collect("room", replace(small, images=None, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}
