@@ -80,26 +80,3 @@ def test_ranges_and_noise_are_taken(tmp_path: Path, run: Run) -> None:
     record = json.loads((tmp_path / "made" / "scene_0000" / "generated.json").read_text())
     drawn = record["noise"]
     assert (drawn["scale"], drawn["sh_degree"], drawn["grain"]) == (0.7, 1, 0)
-
-
-def test_a_building_is_made_and_read(tmp_path: Path, run: Run) -> None:
-    run(
-        "lab",
-        "generate",
-        "-o",
-        tmp_path / "made",
-        "--scenes",
-        1,
-        "--views",
-        4,
-        "--size",
-        "48x36",
-        "--set",
-        "style=building",
-        code=0,
-    )
-    folder = tmp_path / "made" / "scene_0000"
-    record = json.loads((folder / "generated.json").read_text())
-    assert (record["style"], record["path"], record["num_views"]) == ("building", "walk", 4)
-    assert json.loads(run("inspect", folder, "--json").out)["num_missing"] == 0
-    assert len(list((folder / "targets" / "images").iterdir())) == 3

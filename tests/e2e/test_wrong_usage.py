@@ -149,7 +149,6 @@ USAGE = {
     "lab generate -o out --size 9x9": "width*16 to 2048*9",
     "lab generate -o out --set style=castle": "style*mixed*'castle'",
     "lab generate -o out --set path=spiral": "path*arc*'spiral'",
-    "lab generate -o out --set style=building --set path=orbit": "path*walk*'orbit'",
     "lab train -o out": "*'--data'",
 }
 PLACES = {

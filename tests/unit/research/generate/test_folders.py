@@ -14,6 +14,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import project
 from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate, make_scene
+from gsmerge.research.generate.folders import _write_views
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.held_out import read_held_out
@@ -107,7 +108,7 @@ def test_what_is_there_is_kept_and_the_rest_added(folder: Path, tmp_path: Path) 
 def test_other_scenes_and_strangers_are_not_replaced(tmp_path: Path) -> None:
     generate(tmp_path, 1, TINY)
     before = contents(tmp_path)
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="overwrite=true"):
         generate(tmp_path, 1, TINY, seed=5)
     assert contents(tmp_path) == before
     generate(tmp_path, 1, TINY, seed=5, overwrite=True)
@@ -123,7 +124,7 @@ def test_other_scenes_and_strangers_are_not_replaced(tmp_path: Path) -> None:
 def test_a_damaged_record_is_no_scene(tmp_path: Path) -> None:
     generate(tmp_path, 1, TINY)
     (tmp_path / "scene_0000" / "generated.json").write_text("[")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="overwrite=true"):
         generate(tmp_path, 1, TINY)
 
 
@@ -156,3 +157,12 @@ def test_counts_and_seeds_are_checked(tmp_path: Path) -> None:
     for count, seed in ((0, 0), (1, -1)):
         with refuses(ValueError, "", "1 scene", "seed"):
             generate(tmp_path, count, TINY, seed=seed)
+
+
+def test_more_than_a_thousand_views_keep_their_order(tmp_path: Path) -> None:
+    cameras = gsmerge.Cameras(np.repeat(np.eye(4)[None], 1001, 0), np.repeat(np.eye(3)[None], 1001, 0), 2, 2)
+    _write_views(tmp_path, cameras, [np.zeros((2, 2, 3), np.float32)] * 1001)
+    names = sorted(path.name for path in (tmp_path / "images").iterdir())
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert (names[0], names[-1]) == ("view_0000.png", "view_1000.png")
+    assert [frame["file_path"] for frame in frames] == [f"images/{name}" for name in names]
