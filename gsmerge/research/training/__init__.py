@@ -1,4 +1,4 @@
-"""Training of the networks on renders compared with photos, and on the corrections that the full fit makes."""
+"""Training of the networks on renders compared with photos."""
 
 from gsmerge.research.training.backbones import Backbone
 from gsmerge.research.training.examples import Example, make_example
