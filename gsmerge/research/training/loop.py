@@ -3,7 +3,7 @@
 Validation is on fixed windows and whole photos of the validation examples, read one after the other.
 
 Random numbers depend only on seed and step, and the gradients of crops are added in order. So an interrupted run ends
-with the same bytes as one that was not, on any number of threads and of processes.
+with the same bytes as one that was not, on any number of threads.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import WindowLoss, render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
-from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
@@ -47,28 +46,18 @@ FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-@dataclass(frozen=True)
-class TrainingRun:
-    """Settings that every step of a run reads."""
-
-    options: TrainOptions
-    processes: Processes
-
-
-def validate(networks: Networks, shards: Sequence[Source], run: TrainingRun, out: Path) -> Row:
+def validate(networks: Networks, shards: Sequence[Source], options: TrainOptions, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
     For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
     """
-    scores = [_score(networks, shards, i, run, out) for i in run.processes.share(range(len(shards)))]
-    every = run.processes.gather(scores)
-    analytic, learned, matched = np.mean([window for windows in every for window in windows], 0).tolist()
+    scores = [window for i in range(len(shards)) for window in _score(networks, shards, i, options, out)]
+    analytic, learned, matched = np.mean(scores, 0).tolist()
     return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(networks: Networks, shards: Sequence[Source], number: int, run: TrainingRun, out: Path) -> Scores:
+def _score(networks: Networks, shards: Sequence[Source], number: int, options: TrainOptions, out: Path) -> Scores:
     """Score one of the shards, and write its picture if it is the first of its scene."""
-    options = run.options
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_example(shards[number], options, rng)
     windows = [
@@ -132,7 +121,6 @@ def train(
     backbone: Backbone | None = None,
     threads: int | None = None,
     device: str = "cpu",
-    processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> TrainResult:
     """Train networks, or continue the run in the folder.
@@ -149,19 +137,17 @@ def train(
         threads: Threads to use; None: all processors. The result does not depend on it.
         device: Where the networks run, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
             repeats up to rounding, not to the bit.
-        processes: Processes that share the crops of every step.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, captures have no backbone, the crops of a step cannot be shared evenly,
-            or torch finds no CUDA device and ``device`` asks for it.
+        ValueError: If there are no examples, captures have no backbone, or torch finds no CUDA device and ``device``
+            asks for it.
         GsmergeError: If LPIPS has a weight, and its weights are not installed.
         SceneError: If a shard is damaged, or the folder holds another run or cannot be written.
     """
     options = options or TrainOptions()
     if not shards:
         raise ValueError("examples: expected at least one, got none")
-    processes.require_even(options.crops)
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
     bound = bind_backbone([*shards, *validation], backbone)
@@ -169,7 +155,7 @@ def train(
     chosen = bound[len(shards) :] or sources
     chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
-        return _train(TrainingRun(options, processes), sources, chosen, out, choose_device(device), progress)
+        return _train(options, sources, chosen, out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -186,14 +172,13 @@ def choose_device(name: str) -> str:
 
 
 def _train(
-    run: TrainingRun,
+    options: TrainOptions,
     shards: Sequence[Source],
     validation: Sequence[Source],
     out: Path,
     device: str,
     progress: Progress | None,
 ) -> TrainResult:
-    options, processes = run.options, run.processes
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)
         networks = Networks(options.network).to(device)
@@ -204,21 +189,20 @@ def _train(
     head = {"options": options.to_dict(), **hashes}
     step, rows = _resume(out, state, head)
     resumed = step
-    with open_streams(shards, options, processes.share(range(options.crops))) as streams:
+    with open_streams(shards, options) as streams:
         while step < options.steps:
-            loss, share = _step(state, streams, run, step)
+            loss, share = _step(state, streams, options, step)
             losses.append(loss)
             step += 1
             if progress:
                 progress(step, options.steps, float(losses[-1]))
             if step % options.save_every == 0 or step == options.steps:
-                scores = validate(state.smooth, validation, run, out)
+                scores = validate(state.smooth, validation, options, out)
                 mean = float(torch.stack(losses).mean())
                 head_row = {"step": step, "rate": options.rate_at(step - 1), "loss": mean}
                 rows.append({**head_row, **({"diversity_share": share} if options.diversity_weight else {}), **scores})
                 losses = []
-                if processes.rank == 0:
-                    _save(out, state, rows, head, options)
+                _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     most = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], most, resumed)
@@ -254,12 +238,12 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> tuple[Tensor, float]:
+def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> tuple[Tensor, float]:
     """Do one step; return its loss, and the share of the gradient from the diversification of siblings, 0 to 1.
 
     It is that norm over the sum of the norms of both parts, measured in validated steps, and 0 in others.
     """
-    options, parameters = run.options, list(state.networks.parameters())
+    parameters = list(state.networks.parameters())
     shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps
     streams.move_to(step)
 
@@ -278,8 +262,7 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
             parts = differentiate(loss.total, more=False)
         return torch.cat([*parts, loss.total.detach().to(parts[0])[None], *apart])  # which may be on a GPU
 
-    rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
-    mean = rows.sum(0) / options.crops
+    mean = torch.stack(parallel_map(work, range(options.crops))).sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
     gradients, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
     for parameter, gradient in zip(parameters, gradients.split(sizes), strict=True):

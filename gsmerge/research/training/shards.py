@@ -8,8 +8,7 @@ Threads read ahead. Every crop of a step has a stream of its own: every ``crops`
 shuffled anew for each pass over them. A stream holds ``buffer`` examples, from which the crop draws one at random;
 every ``refresh`` steps the next in the order takes the place of the oldest. A capture takes the place of a shard: what
 its backbone predicts is another example at every place in the order. Which examples these are depends on seed and step
-alone. So a run that is resumed goes on as if it had not stopped, and so does one that is shared among
-processes, each of which reads the streams of its own crops.
+alone. So a run that is resumed goes on as if it had not stopped.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.backbones import PredictedCapture
 from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
-from gsmerge.research.training.processes import ALONE, Processes
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, read_files
@@ -66,10 +64,9 @@ def prepare_shards(
     scenes: Sequence[Path],
     options: TrainOptions,
     folder: Path,
-    processes: Processes = ALONE,
     report: Report | None = None,
 ) -> list[Shard]:
-    """Return the shards of all scenes in order; missing ones are made, the work shared by all processes.
+    """Return the shards of all scenes in order; missing ones are made.
 
     ``scenes`` are folders or ``.ply`` files; ``report`` is called with (words, step, steps). A SceneError if a scene
     cannot be used, or the folder cannot be written.
@@ -78,11 +75,10 @@ def prepare_shards(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
-    lists, part = list[list[Shard]](), processes.share(scenes)
-    for number, scene in enumerate(part):
-        move = _in_all(report, sum(map(len, lists)), len(part) - number)
-        lists.append(_scene_shards(scene, options, folder, move))
-    return [shard for shards in processes.gather(lists) for shard in shards]
+    shards: list[Shard] = []
+    for number, scene in enumerate(scenes):
+        shards += _scene_shards(scene, options, folder, _in_all(report, len(shards), len(scenes) - number))
+    return shards
 
 
 def _in_all(report: Report | None, before: int, scenes: int) -> Report:
@@ -227,10 +223,10 @@ def read_example(source: Source, options: TrainOptions, rng: np.random.Generator
 
 
 class ExampleStreams:
-    """Streams of examples, one stream for each crop that this process draws per step."""
+    """Streams of examples, one stream for each crop of a step."""
 
-    def __init__(self, shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> None:
-        self.shards, self.options, self.crops = shards, options, crops
+    def __init__(self, shards: Sequence[Source], options: TrainOptions) -> None:
+        self.shards, self.options = shards, options
         self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
         # Those in memory, or being read, by number of the shard; of a capture also by place in the order, else 0
         self.examples: dict[tuple[int, int], Future[Example]] = {}
@@ -239,7 +235,7 @@ class ExampleStreams:
     def move_to(self, step: int) -> None:
         """Load the shards that ``step`` may draw from and the next ones; forget all others."""
         ahead = self.options.buffer + 1
-        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in self.crops]
+        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in range(self.options.crops)]
         for key in self.examples.keys() - set(keys):
             self.examples.pop(key).cancel()
         for key in keys:
@@ -271,9 +267,9 @@ class ExampleStreams:
 
 
 @contextmanager
-def open_streams(shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
+def open_streams(shards: Sequence[Source], options: TrainOptions) -> Iterator[ExampleStreams]:
     """Open streams of examples; their threads end with the block."""
-    streams = ExampleStreams(shards, options, crops)
+    streams = ExampleStreams(shards, options)
     try:
         yield streams
     finally:

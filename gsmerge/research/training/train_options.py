@@ -58,7 +58,7 @@ class TrainOptions(Settings):
     clip: float = setting(1.0, "Largest norm of the gradient.", **RATE)
     average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
         "validated and saved; less in the first steps.", **PART)  # fmt: skip
-    crops: int = setting(2, "Windows per step, of all processes together; worked on in parallel.", **COUNT)
+    crops: int = setting(2, "Windows per step, worked on in parallel.", **COUNT)
     novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **PART)
     photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT)
     photo_side: int = setting(0, "Longer side of the photos in pixels, where they are larger, in place of "

@@ -232,7 +232,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
         with torch.no_grad():
             for p, b in zip(parameters, before, strict=True):
                 p.copy_(b)
-        same += derivative == pytest.approx((values[0] - values[1]) / 6e-3, rel=0.1, abs=1e-3)
+        same += derivative == pytest.approx((values[0] - values[1]) / 6e-3, rel=0.15, abs=1e-3)
     assert same >= 3  # in a window Gaussians pass the renderer's threshold, which is a jump
 
 
