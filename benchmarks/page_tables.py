@@ -9,4 +9,4 @@ Row = Sequence[str]
 
 def make_table(head: Row, rows: Sequence[Row]) -> str:
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join(f"|{'|'.join(line)}|" for line in lines)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
+from dataclasses import is_dataclass
 from typing import Any
 
 import gsmerge
@@ -30,9 +31,9 @@ TOPICS = {
 ELSEWHERE = {"CompactOptions": "settings.md", "CompactReport": "report.md"}  # pages that describe the fields
 HEAD = """# Python API
 
-Every public name of `gsmerge`, from its docstring, which `help()` shows in full, with an example. [The
-guide](../guide/python.md) says how they work together. Bad files raise `SceneError`, bad arguments `ValueError`.
-[Settings](settings.md) have a page."""
+Every public name of `gsmerge`, from its docstring, which `help()` shows in full. [The guide](../guide/python.md) says
+how they work together. Bad files raise `SceneError`, bad arguments `ValueError`. [Settings](settings.md) have a page.
+The examples run after `import gsmerge`, beside the scene `demo` of `examples/01_make_scene.py`."""
 
 
 def api_page() -> str:
@@ -55,9 +56,12 @@ def _describe(name: str, value: Any) -> list[str]:
     lines = [about.strip()]
     if not inspect.isclass(value):
         lines = [f"`gsmerge.{name}{_parameters(value)}`", "", *lines]
+    is_data = is_dataclass(value) or (inspect.isclass(value) and issubclass(value, Exception))
     for title, body in zip(parts[::2], parts[1::2], strict=True):
         body = textwrap.dedent(body).strip()
-        if title == "Returns":
+        if title == "Example" and not is_data:
+            lines += ["", "```pycon", body, "```"]
+        elif title == "Returns":
             lines += ["", f"Returns: {body}"]
         elif title == "Args":
             entries = re.findall(r"^(\*{0,2}\w+): (.*?)(?=^\*{0,2}\w+: |\Z)", body, re.DOTALL | re.MULTILINE)

@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
-from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, is_colmap, read_all_cameras
+from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
@@ -72,12 +72,10 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 def holds_scene(path: Path) -> bool:
     """Return whether a path is read as a scene, and not as cameras, networks, levels or a state alone."""
-    if os.path.isdir(path):
-        return bool(list_plys(path))
     suffix = path.suffix.lower()
     if suffix in SEVERAL_USES:
         return os.path.exists(path) and may_hold_gaussians(path)
-    return suffix in SCENE_SUFFIXES
+    return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 
 def damage(path: Path) -> list[str]:
@@ -103,7 +101,7 @@ def _read(path: Path) -> FileCheck:
         return _read_levels(path)
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
-    if os.path.isdir(path) or suffix in CAMERAS:
+    if suffix in CAMERAS:
         return _read_cameras(path)
     check_file(path)
     endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
@@ -121,15 +119,13 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
 
 
 def _read_cameras(path: Path) -> FileCheck:
-    """Read the cameras of a file, of all scenes if it has several, or of a folder."""
+    """Read the cameras of a file, of all scenes if it has several."""
     count = 0
     for cameras in read_all_cameras(path):
         count += len(cameras)
     if Path(cameras.path).suffix == ".npz":
         read_depths(Path(cameras.path))
-    alone = os.path.isdir(path) and not is_colmap(path)
-    notes = ("the folder has no Gaussians: its cameras alone were read",) if alone else ()
-    return FileCheck(str(path), "cameras", count, cameras.source, notes=notes)
+    return FileCheck(str(path), "cameras", count, cameras.source)
 
 
 def _read_levels(path: Path) -> FileCheck:

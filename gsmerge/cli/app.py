@@ -67,6 +67,7 @@ FORMER_OPTIONS = {
     "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
     "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
     "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
+    "target_images": "photos beside the cameras of --targets are found", "masks": "masks beside the photos are found",
     "config": "use --set NAME=VALUE for each setting in it",
     "draw_only": "a call without scenes draws what the folder holds",
     "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
@@ -241,7 +242,8 @@ def _suggest(option: str, command: Any) -> str | None:
         return f"{option} is no option any more: {FORMER_OPTIONS[name]}" if name in FORMER_OPTIONS else None
     default = settings[positive].default
     value = str(not default).lower() if isinstance(default, bool) else "VALUE"
-    return f"{option} is no option: use --set {positive}={value}"
+    more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
+    return f"{option} is no option: use --set {positive}={value}{more}"
 
 
 _SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled

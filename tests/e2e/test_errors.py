@@ -150,7 +150,7 @@ def test_several_outputs_are_all_there_or_none(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("gsmerge.compaction.files.write_gaussians", full)
-    monkeypatch.setattr("gsmerge.compaction.files.viewer_cameras", no_room)
+    monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", no_room)
     before = listing(scene_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")
     outcome = run("compact", scene_copy, "-o", scene_copy / "out.ply", *quick, *more, "--quiet")

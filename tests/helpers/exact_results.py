@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import sys
 import tempfile
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -41,7 +43,8 @@ def make_results(folder: Path, *, threads: int = 2) -> dict[str, str]:
         out = folder / f"{number}.ply"
         for call in calls:
             words = [word.format(scene=scenes[scene], out=out) for word in call.split()]
-            code = main([*words, "--set", f"threads={threads}", "--quiet"])
+            with mock.patch.dict(os.environ, GSMERGE_THREADS=str(threads)):
+                code = main([*words, "--quiet"])
             assert code == 0, (name, code)
         hashes[name] = hash_rows(out)
     return hashes

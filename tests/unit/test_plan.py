@@ -193,6 +193,13 @@ def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene
         assert plan_of(known).target_psnr is None
 
 
+def test_views_that_are_placed_are_scored(scene: Scene) -> None:
+    alone = Scene(scene.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+    prepared = prepare(alone)  # as for states, and for networks
+    plan = make_plan(prepared, options_of())
+    assert plan.scored_views == tuple(range(len(prepared.scene)))
+
+
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     noise = replace(scene, images=rng.random(scene.images.shape, np.float32))

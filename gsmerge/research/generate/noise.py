@@ -90,14 +90,15 @@ def read_ranges(path: Path) -> NoiseOptions:
     A SceneError if the file cannot be read, or holds an unknown name or an impossible range.
     """
     table = read_table(path)
-    unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
+    names = [f.name for f in fields(NoiseOptions)]
+    unknown = sorted(table.keys() - set(names))
     if unknown:
-        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/lab.md has the names")
+        raise SceneError(path, f"expected ranges named {', '.join(names)}, found {unknown[0]!r}")
     values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
     try:
         return NoiseOptions(**values)
     except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error), "docs/internals/lab.md has the ranges") from error
+        raise SceneError(path, f"expected two numbers for each range ({error})") from error
 
 
 RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]

@@ -16,7 +16,6 @@ from tiny_scene import frames_of, save_json, write_images, write_npz
 
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
-from gsmerge.file_checks import check_content
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.scene.content_hash import read_files
 from gsmerge.scene.files import find_scene_files
@@ -80,7 +79,6 @@ def test_the_scene_of_a_folder(tmp_path: Path, ply: str, beside: tuple[str, ...]
     for start in dict.fromkeys((tmp_path, path)):
         assert find_scene_files(start).ply == tmp_path / ply
     assert [main_file(scene) for scene in find_scenes([str(tmp_path)], tmp_path / "out")] == [tmp_path / ply]
-    assert check_content(tmp_path).count == len(SMOOTH.gaussians)
 
 
 def test_points_of_a_usual_name(tmp_path: Path) -> None:

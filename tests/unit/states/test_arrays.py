@@ -69,13 +69,12 @@ def test_members_add_up_in_the_world(plain: State, learned: State, scene: Scene)
 
 def test_the_page_names_all_with_shape_and_type(plain: State, learned: State, root: Path) -> None:
     page = (root / "docs" / "reference" / "formats.md").read_text()
-    table = page.partition("\n## Feature Gaussians")[2].partition("\n## ")[0]
+    listed = page.partition("\n## Feature Gaussians")[2].partition("\n## ")[0]
     said = dict[str, tuple[str, str]]()
-    for row in re.findall(r"^\| (`.*)$", table, re.MULTILINE):
-        names, kinds, *_ = row.split(" | ")
-        shapes = re.findall(r"`\[(.*?)\]`", kinds)
-        found = re.findall(r"`(\w+)`", names)
-        said |= {name: (shape, kinds.split()[-1]) for name, shape in zip(found, shapes, strict=True)}
+    for entry in re.findall(r"^- (`.*?): ", listed, re.MULTILINE):
+        shapes = re.findall(r"`\[(.*?)\]`", entry)
+        found = re.findall(r"`(\w+)`", entry)
+        said |= {name: (shape, entry.split()[-1]) for name, shape in zip(found, shapes, strict=True)}
     both = [feature_arrays(state) for state in (plain, learned)]
     assert {name for arrays in both for name in arrays} == set(said)
     for arrays in both:

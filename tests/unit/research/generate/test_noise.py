@@ -178,5 +178,5 @@ def test_ranges_come_from_files(tmp_path: Path) -> None:
     assert read_ranges(path) == NoiseOptions(grain=(0.001, 0.002), sh_degrees=(0,), constant_opacity=0)
     for text in ('{"grian": [0, 1]}', '{"grain": 3}', '{"grain": ["a", 1]}', '{"grain": [2, 1]}'):
         path.write_text(text)
-        with pytest.raises(SceneError, match=r"docs/internals/lab\.md"):
+        with pytest.raises(SceneError, match=r"expected ranges|two numbers"):
             read_ranges(path)

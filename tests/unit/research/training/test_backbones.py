@@ -205,13 +205,13 @@ def test_what_cannot_be_trained_on_is_refused(scene: Scene, data: Path, tmp_path
 
 
 def test_the_guide_s_example_runs(scene: Scene, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[4] / "docs" / "internals" / "backbones.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[4] / "docs" / "internals" / "training.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "re10k").mkdir()
     (tmp_path / "re10k" / "train").symlink_to(data)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("gsmerge.research.training.preset_options", lambda _: RUN)
     guess = Guess(scene)
-    exec(compile(example, "backbones.md", "exec"), {"model": guess})
+    exec(compile(example, "training.md", "exec"), {"model": guess})
     assert len(guess.calls) >= RUN.steps
     assert (tmp_path / "run" / "best.safetensors").is_file()
