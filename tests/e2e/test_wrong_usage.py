@@ -170,7 +170,6 @@ PLACES = {
     "lab stress alone.ply --set targets=room/targets": "alone.ply*none*--cameras",
     "lab chart -o out nowhere": "nowhere*no such",
     "lab chart -o out room --targets {{scene}}/none.json": "room/none.json*cameras*nothing",
-    "lab generate -o out --set ranges=nowhere.toml": "nowhere.toml*no such",
     "lab generate -o alone.ply": "alone.ply*folder*file",
     "lab train --data nowhere -o out": "nowhere*no such",
 }
