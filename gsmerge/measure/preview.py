@@ -21,6 +21,7 @@ from gsmerge.types import Cameras, Gaussians
 Picture = NDArray[np.uint8]  # [h,w,3], sRGB, RGB order
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 BAND, WIDE = 22, 640  # height of the band that carries a tile's label, pixels, and width of a tile from which it grows
+DARK = 32  # level of the bands, and of the cell without a photo
 GAP = 4
 OUTSIDE = "step back"  # name of the view from outside
 
@@ -48,7 +49,7 @@ def label(picture: Picture, text: str) -> Picture:
     factor = max(1, picture.shape[1] // WIDE)
     scale = 0.42 * factor
     text = shorten_text(text, picture.shape[1] - 8, scale, factor)
-    band = np.full((factor * BAND, picture.shape[1], 3), 32, np.uint8)
+    band = np.full((factor * BAND, picture.shape[1], 3), DARK, np.uint8)
     cv2.putText(band, text, (4, factor * (BAND - 7)), FACE, scale, (235, 235, 235), factor, cv2.LINE_AA)
     return np.concatenate([band, picture])
 
@@ -91,11 +92,11 @@ def outside_pictures(
 ) -> list[tuple[str, Picture]]:
     """Render each scene from outside the capture, as one row like those of :func:`view_pictures`.
 
-    Every picture comes with its name. With ``photos`` a white picture comes first, in the photos' column.
+    Every picture comes with its name. With ``photos`` a dark picture comes first, in the photos' column.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [(f"{name}: {OUTSIDE}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes]
-    return [(f"{OUTSIDE}: no photo", np.full_like(renders[0][1], 255))] * photos + renders
+    return [(f"{OUTSIDE}: no photo", np.full_like(renders[0][1], DARK))] * photos + renders
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
