@@ -153,7 +153,8 @@ def _depths_cameras(path: Path) -> Path:
 
 def scene_title(ply: Path) -> str:
     """Name a scene for a page: by its file, or by its folder where the file has the usual name."""
-    return ply.parent.absolute().name if ply.stem == "scene" else ply.stem
+    name = ply.stem.removesuffix(".compact")
+    return ply.parent.absolute().name if name == "scene" else name
 
 
 def result_cameras(ply: Path) -> Path | None:

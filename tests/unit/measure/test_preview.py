@@ -44,7 +44,7 @@ def test_the_row_from_outside_has_no_photo_and_no_score(photos: bool) -> None:
     row = preview.outside_pictures([("dark", blob(0.3)), ("bright", blob(0.9))], cameras(2), photos=photos)
     assert [text for text, _ in row] == ["step back: no photo"] * photos + ["dark: step back", "bright: step back"]
     *blank, dark, bright = [float(image.mean()) for _, image in row]
-    assert blank == [255] * photos
+    assert blank == [preview.DARK] * photos
     assert 0 < dark < bright < 255
 
 

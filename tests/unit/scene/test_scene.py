@@ -22,7 +22,7 @@ from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene import read
-from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.scene.views import stored_photos
 
@@ -180,3 +180,11 @@ def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> No
         changed = ids.copy()
         changed[wrong] += 1
         assert not read._counts_up(changed)
+
+
+@pytest.mark.parametrize(
+    ("path", "title"),
+    [("room/scene.ply", "room"), ("room/scene.compact.ply", "room"), ("room/a.compact.ply", "a"), ("room/b.ply", "b")],
+)
+def test_a_scene_is_named_by_its_file_or_its_folder(path: str, title: str) -> None:
+    assert scene_title(Path(path)) == title
