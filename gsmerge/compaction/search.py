@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
-from gsmerge.compaction.result import Candidate
+from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan
+from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import choose, record_part, report_progress, stage
@@ -71,10 +71,11 @@ class CountSearch:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
-        usual = self.plan.keeps_psnr and not self.plan.auto_count
+        keeps = self.plan.keeps_input
+        usual = keeps and not self.plan.auto_count
         least = min(limits.default, limits.max_count) if usual else limits.min_count
-        most = limits.max_count if self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
-        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, 0.0)
+        most = limits.max_count if keeps or self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
+        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, KEPT_LOSS if keeps else 0.0)
         while target is not None and len(self.candidates) < MAX_RUNS:
             count = next_count(self.tried, target, least, most, *steps)
             if count in self.tried:
@@ -84,7 +85,7 @@ class CountSearch:
     @property
     def tried(self) -> dict[int, float]:
         """PSNR (dB) by count, in the order of the runs."""
-        return {candidate.count: candidate.psnr or 0.0 for candidate in self.candidates if candidate.count is not None}
+        return {run.count: run.kept_psnr or 0.0 for run in self.candidates if run.count is not None}
 
     def add(self, candidate: Candidate) -> None:
         """Add the candidate built for the last count."""
@@ -101,11 +102,14 @@ class CountSearch:
         return next(candidate for candidate in self.candidates if candidate.count == chosen)
 
     @property
+    def met(self) -> bool:
+        """Whether a candidate reaches the target."""
+        return self.plan.target_psnr is not None and max(self.tried.values()) >= self.plan.target_psnr
+
+    @property
     def unmet(self) -> str | None:
         """Reason why the target is not met; None if it is met."""
-        if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
-            return None
-        if self.plan.keeps_psnr:
+        if self.plan.target_psnr is None or self.plan.keeps_input or self.met:
             return None
         psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
         reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
@@ -118,20 +122,36 @@ class CountSearch:
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
-            met = (best.psnr or 0.0) >= self.plan.target_psnr
-            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": met, "tried": tried}
+            choices["search"] = {"count": best.count, "psnr": best.kept_psnr, "met": self.met, "tried": tried}
         return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
 
     @property
     def notes(self) -> list[str]:
         """Note that says how many Gaussians were kept by default, where they are more than usual."""
         count, limits = self.best.count or 0, self.plan.limits
-        if not self.plan.keeps_psnr or count <= limits.default:
+        if not self.plan.keeps_input or count <= limits.default:
             return []
-        kept, target = f"{count:,} of {limits.num_input:,} Gaussians", self.plan.target_psnr
+        kept = f"kept {count:,} of {limits.num_input:,} Gaussians"
+        short = f"be below {self.plan.target_psnr:g} dB from it"
+        good = f"are {self.plan.target_psnr:g} dB from the input or better"
+        if not self.rendered:
+            short = f"show the photos over {KEPT_LOSS:g} dB worse"
+            good = f"show the photos at most {KEPT_LOSS:g} dB worse than the input"
+        if not self.met:
+            return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
         if count > MOSTLY * limits.num_input:
-            return [f"the scene is compact already: kept {kept}, since fewer would be below {target:g} dB from it"]
-        return [f"kept {kept}, about the fewest that are {target:g} dB from the input or better"]
+            return [f"the scene is compact already: {kept}, since fewer would {short}"]
+        return [f"{kept}, about the fewest that {good}"]
+
+
+def add_target(plan: Plan, prepared: Prepared) -> Plan:
+    """Return the plan with the PSNR that keeps the input, if photos show how good the input is."""
+    if not plan.keeps_input or plan.target_psnr is not None:
+        return plan
+    before = measure_input(prepared, plan)
+    assert before is not None, "a scene with photos"
+    psnr = before.psnr if covers_all(before) else before.covered_psnr
+    return replace(plan, before=before, target_psnr=psnr - KEPT_LOSS)
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
