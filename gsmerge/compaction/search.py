@@ -42,6 +42,7 @@ KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaus
 SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
+PHOTOS_NEAR = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
 MAX_RUNS = 6
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
 FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
@@ -75,7 +76,7 @@ class CountSearch:
         usual = keeps and not self.plan.auto_count
         least = min(limits.default, limits.max_count) if usual else limits.min_count
         most = limits.max_count if keeps or self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
-        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, KEPT_LOSS if keeps else 0.0)
+        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, PHOTOS_NEAR if keeps else 0.0)
         while target is not None and len(self.candidates) < MAX_RUNS:
             count = next_count(self.tried, target, least, most, *steps)
             if count in self.tried:
