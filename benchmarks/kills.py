@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
-FAST = "--effort draft --fit none --threads 1"
+FAST = "--effort draft --set fit=none --threads 1"
 COMPACT = f"compact {{scene}} -o {{out}}/a.ply --levels 2 --overwrite {FAST}"
 LOD = f"compact {{scene}} -o {{out}}/lod/lod-meta.json --levels 2 --overwrite {FAST}"
 # What is run, with the scene of {scene}, and what is run before for the earlier files

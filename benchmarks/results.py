@@ -51,7 +51,6 @@ SECOND: tuple[Ask, ...] = (
     *((f"`{name}`", name, {}, "budget") for name in (*BASELINES[2:4], *SLOW)),
     (f"`{UNMERGED} --effort fast`, the input after the same fit", UNMERGED, {"effort": "fast"}, ""),
 )
-NO_PROXIES = ("--set", "proxy_views=0")
 LPIPS = ("--set", "lpips=vgg")
 CALLS = {
     "sizes": (
@@ -92,7 +91,7 @@ def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
     targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
     for call in CALLS[name]:
         start = time.perf_counter()
-        code = gsmerge(["lab", "chart", *scenes, *targets, *call, *LPIPS, *NO_PROXIES])
+        code = gsmerge(["lab", "chart", *scenes, *targets, *call, *LPIPS])
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
 
 

@@ -2,9 +2,9 @@
 
 python benchmarks/trained_scenes.py SCENE OUT.ply --count 1000000
 
-Half to all of the Gaussians of a SCENE with photos are fitted to them, split along their longest axis up to COUNT,
-stretched, and made to look different from each side; faint ones and floaters are added, as trained scenes have them.
-The cameras are written beside it, the photos are not. A seed gives the same bytes every time.
+At most half of the Gaussians of a SCENE with photos are fitted to the photos, split along their longest axis until
+there are enough, stretched, and given harmonics of degree 3; faint copies and floaters are added, as trained scenes
+have them. The cameras are written beside OUT.ply, the photos are not. A seed gives the same bytes every time.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Memory and steps per second of ``gsmerge lab train``: streamed examples, all in memory, several processes.
+"""Memory and steps per second of ``gsmerge lab train``: streamed examples, or all in memory.
 
-python benchmarks/training.py made                     # 200 scenes of gsmerge lab generate, streamed and in memory
-python benchmarks/training.py made --processes 1 2     # one thread each; wants as many idle processors
+python benchmarks/training.py made    # 200 scenes of gsmerge lab generate, streamed and in memory
 
 The folder is filled with scenes and their examples first, which is resumed if it was interrupted. Each measurement is a
 process of its own, and all of them draw the same windows. Processor seconds hardly depend on what else runs.
@@ -11,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -20,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsmerge.research.generate import GenerateOptions, generate
-from gsmerge.research.training import TrainOptions, join_processes, prepare_shards, preset_options, read_shard, train
+from gsmerge.research.training import TrainOptions, prepare_shards, preset_options, read_shard, train
 from gsmerge.research.training import shards as streams
 from gsmerge.runtime.memory import peak_memory
 
@@ -38,36 +36,29 @@ def options_of(args: argparse.Namespace) -> TrainOptions:
 def measure(args: argparse.Namespace, kind: str) -> None:
     """In a process of its own: prepare, or prepare and train; prints JSON."""
     scenes, options = sorted((args.folder / "scenes").glob("scene_*")), options_of(args)
-    with join_processes("cpu") as processes:
-        shards = prepare_shards(scenes[: args.scenes], options, args.folder / "examples", processes)
-        facts = {"shards": len(shards), "bytes": sum(shard.path.stat().st_size for shard in shards)}
-        if kind != "prepare":
-            if kind == "memory":
-                examples = {shard: read_shard(shard) for shard in shards}
-                streams.read_shard = lambda shard, check: examples[shard]  # type: ignore[assignment]
-            marks: list[tuple[float, float]] = []
+    shards = prepare_shards(scenes[: args.scenes], options, args.folder / "examples")
+    facts = {"shards": len(shards), "bytes": sum(shard.path.stat().st_size for shard in shards)}
+    if kind != "prepare":
+        if kind == "memory":
+            examples = {shard: read_shard(shard) for shard in shards}
+            streams.read_shard = lambda shard, check: examples[shard]  # type: ignore[assignment]
+        marks: list[tuple[float, float]] = []
 
-            def mark(*_: float) -> None:
-                marks.append((time.perf_counter(), time.process_time()))
+        def mark(*_: float) -> None:
+            marks.append((time.perf_counter(), time.process_time()))
 
-            with tempfile.TemporaryDirectory() as out:
-                folder = Path(os.environ.get("BENCHMARK_OUT", out))  # of all processes
-                train(shards, shards[:1], folder, options, threads=args.threads, processes=processes, progress=mark)
-            (start, start_cpu), (end, end_cpu) = marks[WARM - 1], marks[-1]
-            facts |= {"seconds": end - start, "processor": end_cpu - start_cpu}
-        if processes.rank == 0:
-            print(json.dumps({**facts, "peak": peak_memory()}), flush=True)
+        with tempfile.TemporaryDirectory() as out:
+            train(shards, shards[:1], Path(out), options, threads=args.threads, progress=mark)
+        (start, start_cpu), (end, end_cpu) = marks[WARM - 1], marks[-1]
+        facts |= {"seconds": end - start, "processor": end_cpu - start_cpu}
+    print(json.dumps({**facts, "peak": peak_memory()}), flush=True)
 
 
-def run(args: argparse.Namespace, kind: str, processes: int = 1, threads: int | None = None) -> dict[str, float]:
-    """What :func:`measure` prints in one process, or several."""
+def run(args: argparse.Namespace, kind: str) -> dict[str, float]:
+    """What :func:`measure` prints in a process of its own."""
     own = [__file__, args.folder, "--measure", kind, "--scenes", args.scenes, "--steps", args.steps]
-    own += ["--crops", args.crops, "--threads", threads or args.threads]
-    launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", processes] if processes > 1 else []
-    with tempfile.TemporaryDirectory() as out:
-        environment = {**os.environ, "BENCHMARK_OUT": out, "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, *map(str, [*launcher, *own])]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    own += ["--crops", args.crops, "--threads", args.threads]
+    done = subprocess.run([sys.executable, *map(str, own)], capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(done.stderr)
     return dict(json.loads(done.stdout.splitlines()[-1]))
@@ -82,7 +73,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--crops", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--processes", type=int, nargs="+", default=[])
     parser.add_argument("--measure", choices=("prepare", "streamed", "memory"))
     args = parser.parse_args()
     if args.measure:
@@ -96,16 +86,13 @@ def main() -> None:
     prepared = run(args, "prepare")
     print(LINE.format("prepare", f"{prepared['peak'] / 1e9:.2f}", "", "", ""), flush=True)
     print(f"{prepared['shards']} examples, {prepared['bytes'] / 1e9:.2f} GB")
-    rows = [("memory", 1), ("streamed", 1)] if not args.processes else [("streamed", n) for n in args.processes]
     first = None
-    for kind, count in rows:
-        facts = run(args, kind, count, 1 if args.processes else None)
+    for kind in ("memory", "streamed"):
+        facts = run(args, kind)
         speed = args.steps / facts["seconds"]
         first = first or speed
-        name = kind if not args.processes else f"{count} process{'es' * (count > 1)} of one thread"
         cpu = f"{facts['processor'] / args.steps:.3f}"
-        line = LINE.format(name, f"{facts['peak'] / 1e9:.2f}", f"{speed:.3f}", cpu, f"{speed / first:.2f}")
-        print(line, flush=True)
+        print(LINE.format(kind, f"{facts['peak'] / 1e9:.2f}", f"{speed:.3f}", cpu, f"{speed / first:.2f}"), flush=True)
 
 
 if __name__ == "__main__":

@@ -281,6 +281,7 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     budget = options.budget
     asked = budget.quality is not None or budget.budget not in (None, AUTO, *DEVICES)
     asked |= options.segment.superpixels != SHARE or options.decode.k != AUTO or options.method != OURS
+    asked |= options.checkpoint not in ("auto", "none")  # networks alone seldom come so near
     return not (asked or scene.aligned or (budget.auto and not scene.rendered))
 
 
@@ -448,7 +449,7 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
 def _choose_scored_views(prepared: Prepared, *, decisive: bool) -> tuple[int, ...]:
     """Choose views for scoring whose pictures show the scene; more if they are ``decisive`` for the count."""
     reference = prepared.reference
-    if reference.placed:
+    if reference.placed or not prepared.repeated:  # views that the scene lacks
         return reference.score_views
     candidates = [view for view, place in enumerate(prepared.repeated) if place in reference.score_views]
     choose_some = scored_views if decisive else report_views

@@ -67,7 +67,7 @@ FORMER_OPTIONS = {
     "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
     "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
     "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
-    "masks": "masks beside the photos are found",
+    "target_images": "photos beside the cameras of --targets are found", "masks": "masks beside the photos are found",
     "config": "use --set NAME=VALUE for each setting in it",
     "draw_only": "a call without scenes draws what the folder holds",
     "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",

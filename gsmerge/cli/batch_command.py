@@ -213,6 +213,8 @@ class Totals:
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     psnr = report["psnr_input_views"]
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
+    if judged := report["choices"].get("fidelity"):
+        quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
     counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
     return output, *counts, f"{100 * report['ratio']:.2f} %", *quality, f"{report['total_seconds']:.1f}"
 

@@ -73,7 +73,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     views = vars(args).get("views")
     if args.targets is not None or views is not None:
         require_views(load)
-    scene, held_out, adapted = held_out_views(load, args.targets, args.target_images, views)
+    scene, held_out, adapted = held_out_views(load, args.targets, vars(args).get("target_images"), views)
     if not scene.aligned:
         with record_run() as record:
             scene = add_views(scene)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import (
@@ -81,7 +82,7 @@ def look(args: opt.Args) -> None:
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
         raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
-    _compact(args)
+    _compact(args, shown=True)
     if args.dry_run or args.output.suffix.lower() not in VIEWED:
         return
     from gsmerge.cli.view_command import view
@@ -91,7 +92,7 @@ def look(args: opt.Args) -> None:
     opt.call(view, before=before, after=after, **cameras, open=not args.json, quiet=args.silent)
 
 
-def _compact(args: opt.Args) -> None:
+def _compact(args: opt.Args, *, shown: bool = False) -> None:
     start = perf_counter()
     if any(path.suffix.lower() == SUFFIX for path in args.scenes):
         _compact_state(args, start)
@@ -99,7 +100,7 @@ def _compact(args: opt.Args) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import COLMAP, PLY, SITE
+    from gsmerge.io.formats.table import COLMAP
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -134,7 +135,6 @@ def _compact(args: opt.Args) -> None:
         return
     _warn_of_memory(files, settings, quiet=args.silent)
     from gsmerge.compaction.files import Outputs, compact_files
-    from gsmerge.compaction.report import result_table, summary_lines
 
     outputs = Outputs(
         out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
@@ -146,11 +146,18 @@ def _compact(args: opt.Args) -> None:
             files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
             hashed=args.json, seconds_before=seconds_before,
         )  # fmt: skip
+    _say_result(args, document, out, shown=shown)
+
+
+def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
+    """Print the report of a run; TargetError if a target is missed. Unless a page is ``shown``, say how to look."""
+    from gsmerge.compaction.report import result_table, summary_lines
+    from gsmerge.io.formats.table import PLY, SITE
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
     lines = summary_lines(document)
     if sys.stdout.isatty():
-        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) else []
+        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) and not shown else []
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
@@ -165,11 +172,17 @@ def _compact(args: opt.Args) -> None:
 
 def _compact_state(args: opt.Args, start: float) -> None:
     """Write a compact scene of a state, fitted to its photos; ``start``: the time when the command began."""
+    from gsmerge.io.formats.table import SITE
+
     path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
     args.require_scene(OF_STATES, path)
     out = output_file(args.output or default_output(path), default_output(path).name)
+    if SITE.names(out):
+        raise UsageError(
+            f"{args.output}: expected a scene for a web site, {path} is a state; name a .ply, and convert it"
+        )
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.fit import FitOptions
     from gsmerge.settings.stages import DecodeOptions

@@ -29,6 +29,7 @@ import typer
 from gsmerge.cli.console import opening_line
 from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.budget import parse_share
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
@@ -326,6 +327,18 @@ def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
     return lines
 
 
+def share_list(text: str) -> list[str]:
+    """Parse shares with commas between: "1,4.4%" -> ["1%", "4.4%"]."""
+    shares = [f"{part.strip().removesuffix('%')}%" for part in text.split(",")]
+    try:
+        numbers = [parse_share(share) for share in shares]
+    except ValueError:
+        numbers = []
+    if len(set(numbers)) < len(shares):
+        raise typer.BadParameter(f"expected different shares in %, such as 1,2,4.4,10, got {text!r}")
+    return shares
+
+
 def number_or_text(text: str) -> int | str:
     """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
@@ -355,6 +368,8 @@ _TABLE = (
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
                "are left out."),
         option("target_images", Path, "Folder of the held-out photos. Default: beside their cameras."),
+        option("sizes", str, "Also compact BEFORE to these shares of its Gaussians, in %, such as 1,2,4.4,10: the page "
+               "has a slider over all sizes.", metavar="LIST", parser=share_list),
     ),
     panel(
         COUNT,

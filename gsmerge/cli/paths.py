@@ -15,9 +15,6 @@ from gsmerge.settings.setting import Settings, setting
 if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
 
-# In the head of every page that gsmerge makes
-PAGE_MARK, PAGE_HEAD = b'<meta name="generator" content="gsmerge ', 4096
-
 
 # In the first bytes of what gsmerge makes for readers: pages, JSON, CSV, Markdown
 MARKS = (b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,", b"<!-- gsmerge ")
@@ -68,12 +65,16 @@ def _is_site(output: Path) -> bool:
 
 
 def is_page(path: Path) -> bool:
-    """Return whether a file is a page that gsmerge made."""
+    """Return whether a file is a page, or a table, that gsmerge made."""
+    return any(mark in _start_of(path) for mark in MARKS)
+
+
+def _start_of(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return PAGE_MARK in file.read(PAGE_HEAD)
-    except OSError:
-        return False
+            return file.read(MARKED)
+    except OSError:  # there is none yet, or writing fails with its own reason
+        return b""
 
 
 def model_files(output: Path) -> tuple[Path, ...]:
@@ -157,12 +158,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
 def check_replaced(outputs: Sequence[Path]) -> None:
     """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
     for output in outputs:
-        try:
-            with open(output, "rb") as file:
-                start = file.read(MARKED)
-        except OSError:  # there is none yet, or writing fails with its own reason
-            continue
-        if start and not any(mark in start for mark in MARKS):
+        if _start_of(output) and not is_page(output):
             raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another output")
 
 

@@ -4,67 +4,93 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.before_after import read_before_after
-from gsmerge.cli.console import print_document, say, say_notes, stage_progress
-from gsmerge.cli.paths import check_outputs, input_files, write_texts
+from gsmerge.cli.before_after import BeforeAfter, read_before_after
+from gsmerge.cli.console import Progress, print_document, say, say_notes, stage_progress
+from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
 from gsmerge.errors import UsageError
+
+if TYPE_CHECKING:
+    from gsmerge.types import Cameras, Gaussians
 
 
 @opt.command(
     opt.BEFORE,
     opt.AFTER,
-    f"{opt.READING} masks {opt.TARGETS}",
-    opt.changed("set", help="How the outlined superpixels are cut, where results were made with another than the "
-                "default, such as superpixels=2%; may be repeated."),
-    opt.output("The page, .html.", wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
-    *opt.panel(opt.OUTPUT, opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True)),
-    "overwrite dry_run threads",
+    f"{opt.READING} targets sizes",
+    opt.output("The page, .html; one that gsmerge made is replaced.",
+               wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
+    *opt.panel(
+        opt.OUTPUT,
+        opt.switch("light", "Show BEFORE in pictures alone: a page of a third of the size, with AFTER in 3D."),
+        opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True),
+    ),
 )  # fmt: skip
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
+    from gsmerge.pages.data import collect
+    from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.report import document_head
-    from gsmerge.settings.stages import SegmentOptions
-    from gsmerge.stages.superpixels import count_for
 
-    (segmentation,) = args.make(SegmentOptions)
     args.after = args.after or []
     files, after = args.files(args.before), args.after
     beside = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
     output = args.output or beside
-    inputs = (*input_files(files), *after, args.targets, args.target_images)
-    check_outputs((output,), inputs, overwrite=args.overwrite or args.dry_run)
+    check_outputs((output,), (*input_files(files), *after, args.targets), overwrite=True)
+    check_replaced((output,))
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"{output}: expected a name that ends in .html")
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
-    size = pair.scene.cameras.height, pair.scene.cameras.width
-    count_for(segmentation, *size)  # refuses more superpixels than pixels, before anything is measured
-    say_notes(pair.notes, quiet=args.silent)
-    document = {**document_head(), "output": str(output), "dry_run": args.dry_run, "notes": pair.notes}
-    if args.dry_run:
-        print_document(document, f"would write {output}", as_json=args.json)
-        return
-    from gsmerge.pages.data import collect
-    from gsmerge.pages.page import headline, view_page
-
-    sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-    with stage_progress(quiet=args.silent) as progress:
+        say_notes(pair.notes, quiet=args.silent)
+        sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
+        results, cameras, more = _compact_sizes(pair, args.sizes or (), progress)
         data = collect(
-            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
-            segmentation=segmentation, threads=args.threads, progress=progress,
+            pair.title, pair.scene, pair.gaussians | results, [*sizes, *more], pair.held_out,
+            cameras=pair.cameras | cameras, light=args.light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
-    write_texts({output: page}, overwrite=args.overwrite)
+    write_texts({output: page}, overwrite=True)
     say_notes(data.notes, quiet=args.silent)
-    said = headline(data)
-    document |= {"bytes": len(page), "headline": said, "notes": [*pair.notes, *data.notes]}
+    said = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
+    notes = [*pair.notes, *data.notes]
+    document = {**document_head(), "output": str(output), "notes": notes, "bytes": len(page.encode()), "headline": said}
     print_document(document, f"{output}: {said}", as_json=args.json, quiet=args.quiet)
     if args.open and not _open(output):
         say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
+
+
+def _compact_sizes(
+    pair: BeforeAfter, shares: Sequence[str], progress: Progress
+) -> tuple[dict[str, Gaussians], dict[str, Cameras], list[int]]:
+    """Compact the scene to ``shares`` such as "2%"; return Gaussians and cameras by name, and bytes as a .ply.
+
+    Without files AFTER the one nearest the default comes first, for the page opens on it.
+    """
+    from gsmerge.compaction.compact import compact
+    from gsmerge.compaction.file_size import measure_bytes
+    from gsmerge.io.formats.table import PLY
+    from gsmerge.settings.budget import parse_share
+    from gsmerge.settings.stages import SHARE
+
+    results: dict[str, Gaussians] = {}
+    cameras: dict[str, Cameras] = {}
+    nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
+    opened = None if pair.plys else nearest
+    for share in sorted(shares, key=lambda share: (share != opened, parse_share(share))):
+        name = share.replace("%", " %")
+        progress(f"compact to {name}", 0, 0)
+        result = compact(pair.load.scene, budget=share)
+        results[name] = result.gaussians
+        if pair.scene.aligned and len(result.cameras) == len(pair.scene):
+            cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
+    return results, cameras, [measure_bytes([gaussians], PLY) for gaussians in results.values()]
 
 
 def _open(page: Path) -> bool:

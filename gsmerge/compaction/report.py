@@ -234,12 +234,10 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
     if not points:
         return []
-    perceptual = points[0]["lpips"] is not None
-    head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}" + ("  LPIPS (AlexNet)" if perceptual else "")
+    head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}"
     nearest = min(points, key=lambda p: abs(math.log(p["count"] / max(count, 1))))
     rows = [
         f"{p['count']:>12,}  {p['psnr']:5.2f}  {p['ssim']:5.3f}"
-        + (f"  {p['lpips']:5.3f}" if perceptual else "")
         + (f"  <- the result has {count:,}" if p is nearest else "")
         for p in points
     ]

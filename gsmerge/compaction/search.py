@@ -32,8 +32,6 @@ from gsmerge.types import Gaussians
 
 SHORT, LONG = 60, 300  # steps of half-size photos: enough to find the knee; to tell tenths of a dB on clean scenes
 HOLDOUT = 0.1  # share of the photos' patches
-NET, PERCEPTUAL_VIEWS = "alex", 2  # the fast net, and as many views: LPIPS takes longer than the fit
-PERCEPTUAL_SIDE = 64  # pixels, at least
 TRIED = "curve: what each count brings"  # progress
 RUNGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0, 2.0)  # of the usual count: where the scene's curve is measured
 AUTO_RUNGS = RUNGS[1:5]  # the same where only its knee is looked for
@@ -56,7 +54,6 @@ class CurvePoint:
     count: int  # Gaussians
     psnr: float  # dB
     ssim: float  # Structural similarity
-    lpips: float | None = None  # LPIPS (AlexNet), None where its weights are not installed
 
 
 @dataclass(eq=False)
@@ -179,10 +176,10 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
 
 
 def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
-    """Measure PSNR, SSIM and, if its weights are installed, LPIPS (AlexNet) of fits with each of the ``counts``.
+    """Measure PSNR and SSIM of fits with each of the ``counts``.
 
     The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on blocks that the fits
-    leave out. LPIPS needs whole pictures.
+    leave out.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
@@ -203,15 +200,7 @@ def _point(count: int, gaussians: Gaussians, photos: Photos, weights: list[np.nd
     images = [np.clip(image, 0, 1) for image in render_photos(gaussians, photos)]
     views = range(len(photos))
     similar = parallel_map(lambda v: _similarity(images[v], photos.images[v], weights[v] == 0), views)
-    perceptual = None
-    if min(photos.height, photos.width) >= PERCEPTUAL_SIDE:
-        from gsmerge.measure.lpips import lpips, lpips_available
-
-        if lpips_available(NET):
-            view_ids = np.linspace(0, len(photos) - 1, min(PERCEPTUAL_VIEWS, len(photos))).round().astype(int)
-            perceptual = float(np.mean([lpips(images[v], photos.images[v], NET) for v in view_ids]))
-    psnr = holdout_psnr(images, photos, weights, min_gain)
-    return CurvePoint(count, psnr, float(np.mean(similar)), perceptual)
+    return CurvePoint(count, holdout_psnr(images, photos, weights, min_gain), float(np.mean(similar)))
 
 
 def _similarity(image: np.ndarray, photo: np.ndarray, mask: np.ndarray) -> float:

@@ -128,11 +128,6 @@ def borders(labels: np.ndarray) -> np.ndarray:
     return border
 
 
-def draw_means(image: np.ndarray, labels: np.ndarray) -> Picture:
-    """Fill each superpixel of ``labels [h,w]`` with its mean colour in ``image [h,w,3]``, sRGB in [0, 1]."""
-    return to_picture(mean_colors(image, labels)[labels])
-
-
 def mean_colors(image: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return the mean colour ``[k,3]`` of each superpixel of ``labels [h,w]`` in ``image [h,w,3]``."""
     flat = labels.reshape(-1)

@@ -44,7 +44,7 @@ def measure_costs(
         for zoom in zooms:
             views = zoom_cameras(few, zoom)
             head = {"width": views.width, "height": views.height, "threads": used}
-            for name, seconds in _time_in_turns(scenes, views, near).items():
+            for name, seconds in time_in_turns(scenes, views, near).items():
                 costs[name]["speeds"].append({**head, "seconds": round(seconds, 6)})
     first, *others = scenes
     for name in others:
@@ -56,8 +56,12 @@ def measure_costs(
     return costs
 
 
-def _time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
-    """Time each scene's views, one scene after the other and again; return seconds per view."""
+def time_in_turns(scenes: Mapping[str, Gaussians], views: Cameras, near: float) -> dict[str, float]:
+    """Measure the seconds per view that drawing each scene takes, at best of a few turns.
+
+    The scenes are drawn one after the other and again, so that a machine that slows down slows all of them. ``views``
+    are few; ``near`` is in the scenes' units.
+    """
     shortest = {name: np.full(len(views), np.inf) for name in scenes}
     for gaussians in scenes.values():  # fills caches
         time_render(gaussians, views[[0]], near)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
@@ -14,8 +12,7 @@ import numpy as np
 from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
-from gsmerge.io.formats import spz
-from gsmerge.io.photo_files import encode_indexed, photo_array
+from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import (
     INPUT,
@@ -31,6 +28,9 @@ from gsmerge.measure.evaluate import (
 from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
+from gsmerge.measure.speed import time_in_turns
+from gsmerge.pages.drops import draw_drops, find_drops
+from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.raster import render
 from gsmerge.raster.photos import WHOLE
 from gsmerge.runtime.threads import use_threads
@@ -40,15 +40,12 @@ from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # the network of LPIPS where its weights are installed: 0.05 s a picture, the other one takes 0.8 s
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
+LOSSLESS = 101  # quality of a WebP
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
-OUTLINE_LEVELS = 6  # of each channel in their colours: with the transparent one they fit a byte
-OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
-MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
-MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
-MIN_OPACITY = 1 / 255  # what is fainter is not drawn
+OUTLINE_LEVELS = 5  # of each channel in their colours: with the transparent one they fit a byte
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
-FINE = 11  # bits of a position within the scene: the browser keeps 10 and the sign
+OUTLINE_SHIFT = 0.35  # by which an outline is lighter than its superpixel, or darker where that is light
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,8 @@ class Side:
     fog: Fog | None  # of a result
     covered_share: float | None  # of the pixels of these views, covered by the input
     covered: Quality  # over those
+    seconds: float  # that drawing a view took, on this processor
+    dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,9 @@ class PageView:
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
-    outlines: bytes | None = None  # borders of the photo's superpixels as PNG; None of held-out views
+    outlines: bytes | None = None  # borders of the photo's superpixels as WebP; None of held-out views
     outside: bool = False  # a camera where no photo is; it has no scores
+    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: what ``--drop`` would take, coloured
 
 
 @dataclass(frozen=True)
@@ -131,24 +131,26 @@ def collect(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    segmentation: SegmentOptions | None = None,
-    threads: int | None = None,
+    light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
     """Draw and score a scene with at least one view, and its results, if any, in all views.
 
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
-    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own.
+    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own. ``light``: the scene
+    itself as stills alone.
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, None, threads=threads)
+    options = EvaluateOptions(nets, None)
     evaluation = evaluate(
         scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
     )
     progress("superpixels and the view from outside", 0, 0)
-    with use_threads(threads):
-        return page_data(title, scene, results, file_bytes, held_out, evaluation, stills, segmentation)
+    with use_threads():
+        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
+    progress("done", 0, 0)
+    return data
 
 
 def still_keeper(stills: Stills) -> OnImage:
@@ -168,7 +170,8 @@ def page_data(
     held_out: Views | None,
     evaluation: Evaluation,
     stills: Stills,
-    segmentation: SegmentOptions | None = None,
+    *,
+    light: bool = False,
 ) -> ViewData:
     """Make the content of a page of what was measured: see :func:`collect`."""
     pictures = photo_array(with_row_colors(scene).images)
@@ -176,11 +179,20 @@ def page_data(
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
+    cameras = frame.enter_cameras(scene.cameras.numpy())
+    looked_at = [name for name in named if name != INPUT or not results]
+    drops = {name: find_drops(entered[name], cameras, pictures if len(pictures) else None) for name in looked_at}
+    split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
+    seconds = time_in_turns(entered, cameras[[len(cameras) // 2]], near)
     sides = [
-        _side(result, frame.enter(named[result.name]), size, "context" if held_out is None else "target")
+        _side(
+            result, size, split, _pack(entered[result.name], result.name, scene, cameras, light),
+            seconds[result.name], drops,
+        )
         for result, size in zip(evaluation.results, file_bytes, strict=True)
-    ]
-    means = frame.enter(named[evaluation.results[:2][-1].name]).means
+    ]  # fmt: skip
+    means = entered[evaluation.results[:2][-1].name].means
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
         if split not in evaluation.num_views:  # only held-out views were measured
@@ -199,15 +211,21 @@ def page_data(
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
-    outside = _outside_view(scene, named, frame, len(views))
-    shown, num_superpixels = with_outlines(_shown(views), pictures, segmentation or SegmentOptions())
+    shown, num_superpixels = with_outlines(_shown(views), pictures)
+    *drawn, outside = (
+        replace(view, drops=tuple(
+            draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
+        ))
+        for view in (*shown, _outside_view(scene, named, frame, len(views)))
+    )  # fmt: skip
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
     share, _ = evaluation.results[0].mean_covered("context")
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
-        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes, num_superpixels, lacks_pixels
-    )
+        title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
+        lacks_pixels,
+    )  # fmt: skip
 
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
@@ -227,15 +245,13 @@ def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, pl
     )
 
 
-def with_outlines(
-    views: Sequence[PageView], photos: np.ndarray, options: SegmentOptions
-) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
+def with_outlines(views: Sequence[PageView], photos: np.ndarray) -> tuple[tuple[PageView, ...], tuple[int, int] | None]:
     """Add outlines of superpixels to the input views with photos; also return their least and largest number."""
     places = [i for i, view in enumerate(views) if view.photo and not view.held_out]
     if not places:
         return tuple(views), None
     pictures = photos[[views[i].place for i in places]]
-    groups = segment(pictures, options)
+    groups = segment(pictures, SegmentOptions())
     made = list(views)
     for i, picture, labels in zip(places, pictures, groups.labels, strict=True):
         made[i] = replace(views[i], outlines=encode_outlines(picture, labels))
@@ -255,7 +271,7 @@ def encode_still(picture: Picture) -> bytes:
 
 
 def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
-    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent PNG.
+    """Encode the borders of superpixels ``[h,w]`` as an enlarged, transparent WebP without losses.
 
     Each border has the mean colour of its superpixel in ``photo [h,w,3]``, slightly lighter or, for light colours,
     darker.
@@ -269,16 +285,41 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     steps = np.array([OUTLINE_LEVELS**2, OUTLINE_LEVELS, 1], np.uint8)
     ids = 1 + (levels * steps).sum(1, dtype=np.uint8)
     every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
-    colors = np.concatenate([np.zeros((1, 3)), every]).astype(np.uint8)
-    return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0).astype(np.uint8), colors)
+    colors = np.pad(np.pad(every, ((0, 0), (0, 1)), constant_values=255), ((1, 0), (0, 0))).astype(np.uint8)
+    picture = colors[np.where(borders(enlarged), ids[enlarged], 0)][..., [2, 1, 0, 3]]
+    _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
+    return bytes(data.tobytes())
 
 
-def _side(result: ResultScores, gaussians: Gaussians, file_bytes: int, split: str) -> Side:
-    splats, degree = pack_splats(gaussians)
-    mean, highest = result.mean(split)[1], highest_degree(gaussians.shN)
-    fog = result.fog.get(ALL)
-    covered = result.mean_covered(split)
-    return Side(result.name, result.num_gaussians, file_bytes, mean, splats, degree, highest, fog, *covered)
+def _pack(
+    gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
+) -> tuple[bytes | None, int, int]:
+    """Pack one side's Gaussians (canonical, as ``cameras``) for the page; also return its SH degree and the file's.
+
+    Those of the scene itself are left out if the page is to be ``light``.
+    """
+    highest = highest_degree(gaussians.shN)
+    if name != INPUT:
+        return *pack_splats(gaussians), highest
+    if light:
+        return None, highest, highest
+    ids = None
+    if scene.aligned:
+        ids = np.arange(len(gaussians)) if scene.missing is None else np.flatnonzero(~scene.missing.reshape(-1))
+    return *pack_splats(gaussians, cameras, ids), highest
+
+
+def _side(
+    result: ResultScores,
+    file_bytes: int,
+    split: str,
+    packed: tuple[bytes | None, int, int],
+    seconds: float,
+    drops: Mapping[str, Mapping[str, np.ndarray]],
+) -> Side:
+    counts = {word: int(mask.sum()) for word, mask in drops.get(result.name, {}).items()}
+    mean, fog, covered = result.mean(split)[1], result.fog.get(ALL), result.mean_covered(split)
+    return Side(result.name, result.num_gaussians, file_bytes, mean, *packed, fog, *covered, seconds, counts)
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
@@ -297,7 +338,7 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
     """List what the page leaves out: Gaussians, harmonics and views."""
     notes = []
     for side in sides:
-        if side.splats is None:
+        if side.num_gaussians > MAX_GAUSSIANS and side.splats is None:
             notes.append(
                 f"{side.name}: {side.num_gaussians:,} Gaussians are too many for a page, which takes"
                 f" {MAX_GAUSSIANS:,}: stills only"
@@ -307,33 +348,3 @@ def _limits(sides: Sequence[Side], num_shown: int, num_views: int) -> list[str]:
     if num_shown < num_views:
         notes.append(f"{num_shown} of {num_views} views are shown, the worst among them; means are over all")
     return notes
-
-
-def pack_splats(gaussians: Gaussians) -> tuple[bytes | None, int]:
-    """Pack the visible Gaussians with as many harmonics as fit; return bytes (None if too many) and SH degree.
-
-    Neighbouring rows are similar, so the bytes of a ``.spz`` are stored as differences from the row before, column by
-    column, in 60 % of its size. The gzip stream has the header of an uncompressed ``.spz`` of version 3, the checksum
-    of its whole content (CRC-32, little-endian), and the columns; the page's script restores the ``.spz``.
-    ``gaussians`` are in the page's frame, where the scene is about 1 large: browsers keep means in 16 bits.
-    """
-    drawn = gaussians.opacities >= MIN_OPACITY
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
-    count = int(drawn.sum())
-    if count > MAX_GAUSSIANS:
-        return None, 0
-    highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
-    degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
-    columns = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
-    checksum = zlib.crc32(columns.header)
-    for part in columns.parts:
-        checksum = zlib.crc32(part.tobytes(), checksum)
-    planes = [np.diff(part, axis=0, prepend=part[:1] & 0).T.tobytes() for part in columns.parts]
-    return gzip.compress(b"".join([columns.header, checksum.to_bytes(4, "little"), *planes]), mtime=0), degree
-
-
-def highest_degree(harmonics: np.ndarray) -> int:
-    """Return the highest degree at which harmonics ``[n,k-1,3]`` are not all zero."""
-    used = np.flatnonzero(harmonics.any((0, 2)))
-    return int(np.sqrt(used[-1] + 1)) if len(used) else 0

@@ -29,6 +29,7 @@ PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {sc
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY = "{policy}"  # stands for it in the templates until the hashes are known
 NONE = "-"  # in place of a figure
+FASTER = 1.2  # times, from which on the headline says it
 ENGINE = "vendor/spark-three.js.gz"
 
 
@@ -36,11 +37,14 @@ def view_page(data: ViewData) -> str:
     """Make the HTML page of a scene and its results."""
     photos = any(view.photo is not None for view in data.views)
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if photos else []
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0, "dropped": {}}] if photos else []
     sources += [
-        {"name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians}
+        {
+            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
+            "dropped": side.dropped,
+        }
         for i, side in enumerate(data.sides)
-    ]
+    ]  # fmt: skip
     right = min(int(photos) + 1, len(sources) - 1)
     left = max(right - 1, 0)
     stills = [
@@ -53,7 +57,14 @@ def view_page(data: ViewData) -> str:
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = files("gsmerge.pages").joinpath(ENGINE).read_bytes() if splats else None
     places = range(min(len(data.sides) - 1, 1), len(data.sides))
-    results = [(_unbroken(headline(data, place)), figures(data, place)) for place in places]
+    results: list[dict[str, Any]] = [
+        {
+            "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
+            "figures": figures(data, place),
+        }
+        for place in places
+    ]  # fmt: skip
+    by_size = sorted(places, key=lambda place: data.sides[place].num_gaussians)
     return render_template(
         "view.html",
         policy=SOLID,
@@ -70,12 +81,19 @@ def view_page(data: ViewData) -> str:
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [
-                {"headline": line, "figures": [[figure.new, figure.better] for figure in row]} for line, row in results
+                result | {"figures": [[figure.new, figure.better] for figure in result["figures"]]}
+                for result in results
             ],
+            "sizes": [place + photos for place in by_size],
             "views": [_view(view) for view in data.shown],
         },
         stills=stills,
-        outlines=[view.outlines and data_uri(view.outlines, "image/png") for view in data.shown],
+        speed_words=speed_words(results[0]["speed"]),
+        outlines=[view.outlines and data_uri(view.outlines, "image/webp") for view in data.shown],
+        drops=[
+            [None] * photos + [one and data_uri(one, "image/png") for one in view.drops or [None] * len(data.sides)]
+            for view in data.shown
+        ],
         splats=splats,
         engine=engine and base64_text(engine),
     )
@@ -98,6 +116,29 @@ def headline(data: ViewData, place: int = 1) -> str:
         return f"{said}, {new:.1f} dB from the input's own renders"
     words = ROW_COLORS if reference == ROW_COLORS else "the photos"
     return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
+
+
+def speed(data: ViewData, place: int = 1) -> float | None:
+    """Return how many times as fast as the scene itself this processor drew a result; None for one scene alone."""
+    if len(data.sides) == 1 or not data.sides[place].seconds:
+        return None
+    return round(data.sides[0].seconds / data.sides[place].seconds, 2)
+
+
+def speed_words(ratio: float | None) -> str:
+    """Write the end of the headline; empty where a result is not clearly faster."""
+    if ratio is None or ratio < FASTER:
+        return ""
+    return f", {ratio:.{0 if ratio >= 3 else 1}f}\u00a0\u00d7\u00a0faster to draw"
+
+
+def size_words(data: ViewData, place: int) -> str:
+    """Describe the size of a result: share, bytes, quality."""
+    side = data.sides[place]
+    share = 100 * side.num_gaussians / max(data.sides[0].num_gaussians, 1)
+    quality = _number(side.mean.psnr, 1)
+    words = [f"{share:.1f} %", human_bytes(side.file_bytes), *([f"{quality} dB"] if quality != NONE else [])]
+    return _unbroken(" · ".join(words))
 
 
 @dataclass(frozen=True)
@@ -140,12 +181,12 @@ def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
     first = data.sides[0]
     columns: dict[str, list[str]] = {
         "": [side.name for side in data.sides],
-        "Gaussians": [f"{side.num_gaussians:,}" for side in data.sides],
-        "Share": [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides],
         "File": [human_bytes(side.file_bytes) for side in data.sides],
     }
     for head, name, digits in (("PSNR (dB)", "psnr", 2), ("SSIM", "ssim", 3), ("LPIPS", "lpips_alex", 3)):
         columns[head] = [_number(getattr(side.mean, name), digits) for side in data.sides]
+    columns["Gaussians"] = [f"{side.num_gaussians:,}" for side in data.sides]
+    columns["Share"] = [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides]
     if data.lacks_pixels:
         columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
     for head, name in (("Near fog", "fog_near"), ("Far fog", "fog_far"), ("Holes", "holes")):

@@ -92,10 +92,11 @@ def view(
         for name, value in given.items()
         if (moved := getattr(value, "cameras", None)) is not None and len(moved) == len(shown) == len(read)
     }
+    is_light = len(read.gaussians) > MOST_SOLID if light is None else light
     data = collect(
         Path(scene).stem if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
-        progress=progress or (lambda *_: None),
+        light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data), headline(data))
 

@@ -23,7 +23,7 @@ from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
-from gsmerge.scene.exporters import AUTO, ReadHints
+from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.read import Loaded, align_scene, read_rows
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
@@ -252,14 +252,12 @@ def stress(
     *,
     targets: Views | None = None,
     cases: Sequence[str] | None = None,
-    hints: ReadHints = AUTO,
     progress: Progress | None = None,
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
     Results are compared on held-out views (``targets``), or on the input views with their photos, or with renders of
-    the input where there are none. ``hints`` are those that the scene was read with; ``progress`` is called with (case,
-    done, total).
+    the input where there are none. ``progress`` is called with (case, done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -279,7 +277,7 @@ def stress(
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
         report(case.words, i, len(names))
-        passed, measured = _check_case(case, load, setup, base, options, hints)
+        passed, measured = _check_case(case, load, setup, base, options)
         seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
         out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
     report("done", len(names), len(names))
@@ -287,16 +285,16 @@ def stress(
 
 
 def _check_case(
-    case: Case, load: Loaded, setup: StressScene, base: _Result | None, options: CompactOptions, hints: ReadHints
+    case: Case, load: Loaded, setup: StressScene, base: _Result | None, options: CompactOptions
 ) -> tuple[bool | None, str]:
     """Check whether the property of a case holds; return the answer with the figures."""
     problem = _inapplicable(case, load)
     if problem is not None:
         return None, problem
     if case.check == "convention":
-        return _check_convention(case, load, hints)
+        return _check_convention(case, load)
     if case.cameras is not None:
-        return _check_cameras(case, load, hints)
+        return _check_cameras(case, load)
     assert base is not None
     try:
         if case.check == "again":
@@ -370,14 +368,14 @@ def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> 
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 
-def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
+def _check_convention(case: Case, load: Loaded) -> tuple[bool, str]:
     """Read the scene from cameras with poses in another convention than their format declares."""
     assert load.cameras is not None
     assert case.convention is not None
     stored = from_viewmats(load.cameras.viewmats, case.convention)
     wrong = replace(load.cameras, viewmats=to_viewmats(stored, load.cameras.convention))
     try:
-        read = _read_again(load, wrong, hints).scene
+        read = _read_again(load, wrong).scene
     except SceneError as error:
         return True, f"refused: {error.problem}"
     expected, viewmats = load.scene.cameras.viewmats, read.cameras.viewmats
@@ -386,13 +384,13 @@ def _check_convention(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool,
     return bool(same), "recognised" if same else "taken for something else"
 
 
-def _check_cameras(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, str]:
+def _check_cameras(case: Case, load: Loaded) -> tuple[bool, str]:
     """Read the scene with wrong cameras and correct Gaussians."""
     assert load.cameras is not None
     assert case.cameras is not None
     wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
     try:
-        read = _read_again(load, wrong, hints)
+        read = _read_again(load, wrong)
     except SceneError as error:
         return case.check == "refused", f"refused: {error.problem}"
     if read.alignment is None:
@@ -400,10 +398,10 @@ def _check_cameras(case: Case, load: Loaded, hints: ReadHints) -> tuple[bool, st
     return case.check == "moved" and read.alignment.ok, f"{read.alignment.worst_px:.2f} px from the pixels"
 
 
-def _read_again(load: Loaded, cameras: CameraFile, hints: ReadHints) -> Loaded:
+def _read_again(load: Loaded, cameras: CameraFile) -> Loaded:
     """Read the scene's own file with other cameras."""
     opacity: OpacityChoice = "raw" if load.info.opacity_encoding == "raw" else "logit"
-    return align_scene(read_rows(load.files, opacity=opacity, hints=hints), load.files, cameras, hints=hints)
+    return align_scene(read_rows(load.files, opacity=opacity, hints=AUTO), load.files, cameras)
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:

@@ -59,8 +59,7 @@ class CompactOptions(Settings):
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
-    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel; docs/internals/plugins.md "
-        "lists them.",
+    method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel or contribution.",
         "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME")  # fmt: skip
     effort: str = setting("default", "Quality for time: best is sharper and takes two to three times as "
         "long; fast and draft take a third or less.",

@@ -74,8 +74,6 @@ def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
             place / "out",
             *CHART_TARGETS,
             *CHART_FAST,
-            "--set",
-            "proxy_views=1",
             "-q",
         )
         assert main([str(word) for word in words]) == 0

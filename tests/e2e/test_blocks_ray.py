@@ -12,19 +12,7 @@ from typing import Any
 import pytest
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs gsmerge[ray]")
-SETTINGS = (
-    "--set",
-    "blocks=4",
-    "--set",
-    "superpixels=5%",
-    "--set",
-    "fit_steps=60",
-    "--threads",
-    "1",
-    "--seed",
-    "3",
-    "-q",
-)
+SETTINGS = ("--set", "blocks=4", "--set", "superpixels=5%", "--set", "fit_steps=60", "--seed", "3", "-q")
 CLUSTER = """
 import os, random, signal, subprocess, sys, threading, time
 from ray.cluster_utils import Cluster
@@ -50,7 +38,7 @@ def strike():
 
 thread = threading.Thread(target=strike, daemon=True)
 thread.start()
-code = main([*words, "--engine", "ray", "--set", f"address={cluster.address}"])
+code = main([*words, "--set", "engine=ray", "--set", f"address={cluster.address}"])
 ended.set()
 thread.join()
 print("killed:", len(killed))

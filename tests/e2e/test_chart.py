@@ -51,9 +51,6 @@ def budgets(merges: list[CompactOptions]) -> list[object]:
     return [settings.budget.budget for settings in merges]
 
 
-NO_PROXIES = ("--set", "proxy_views=0")
-
-
 def runs(folder: Path) -> dict[str, RunRecord]:
     """All runs by their label; none may be left out."""
     records, notes = read_runs(folder)
@@ -64,14 +61,14 @@ def runs(folder: Path) -> dict[str, RunRecord]:
 def again(run: Run, folder: Path, *options: object) -> Outcome:
     fast = CHART_FAST[2 * ("--grid" in options) :]
     where = ("--output", folder / "out") if "--output" not in options else ()
-    return run("lab", "chart", folder / "room", *where, *CHART_TARGETS, *fast, *NO_PROXIES, *options)
+    return run("lab", "chart", folder / "room", *where, *CHART_TARGETS, *fast, *options)
 
 
 def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
     records = runs(charted_scene / "out")
-    expected = ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none", "superpixels, 1 views"]
+    expected = ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none"]
     assert list(records) == expected
-    first, one, two, proxies = records.values()
+    first, one, two = records.values()
     pixels = 3 * 64 * 48
     for record in (first, one, two):
         assert record.error is None
@@ -82,16 +79,15 @@ def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
         assert record.environment["gsmerge"] == gsmerge.__version__
         assert record.command.startswith("gsmerge lab chart ")
         assert "--grid budget=1%,2% --set fit=none" in record.command
-    assert len(proxies.scores) == 30
     assert (first.ratio, one.count, two.count) == (1.0, pixels // 100, pixels // 50)
     assert first.seconds == 0
     assert one.seconds == pytest.approx(sum(v for k, v in one.stages.items() if k not in ("score", "input")))
     page = (charted_scene / "out" / "index.html").read_text()
-    assert "4 runs on 1 scene(s): room" in page
+    assert "3 runs on 1 scene(s): room" in page
     assert page.count('<input type="range"') == 2
-    assert len((charted_scene / "out" / "runs.csv").read_text().splitlines()) == 1 + 4
+    assert len((charted_scene / "out" / "runs.csv").read_text().splitlines()) == 1 + 3
     names = {path.name for path in (charted_scene / "out" / "charts").iterdir()}
-    assert {"quality-ratio.png", "quality-ratio.svg", "proxy.png", "break-even.svg", "stages.png"} <= names
+    assert {"quality-ratio.png", "quality-ratio.svg", "break-even.svg", "stages.png"} <= names
     assert not any(name.startswith(".") for name in listing(charted_scene / "out"))
 
 
@@ -109,7 +105,7 @@ def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: R
     assert outcome.code == 0, outcome.err
     assert merges == []
     assert (copied / "out" / "batch.jsonl").read_bytes() == before
-    assert names(outcome.out, "4 runs", "0 new")
+    assert names(outcome.out, "3 runs", "0 new")
     assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
 
 
@@ -122,7 +118,7 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err
     assert set(budgets(merges)) == {"2%"}
-    assert len(runs(copied / "out")) == 4
+    assert len(runs(copied / "out")) == 3
     next((copied / "out" / "room").glob("*1%*.jpg")).unlink()
     assert again(run, copied).code == 0
     assert budgets(merges)[-1] == "1%"
@@ -192,7 +188,6 @@ def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run:
         copied / "out",
         *CHART_TARGETS,
         *CHART_FAST,
-        *NO_PROXIES,
         "--quiet",
         code=5,
     )
@@ -207,7 +202,7 @@ def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) ->
     document = json.loads(outcome.out)
     assert document["num_done"] == 3
     assert noted(document["notes"], "room", "views", 3)
-    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2 and r["method"] != "superpixels"} == {2}
+    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2} == {2}
 
 
 def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
@@ -229,6 +224,6 @@ def test_drawing_alone(copied: Path, run: Run) -> None:
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
     assert document["schema_version"] == 1
-    assert (document["num_runs"], document["num_done"], document["num_failed"]) == (4, 0, 0)
+    assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
     assert all(Path(path).stat().st_size > 1000 for path in document["charts"])
     assert Path(document["page"]).is_file()

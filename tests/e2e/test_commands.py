@@ -192,7 +192,7 @@ def test_a_view_of_one_scene(small_copy: Path, run: Run) -> None:
     outcome = run("view", bare, "--no-open", code=0)
     assert "estimated" in outcome.err
     write_without_grid(bare, bare)
-    outcome = run("view", bare, "--no-open", "--overwrite", code=0)
+    outcome = run("view", bare, "--no-open", code=0)
     assert "cameras: " in outcome.err
     assert outcome.out.endswith("bare.view.html: 7,679 Gaussians\n")
     shutil.copy(bare, bare.with_name("x.ply"))

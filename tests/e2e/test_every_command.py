@@ -165,7 +165,8 @@ def test_inputs_are_not_replaced(command: str, output: str, small_copy: Path, ru
     before = listing(small_copy)
     scene = small_copy / "scene.ply"
     results = [scene] if command == "view" else []
-    outcome = run(*command.split(), scene, *results, "-o", small_copy / output, "--overwrite")
+    replacing = [] if command == "view" else ["--overwrite"]
+    outcome = run(*command.split(), scene, *results, "-o", small_copy / output, *replacing)
     assert_refused(outcome, 2, small_copy / output, "input")
     assert listing(small_copy) == before
 

@@ -104,6 +104,10 @@ def test_a_state_is_converted_as_it_is(
 
 def test_a_state_is_converted_alone(state: Path, tmp_path: Path, run: Run) -> None:
     assert_refused(run("convert", state, state, tmp_path / "a.npz"), 2, state, "alone", 2)
+
+
+def test_a_state_is_no_web_site(state: Path, tmp_path: Path, run: Run) -> None:
+    assert_refused(run("compact", state, "-o", tmp_path / "site"), 2, tmp_path / "site", state, "convert")
     damaged = tmp_path / "a.gsm"
     damaged.write_bytes(state.read_bytes()[:1000])
     assert_refused(run("convert", damaged, tmp_path / "a.npz"), 3, "a.gsm")

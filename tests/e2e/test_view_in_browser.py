@@ -34,7 +34,8 @@ BARE = (
 FRESH = (
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('pixels', 'screen'); set('shape', 'splats');"
+    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', '');"
+    "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
 )
@@ -167,13 +168,89 @@ def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) ->
             assert psnr(picture(tab), drawn) > least
     for solid in ("''", "'1'"):
         tab.run(f"set('solid', {solid}); set('other', false); set('left', 0)")
-        assert tab.run("[id('left').hidden, id('message').textContent]") == [True, "photo: at the photos' cameras only"]
+        shown = tab.run("[id('left-tag').textContent, id('message').textContent]")
+        assert shown == [tab.run("data.sources[2].name"), "photo: at the photos' cameras only"]
+        tab.run("id('message').style.opacity = 0")
+        assert psnr(picture(tab), drawn) > (33 if solid == "''" else 28)  # the result, which is on the other side
+        tab.run("id('message').style.opacity = ''")
         assert tab.run("id('overlay-share').title") == "No photo is outside"
     tab.run("set('left', 1)")
     tab.press("ArrowUp")
     assert tab.run("view().outside") is False
     tab.press("b")
     assert tab.run("view().outside") is True
+
+
+def test_step_back_is_a_toggle(opened: tuple[Browser, Any]) -> None:
+    """By button and keys, with the whole picture on both ways."""
+    tab, _ = opened
+    state = "[state.view, state.zoom, id('outside').ariaPressed, view().outside]"
+    for solid in ("''", "'1'"):
+        for back in ("id('outside').click()", "pressed = 'b'", "pressed = 'r'"):
+            tab.run(f"set('solid', {solid}); jump(1); zoomTo(6); id('outside').click()")
+            assert tab.run(state)[1:] == [1, "true", True]
+            if key := back.partition("'")[2][0] if "pressed" in back else "":
+                tab.press(key)
+            else:
+                tab.run(back)
+            assert tab.run(state) == [1, 1, "false", False]
+
+
+def test_what_cannot_be_seen_from_here_gives_way(opened: tuple[Browser, Any]) -> None:
+    """Without a GPU a large scene is in stills alone: once the camera has moved, both sides show the result."""
+    tab, _ = opened
+    tab.run("set('mode', 'swipe'); set('solid', '1'); jump(0)")
+    wait(tab, SETTLED)
+    tab.run("kept = solid.results.get(1); solid.results.delete(1); show()")
+    tags = "[id('left-tag').textContent, id('message').hidden]"
+    assert tab.run(tags) == ["input", True]
+    tab.run("solid.orbit(0.2, 0.1)")
+    wait(tab, "state.atCamera === false")
+    assert tab.run(tags) == [tab.run("data.sources[2].name"), False]
+    assert tab.run("panes().map(pane => pane.source)") == [2, 2]
+    assert tab.run("id('message').textContent") == "input: at the photos' cameras only"
+    tab.run("solid.results.set(1, kept)")
+
+
+def test_the_size_slider(opened: tuple[Browser, Any]) -> None:
+    """From the smallest: it brings the picture, the figures and the 3D of a result."""
+    tab, _ = opened
+    assert tab.run("data.sizes") == [2, 3]  # one Gaussian more
+    said = "[state.right, id('size-words').textContent, id('size').value]"
+    for place, source in ((1, 3), (0, 2)):
+        tab.run(f"id('size').value = {place}; id('size').dispatchEvent(new Event('input'))")
+        words = tab.run(f"data.results[{source - 2}].words")
+        assert tab.run(said) == [source, words, str(place)]
+        assert "B · " in words
+        assert tab.run("id('right').src === stillOf(state.right)")
+        wait(tab, f"solid.has({source})")
+
+
+def test_the_speed_of_this_device_is_in_the_headline(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.run("[solid.frameTime, solid.software] = [source => source === 1 ? 18 : 2, false]; measureSpeed()")
+    assert tab.run("id('speed').textContent").replace("\u00a0", " ") == ", 9 \u00d7 faster to draw"
+    assert tab.run("id('speed').title") == "Medians of frames on this device: 18.0 and 2.0 ms"
+    tab.run("times.clear(); solid.frameTime = source => 2; measureSpeed()")
+    assert tab.run("[id('speed').textContent, id('speed').title]") == ["", ""]
+    tab.run("delete solid.frameTime; set('solid', '1')")
+    wait(tab, SETTLED)
+    assert tab.run("[1, 2].every(source => solid.frameTime(source) > 0)")
+    tab.run("times.clear(); solid.software = true")
+
+
+def test_what_would_be_dropped_is_shown_in_colour(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    assert tab.run("data.sources[3].dropped.floaters") > 0  # the one that reaches in from outside
+    tab.run("choose(3); jump(data.views.findIndex((_, i) => drops[i][3])); set('drops', '1')")
+    layer = "document.querySelector('#right-pane .drops')"
+    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
+        False,
+        True,
+    ]
+    assert tab.run("id('legend').textContent").startswith("floaters: ")
+    tab.press("x")
+    assert tab.run(f"[{layer}.hidden, id('legend').hidden]") == [True, True]
 
 
 def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
@@ -242,11 +319,13 @@ def test_grey_controls_say_why(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
     tab.run("jump(data.views.findIndex(view => view.held_out)); set('solid', '')")
     grey = "[...document.querySelectorAll('button:disabled')].filter(one => one.checkVisibility())"
-    assert tab.run(f"{grey}.length") >= 11
+    assert tab.run(f"{grey}.length") >= 2
     assert tab.run(f"{grey}.every(one => one.title.length > 5)")
     assert tab.run("document.querySelector('[data-set=outlines]').title") == "Held-out photos have no superpixels"
-    assert tab.run("document.querySelector('[data-set=shape]').title") == "In 3D only"
+    seen = "[...document.querySelectorAll('[data-set=shape], [data-set=pixels]')].map(one => one.checkVisibility())"
+    assert tab.run(seen) == [False] * 4  # in 3D only
     tab.run("set('solid', '1')")
+    assert tab.run(seen) == [True] * 4
     assert tab.run("[...document.querySelectorAll('button:enabled')].every(one => one.title === '')")
 
 
@@ -285,6 +364,47 @@ def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browse
     tops = tab.run("[...id('figures').children].map(one => Math.round(one.getBoundingClientRect().top))")
     assert [tops.count(top) for top in sorted(set(tops))] == ([2, 2] if size[0] < 640 else [4])
     assert tab.run("document.documentElement.scrollWidth") == size[0]
+
+
+@pytest.mark.parametrize("mode", ["swipe", "side", "blink", "difference"])
+def test_the_modes_on_a_phone(mode: str, opened: tuple[Browser, Any]) -> None:
+    """Both pictures are whole and fill their part of the stage, in stills and in 3D."""
+    tab, _ = opened
+    resize(tab, 390, 844)
+    side = mode == "side"
+    expected = [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] if side else [[0, 0, 1, 1]] * (1 if mode == "blink" else 2)
+    for solid in ("''", "'1'"):
+        tab.run(f"set('mode', '{mode}'); set('solid', {solid})")
+        boxes = tab.run(
+            "['left', 'right'].filter(side => !id(`${side}-pane`).hidden).map(side => { const box = id(`${side}-pane`)"
+            ".getBoundingClientRect(), whole = stage.getBoundingClientRect(); return [(box.x - whole.x) / whole.width,"
+            " (box.y - whole.y) / whole.height, box.width / whole.width, box.height / whole.height]; })"
+        )
+        assert np.allclose(boxes, expected, atol=0.01)
+        assert np.allclose(tab.run("panes().map(pane => pane.box)"), expected)
+        assert tab.run("stage.classList.contains('stacked')") is side
+
+
+def test_a_phone_held_sideways_shows_the_picture(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    tab.call("Emulation.setDeviceMetricsOverride", width=844, height=390, deviceScaleFactor=1, mobile=True)
+    wait(tab, "innerWidth === 844")
+    tab.run("show(); scrollTo(0, 0)")
+    wait(tab, "stage.getBoundingClientRect().bottom <= innerHeight")
+    assert tab.run("stage.getBoundingClientRect().height") > 0.85 * 390
+    assert tab.run("document.documentElement.scrollWidth") == 844
+
+
+def test_the_table_of_a_phone_begins_with_file_and_psnr(opened: tuple[Browser, Any]) -> None:
+    """Which are seen without scrolling; a shadow says that there is more."""
+    tab, _ = opened
+    resize(tab, 390, 844)
+    heads = "[...document.querySelectorAll('.results th')]"
+    assert tab.run(f"{heads}.map(one => one.textContent)")[:3] == ["", "File", "PSNR (dB)"]
+    assert tab.run(f"{heads}[2].getBoundingClientRect().right") < 390
+    assert tab.run("(one => one.scrollWidth > one.clientWidth)(document.querySelector('.results .scroll'))")
+    ground = tab.run("getComputedStyle(document.querySelector('.results .scroll')).backgroundAttachment")
+    assert ground == "local, local, scroll, scroll"
 
 
 @pytest.mark.slow
@@ -433,7 +553,7 @@ def test_another_result_brings_its_figures(opened: tuple[Browser, Any]) -> None:
         assert tag == tab.run(f"data.sources[{source}].name")
         assert tab.run(score) == f"{tab.run(f'view().scores[{row}][0]'):.1f} dB"
         assert tab.run("[...id('results').rows].map(one => one.ariaCurrent)").index("true") == row
-        assert tab.run("id('result').value") == str(source)
+        assert tab.run("data.sizes[id('size').value]") == source
     assert counts[0] != counts[1]
     tab.run("choose(2); pick('left', 3)")
     assert counts[0] in tab.run("id('figures').textContent")  # of the one on the right

@@ -119,7 +119,6 @@ USAGE = {
     "render room --path room/targets --frames 9 -o a.mp4": "--frames*--views",
     "render room --path spline --views 1 -o a.mp4": "spline*2*1",
     "render room --frames 9 -o a": "--frames*--path",
-    "view room alone.ply -o a.html --set superpixels=99999": "superpixels*1536*99999",
     "evaluate room --lpips none --no-context": "*--no-context*--set context=false",
     "evaluate room --lpips none --set context=false": "context=false*held-out*--targets",
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",
@@ -151,7 +150,6 @@ USAGE = {
     "lab generate -o out --size 9x9": "width*16 to 2048*9",
     "lab generate -o out --set style=castle": "style*mixed*'castle'",
     "lab generate -o out --set path=spiral": "path*arc*'spiral'",
-    "lab generate -o out --set style=building --set path=orbit": "path*walk*'orbit'",
     "lab train -o out": "*'--data'",
 }
 PLACES = {
@@ -172,7 +170,6 @@ PLACES = {
     "lab stress alone.ply --set targets=room/targets": "alone.ply*none*--cameras",
     "lab chart -o out nowhere": "nowhere*no such",
     "lab chart -o out room --targets {{scene}}/none.json": "room/none.json*cameras*nothing",
-    "lab generate -o out --set ranges=nowhere.toml": "nowhere.toml*no such",
     "lab generate -o alone.ply": "alone.ply*folder*file",
     "lab train --data nowhere -o out": "nowhere*no such",
 }

@@ -169,13 +169,6 @@ def check_pairs(path: Path) -> None:
             parse_pairs("--set", [line], flat_settings(CompactOptions))
 
 
-def check_settings(path: Path) -> None:
-    """Read ranges of the errors of made scenes."""
-    from gsmerge.research.generate import read_ranges
-
-    read_ranges(path)
-
-
 def written(name: str, degree: int = 0) -> Seeds:
     """Make a file of six Gaussians."""
 
@@ -356,8 +349,6 @@ TARGETS: dict[str, Target] = {
     "sharp": Target("a.ply", sharp, read_sharp_camera),
     "gsm": Target("a.gsm", states, load_state),
     "checkpoint": Target("a.safetensors", checkpoint, load_checkpoint),
-    "settings-json": Target("a.json", texts(b'{"scale": [0.7, 0.7], "sh_degrees": [1]}'), check_settings),
-    "settings-toml": Target("a.toml", texts(b"scale = [0.7, 0.8]\nsh_degrees = [1]\n"), check_settings),
     "crop": Target(
         "a.json", texts(b'{"shape": "box", "center": [0, 1, 2], "size": [1, 2, 3], "rotate": [0, 30, 0]}'), read_crop
     ),

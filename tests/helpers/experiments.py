@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gsmerge.research.charts.measure_run import SEGMENTATIONS, SHARES, SUPERPIXELS, RunRecord, describe
+from gsmerge.research.charts.measure_run import RunRecord, describe
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB
@@ -64,15 +64,3 @@ def make_grid(
                     records.append(make_record(scene, method, {"budget": budget}, views_asked=count))
                 records.append(make_record(scene, "gsmerge", {"budget": budget, "fit": "none"}, views_asked=count))
     return records
-
-
-def make_proxies() -> list[RunRecord]:
-    """Superpixel methods, each 1 dB below the one before."""
-    points = {
-        f"{name} {share:g}": 30 - i + 2 * math.log2(share / 0.01)
-        for i, name in enumerate(SEGMENTATIONS)
-        for share in SHARES
-    }
-    return [
-        RunRecord(scene, SUPERPIXELS, method=SUPERPIXELS, views=2, count=100_000, scores=points) for scene in SCENES
-    ]

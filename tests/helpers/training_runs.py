@@ -20,16 +20,15 @@ from gsmerge.research.training.modules import Networks
 
 TINY = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)
 OPTIONS = TrainOptions(
-    network=TINY, densities=(0.1,), fit_steps=12, levels=(1, 2), steps=12, warmup=2, rate=3e-3, crop=60, save_every=4,
-    validation_crops=2, photo_start=0.3,
+    network=TINY, densities=(0.1,), levels=(1, 2), steps=12, warmup=2, rate=3e-3, save_every=4, window=16,
+    validation_windows=1,
 )  # fmt: skip
-# As the paper's, in small: absolute heads, random views, boxes, no fit.
+# As the paper's, in small: absolute heads, random views, boxes.
 PAPER = replace(
     OPTIONS,
     network=replace(TINY, outputs="absolute", geometry="carried", group_numbers=False, merger_start="first"),
-    random_views=(1, 12), match="aabb", joint=True, photo_start=0.0, photo_loss="mse", photo_weight=1.0,
-    ssim_weight=0.05, regression_weight=0.0,
-    teacher_weight=0.25, diversity_weight=1.0, window=16, validation_windows=1,
+    random_views=(1, 12), match="aabb", joint=True, photo_loss="mse", photo_weight=1.0,
+    ssim_weight=0.05, teacher_weight=0.25, diversity_weight=1.0,
 )  # fmt: skip
 
 

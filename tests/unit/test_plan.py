@@ -245,6 +245,13 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     assert again.kept_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
 
 
+def test_views_that_are_placed_are_scored(scene: Scene) -> None:
+    alone = Scene(scene.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+    prepared = prepare(alone)  # as for states, and for networks
+    plan = make_plan(prepared, options_of())
+    assert plan.scored_views == tuple(range(len(prepared.scene)))
+
+
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
     rng = np.random.default_rng(0)
     noise = replace(scene, images=rng.random(scene.images.shape, np.float32))

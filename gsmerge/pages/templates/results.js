@@ -2,6 +2,8 @@
 // The chosen result: headline, figures, table, strip; and the scores of a view.
 
 const FIRST_RESULT = Number(data.photos) + Number(data.results.length < data.sources.length - Number(data.photos)); // among the sources
+const FASTER = 1.2; // times, from which on the headline says it
+const times = new Map(); // milliseconds of a frame in 3D, by source
 const number = (value, digits) => (value === null ? "-" : value.toFixed(digits));
 const scoreOf = (named, source) => named.scores[source - Number(data.photos)] || [null, null, null];
 
@@ -27,8 +29,9 @@ function showNumbers() {
 // What stands about the picture, for one of the results.
 function showResult(source) {
   state.result = source;
-  const { headline, figures } = data.results[source - FIRST_RESULT];
+  const { headline, figures, speed } = data.results[source - FIRST_RESULT];
   id("headline").textContent = headline;
+  showSpeed(speed);
   figures.forEach(([words, better], i) => {
     const figure = id("figures").children[i].querySelector("b");
     figure.className = better ? "up" : "";
@@ -45,8 +48,41 @@ function showScore(line, named) {
   line.replaceChildren(`${number(before, 1)} → `, make("b", `${number(after, 1)} dB`, { className: (after || 0) < (before || 0) ? "down" : "" }));
 }
 
+// The end of the headline.
+function showSpeed(ratio, by = "As drawn by the processor that made this page") {
+  const isFaster = ratio !== null && ratio >= FASTER;
+  id("speed").textContent = isFaster ? `, ${ratio.toFixed(ratio >= 3 ? 0 : 1)}\u00a0×\u00a0faster to draw` : "";
+  id("speed").title = isFaster ? by : "";
+}
+
+// Where this device draws both scenes in 3D, their frames say how much faster the result is.
+function measureSpeed() {
+  const input = FIRST_RESULT - 1;
+  if (!solid || solid.software || data.sizes[0] === input || ![input, state.result].every((source) => solid.has(source))) return;
+  const [before, after] = [input, state.result].map((source) => {
+    if (!times.has(source)) times.set(source, solid.frameTime(source));
+    return times.get(source);
+  });
+  showSpeed(before / after, `Medians of frames on this device: ${before.toFixed(1)} and ${after.toFixed(1)} ms`);
+}
+
+// How much would be dropped of what the right side shows, or else the left one.
+function showLegend() {
+  if (!id("legend")) return;
+  const source = [state.right, state.left].find((one) => Object.keys(data.sources[one].dropped).length);
+  id("legend").hidden = !state.drops || source === undefined;
+  if (id("legend").hidden) return;
+  const { dropped, count } = data.sources[source];
+  const parts = Object.entries(dropped).map(([word, number]) => make("span", `${word}: ${number.toLocaleString("en")}`, { className: word }));
+  id("legend").replaceChildren(...parts, ` of ${count.toLocaleString("en")} Gaussians`);
+}
+
 function markResult() {
-  if (id("result")) id("result").value = state.result;
+  if (id("size")) {
+    id("size").value = data.sizes.indexOf(state.result);
+    id("size-words").textContent = data.results[state.result - FIRST_RESULT].words;
+    id("size").setAttribute("aria-valuetext", id("size-words").textContent);
+  }
   if (!id("results")) return;
   for (const row of id("results").rows) row.setAttribute("aria-current", String(Number(row.dataset.result) === state.result));
 }

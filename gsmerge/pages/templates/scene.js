@@ -4,13 +4,11 @@
 const FEWER = 0.5; // of the pixels per side: while the camera moves and frames take long, and without a GPU
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i; // names of renderers that draw on the processor
 const SLOW_FRAME = 90; // milliseconds
+const FRAMES = 7; // of which the median counts
 const REST = 160; // milliseconds without a movement after which the camera is at rest
 const SOLID = 0.1; // least opacity of Gaussians that points and the frame count
 const FRAMED = 0.8; // of the Gaussians are in the picture: what lies far behind would make it small
 const GAIN_POINTS = 1.6; // pixels of the screen per point
-const HEADER = 16; // bytes of a .spz, followed here by four of the checksum of all
-const CHECKSUM = 4;
-const BLOCK = 65535; // most bytes of a block that is not compressed
 // Spark leaves out Gaussians whose centre is far outside the picture, for their footprints grow without bounds there.
 // gsmerge, like gsplat, draws them with the footprint of a direction 15 % outside.
 const EVERYWHERE = 1e6; // half pictures from the middle
@@ -35,31 +33,6 @@ function takeBytes(name) {
 async function gunzip(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
-}
-
-// The .spz of what pages/data.py packs: sums down every column of bytes, in a gzip stream that is not compressed.
-async function unpackSplats(packed) {
-  const bytes = await gunzip(packed);
-  const numbers = new DataView(bytes.buffer);
-  const [count, degree] = [numbers.getUint32(8, true), bytes[12]];
-  const columns = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)];
-  const raw = new Uint8Array(bytes.length - CHECKSUM);
-  raw.set(bytes.subarray(0, HEADER));
-  let [from, to] = [HEADER + CHECKSUM, HEADER];
-  for (const width of columns) {
-    for (let column = 0; column < width; column++) {
-      for (let row = 0, at = to + column, sum = 0; row < count; row++, at += width) raw[at] = sum += bytes[from++];
-    }
-    to += width * count;
-  }
-  const blocks = [new Uint8Array([31, 139, 8, 0, 0, 0, 0, 0, 0, 255])];
-  for (let start = 0; start < raw.length; start += BLOCK) {
-    const size = Math.min(BLOCK, raw.length - start);
-    const last = Number(start + size === raw.length);
-    blocks.push(new Uint8Array([last, size & 255, size >> 8, ~size & 255, (~size >> 8) & 255]), raw.subarray(start, start + size));
-  }
-  blocks.push(bytes.subarray(HEADER, HEADER + CHECKSUM), new Uint32Array([raw.length]));
-  return new Uint8Array(await new Blob(blocks).arrayBuffer());
 }
 
 // Runs the compressed script of the renderer, which its WebAssembly follows; its exports are then in `Vendor`.
@@ -287,6 +260,19 @@ class SplatView {
     const results = shown.map((pane) => this.results.get(pane.source));
     if (frame.shape === "splats") results.forEach((result) => this.refresh(result));
     this.onSettle(!this.moving && results.every((result) => !result.busy && !result.spark.dirty));
+  }
+
+  // Milliseconds of a frame with one result, the median of several; what the screen shows stays.
+  frameTime(source) {
+    const [context, pixel, whole] = [this.renderer.getContext(), new Uint8Array(4), [0, 0, 1, 1]];
+    const times = Array.from({ length: FRAMES + 1 }, () => {
+      const start = performance.now();
+      this.drawPane({ source, box: whole, clip: whole }, { shape: "splats" });
+      context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, pixel); // waits for it
+      return performance.now() - start;
+    });
+    this.draw();
+    return times.slice(1).sort((a, b) => a - b)[FRAMES >> 1]; // the first prepares
   }
 
   drawPane(pane, frame) {

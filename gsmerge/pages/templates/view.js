@@ -7,16 +7,19 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", other: false, atCamera: true, left: 0, right: 0, scheme: "",
+  order: "worst", overlay: 0, outlines: "", drops: "", other: false, from: data.start, // the view before the step back
+  atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
 const BLINK = 700; // milliseconds
 const SOFTWARE_MOST = 150000; // Gaussians: 2 seconds a frame on a processor
 const PIXELS = 8; // of the screen for one of a still, from which on they are drawn as squares
 const OUTLINES = 0.8; // opacity of superpixels' outlines
+const QUIET = 1000; // milliseconds after which a 3D that has come is measured
 const NARROW = 640; // pixels of the stage, below which sides go one above the other
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
 let outlines = []; // per view the borders of its superpixels, where there are any
+let drops = []; // per view and source what would be dropped of it, in colour
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
@@ -29,10 +32,19 @@ function stillOf(source) {
   return stills ? stills[state.view][source] : null;
 }
 
+// Whether a source can be seen from here; the photos cannot once the camera has moved, nor what 3D has not taken in.
+const isThere = (source) => inSolid(source) || (state.atCamera && (!stills || Boolean(stillOf(source))));
+
+// What a side shows: its source, or the other side's where it has nothing to show from here.
+function shownAt(side) {
+  const [own, other] = side === "left" ? [state.left, state.right] : [state.right, state.left];
+  return isThere(own) || !isThere(other) ? own : other;
+}
+
 // Which of the sides are seen, and where: shares of the stage from its top left corner.
 function panes() {
   const whole = [0, 0, 1, 1];
-  const { left, right, at } = state;
+  const [left, right, at] = [shownAt("left"), shownAt("right"), state.at];
   if (state.mode === "side") {
     const boxes = stage.classList.contains("stacked") ? [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] : [[0, 0, 0.5, 1], [0.5, 0, 0.5, 1]];
     return [left, right].map((source, i) => ({ source, box: boxes[i], clip: boxes[i] }));
@@ -83,12 +95,15 @@ function showZoom() {
   id("back").textContent = state.atCamera ? `${zoom.toFixed(1)} × · whole picture` : "Back to the view";
 }
 
-// Lays a picture over a side: the photo, or outlines.
-function lay(layer, address, opacity) {
+const dropsOf = (source) => (drops[state.view] || [])[source] || null;
+
+// Lays a picture over a side: the photo, outlines, or what would be dropped of a source.
+function lay(layer, address, opacity, source = "") {
   layer.hidden = !address || opacity === 0;
   if (layer.hidden) return;
-  if (layer.dataset.shown !== String(state.view)) layer.style.backgroundImage = `url("${address}")`;
-  layer.dataset.shown = state.view;
+  const key = `${state.view} ${source}`;
+  if (layer.dataset.shown !== key) layer.style.backgroundImage = `url("${address}")`;
+  layer.dataset.shown = key;
   layer.style.opacity = opacity;
 }
 
@@ -99,11 +114,12 @@ function show() {
   fitStage();
   showZoom();
   const seen = panes().map((pane) => pane.source);
-  const twice = state.left === state.right;
+  const [left, right] = [shownAt("left"), shownAt("right")];
+  const twice = left === right;
   const missing = [];
   const plain = state.atCamera && state.mode !== "difference";
   for (const side of ["left", "right"]) {
-    const source = state[side];
+    const source = side === "left" ? left : right;
     const here = seen.includes(source) && !(twice && seen.length === 1 && side === "right");
     const drawn = inSolid(source);
     const still = stillOf(source);
@@ -115,10 +131,11 @@ function show() {
     pane.hidden = !here;
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
     lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
+    lay(pane.querySelector(".drops"), plain && state.drops && dropsOf(source), OUTLINES, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
-    if (here && !drawn && ((state.solid && !state.atCamera) || (stills && !still))) missing.push(data.sources[source].name);
+    if (here && (source !== state[side] || !isThere(source))) missing.push(data.sources[state[side]].name);
   }
   id("message").hidden = missing.length === 0;
   id("message").textContent = `${[...new Set(missing)].join(" and ")}: at the photos' cameras only`;
@@ -127,24 +144,27 @@ function show() {
   for (const button of document.querySelectorAll("[data-set]")) {
     button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
   }
+  id("outside").setAttribute("aria-pressed", String(view().outside));
+  showLegend();
   showLimits();
   if (solid && state.solid) solid.request();
 }
 
-// Greys out what has no effect now, and says why.
+// Greys out what has no effect now, and says why; what is about 3D alone is there with it.
 function showLimits() {
   const away = !state.atCamera ? "From the photo's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
-  const flat = state.solid ? "" : none || "In 3D only";
+  const unseen = [state.left, state.right].some(dropsOf) ? "" : "Nothing of it is seen here";
   const outside = view().outside ? "No photo is outside" : "";
   const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
-  const reasons = { shape: flat, frustums: flat, background: flat, pixels: flat, outlines: bare || away };
+  const reasons = { outlines: bare || away, drops: away || unseen };
+  for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
     grey(button, name === "solid" && value ? none : reasons[name]);
   }
   if (id("overlay-share")) grey(id("overlay-share"), outside || away);
-  grey(id("full"), document.fullscreenEnabled ? "" : "This browser has no full screen");
+  id("full").hidden = !document.fullscreenEnabled;
 }
 
 function grey(control, reason) {
@@ -170,8 +190,11 @@ function jump(index) {
   show();
 }
 
+// Outside of the capture, and back to the view before.
 function stepBack() {
-  jump(data.views.findIndex((one) => one.outside));
+  if (!view().outside) state.from = state.view;
+  zoomTo(1);
+  jump(view().outside ? state.from : data.views.findIndex((one) => one.outside));
 }
 
 function set(name, value) {
@@ -183,7 +206,7 @@ function set(name, value) {
   if (name === "left" || name === "right") {
     const result = [state.right, state.left].find((source) => source >= FIRST_RESULT);
     if (result !== undefined && result !== state.result) showResult(result);
-    if (solid) load(solid).then(show);
+    if (solid) load(solid).then(show).then(measureSpeed);
   }
   show();
 }
@@ -202,6 +225,7 @@ function toggleFull() {
 function startStrip() {
   stills = JSON.parse(id("stills").textContent);
   outlines = JSON.parse(id("outline-pictures").textContent);
+  drops = JSON.parse(id("drop-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
   for (const card of id("strip").children) {
@@ -227,7 +251,7 @@ async function load(made) {
 
 async function startScene() {
   const probe = document.createElement("canvas");
-  if (!id("engine")) return say("Stills only: too many Gaussians for a page");
+  if (!id("engine")) return say("Stills only: this page holds no Gaussians");
   if (!window.DecompressionStream || !probe.getContext("webgl2")) return say("Stills only: this browser has no WebGL 2");
   say("3D loads …");
   const painted = () => new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve)));
@@ -255,6 +279,7 @@ async function startScene() {
     if (!chosen && !solid.software) state.solid = "1";
     say(solid.software ? "no GPU: 3D is slow and coarse, and shows small scenes only" : "");
     show();
+    setTimeout(measureSpeed, QUIET);
   } catch (error) {
     [solid, state.solid] = [null, ""];
     say(`Stills only: ${error.message}`);

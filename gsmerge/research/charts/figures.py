@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.io import atomic_output
 from gsmerge.measure.speed import break_even
-from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results, make_lines, size_label
-from gsmerge.research.charts.measure_run import INPUT, SCORING, SEGMENTATIONS, SHARES
+from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
+from gsmerge.research.charts.measure_run import INPUT, SCORING
 from gsmerge.runtime.record import STAGES
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn
@@ -90,7 +89,7 @@ def make_figures(results: Results) -> list[Figure]:
         _against(results, "seconds", "quality-seconds", time),
         _against(results, "percent", "quality-ratio", size),
     ]
-    figures += [_stages(results), _superpixels(results), _counts(results), _over_views(results), _break_even(results)]
+    figures += [_stages(results), _counts(results), _over_views(results), _break_even(results)]
     return [figure for figure in figures if figure is not None]
 
 
@@ -179,26 +178,6 @@ def _stages(results: Results) -> Figure | None:
     scenes = len({record.scene for group in rows.values() for record in group})
     caption = f"Seconds by stage, scoring left out, means over {scenes} scene(s). {_size_words(results)}"
     return Figure("stages", "Where the time goes", caption, "Seconds", ("Line", *bars), tuple(cells), bars=bars)
-
-
-def _superpixels(results: Results) -> Figure | None:
-    """Show the quality of superpixels alone as approximations of the photos (the paper's proxy)."""
-
-    points = []
-    for record, name, share in product(results.superpixels, SEGMENTATIONS, SHARES):
-        score = record.scores.get(f"{name} {share:g}")
-        if score is not None:
-            settings = {"superpixels": f"{100 * share:g}%"}
-            count = round(share * (record.count or 0))
-            points.append(replace(record, method=name, settings=settings, scores={"psnr_context": score}, count=count))
-    lines = make_lines(points, size_label, "count", "count", "psnr_context")
-    caption = (
-        "Every pixel takes the mean colour of its superpixel; PSNR against the photo, the best that a superpixel method"
-        " could reach."
-    )
-    lines = [replace(line, ours=line.name == SEGMENTATIONS[0]) for line in lines]
-    panel = Panel("Proxy PSNR (dB)", True, tuple(sorted(lines, key=lambda line: not line.ours)))
-    return _curves("proxy", "Superpixels alone", caption, "Superpixels per view", [panel], "x")
 
 
 def _counts(results: Results) -> Figure | None:

@@ -17,12 +17,10 @@ from gsmerge.io.cameras.read import find_cameras, is_colmap
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.lines import ONE_SIZE
-from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, ChartRun, RunRecord, describe
+from gsmerge.research.charts.measure_run import INPUT, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
-from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import find_scene_files
 from gsmerge.settings.compact import OURS, RECIPES, CompactOptions
-from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import Settings, join_words, setting, settings_of
 
 ALL = "all"  # word for all views
@@ -175,16 +173,11 @@ def make_jobs(
     measured: EvaluateOptions,
     *,
     seed: int = 0,
-    proxy_views: int = 0,
     command: str = "",
-    opacity: OpacityChoice = "auto",
-    hints: ReadHints = AUTO,
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 
-    ``proxy_views``: photos of each scene on which superpixels alone are measured; 0: none. ``command``: the command
-    line, for the records. ``opacity`` and ``hints``: how to read all scenes. A UsageError if the library does not take
-    a setting.
+    ``command``: the command line, for the records. A UsageError if the library does not take a setting.
     """
     combinations, notes = list_settings(grid)
     counts = [None if count == ALL else int(count) for count in grid.views]
@@ -192,13 +185,11 @@ def make_jobs(
         (method, settings, count, _options_of(method, settings, seed))
         for count, (method, settings) in product(counts, combinations)
     ]
-    if proxy_views:
-        chosen.append((SUPERPIXELS, {}, proxy_views, CompactOptions().with_settings({"method": "unmerged"})))
     jobs: list[Job] = []
     for source in sources:
         most = source.num_views or math.inf
         limit = most - 1 if None in counts else most  # as many as there are: the run of all
-        runs = [choice for choice in chosen if choice[0] == SUPERPIXELS or (choice[2] or 0) <= limit]
+        runs = [choice for choice in chosen if (choice[2] or 0) <= limit]
         if len(runs) < len(chosen):
             few = len(chosen) - len(runs)
             notes.append(f"{source.name} has fewer views than asked for, or as many as all: {few} run(s) left out")
@@ -209,7 +200,7 @@ def make_jobs(
             name = name if name == label else f"{name} {digest({'label': label})[:6]}"
             output = f"{source.name}/{name}"
             record = RunRecord(source.name, label, output, source.sha256, method, settings, views, command)
-            run = ChartRun(record, options, measured, source.targets, source.target_images, opacity, hints)
+            run = ChartRun(record, options, measured, source.targets, source.target_images)
             share = min(1.0, (views or most) / most) if source.num_views else 1.0
             jobs.append(Job(str(source.path), (output,), run, round(share * num_gaussians), num_rest))
     return jobs, notes

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from gsmerge.research.charts.measure_run import INPUT, SUPERPIXELS, RunRecord
+from gsmerge.research.charts.measure_run import INPUT, RunRecord
 from gsmerge.settings.compact import OURS
 
 LEVEL = 0.95  # confidence of the intervals
@@ -219,7 +219,6 @@ class Results:
 
     Attributes:
         runs: The runs.
-        superpixels: Records of superpixels alone.
         names: Name of each line; that of the input is its method.
         part: What scores are means over: the most meaningful that nine of ten runs have.
         metrics: Names of the metrics that were measured, of PSNR, SSIM and one LPIPS, VGG if possible.
@@ -228,9 +227,7 @@ class Results:
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
-        done = [record for record in records if record.error is None]
-        self.superpixels = [record for record in done if record.method == SUPERPIXELS]
-        self.runs = [record for record in done if record.method != SUPERPIXELS]
+        self.runs = [record for record in records if record.error is None]
         keys = dict.fromkeys(map(line_key, ours_first(self.runs)))
         self.names = {key: INPUT for key in keys if key[0] == INPUT}
         self.names |= line_names([key for key in keys if key[0] != INPUT])

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from statistics import median
@@ -26,30 +26,23 @@ from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate, near_plane
-from gsmerge.measure.preview import Picture, draw_means, heat_map, save_picture, to_picture
+from gsmerge.measure.preview import Picture, heat_map, save_picture, to_picture
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.measure.speed import time_render
 from gsmerge.raster import render
-from gsmerge.raster.metrics import psnr
 from gsmerge.report import document_head
-from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.content_hash import digest
-from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.scene.held_out import HeldOutViews, read_held_out
 from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.reading import OpacityChoice
-from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Gaussians, Scene, Views
 
 RECORD_VERSION = 1  # of what a run records; another version is run again
-SUPERPIXELS = "superpixels"  # a method of runs, as OURS, INPUT (nothing is merged) and baselines
 SCORING = ("score", "input")  # stages of a run that only measure
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 SCORES = tuple(map("".join, product(MEASURES, ("_context", "_target"), ("", "_visible"))))
-SEGMENTATIONS = ("rdseg", "bass-adaptive", "bass-st", "bass", "slic")
-SHARES = (0.0025, 0.005, 0.01, 0.02, 0.044, 0.1)  # superpixels per pixel
 PACKAGES = ("torch", "numpy", "cv2")
 MAX_TIMED = 4  # views that are rendered for the time
 MAX_PICTURES, MAX_WIDTH, QUALITY = 2, 640, 88  # views of a run with pictures, their pixels, quality of the JPEG files
@@ -70,14 +63,14 @@ class RunRecord:
     label: str  # method, settings and number of views in words
     output: str = ""  # name of its files in the folder
     scene_sha256: str = ""  # hash of everything that was read
-    method: str = ""  # gsmerge, the name of a baseline, input (the scene as it is), or superpixels alone
+    method: str = ""  # gsmerge, the name of a baseline, or input (the scene as it is)
     settings: Mapping[str, Any] = field(default_factory=dict)  # settings by flat name; the rest are defaults
     views_asked: int | None = None  # number of views that was asked for; None: all
     command: str = ""  # the command line of the run
     environment: Mapping[str, str] = field(default_factory=dict)  # processor, threads and versions
     views: int | None = None  # views that went in
     num_input: int | None = None  # Gaussians of those views
-    count: int | None = None  # Gaussians of the result; of superpixels alone the pixels of a view
+    count: int | None = None  # Gaussians of the result
     bytes: int | None = None  # size of the result as a .ply
     seconds: float | None = None  # wall time of the merge with everything but reading, writing and scoring
     stages: Mapping[str, float] = field(default_factory=dict)  # the same by stage, scoring included
@@ -180,24 +173,18 @@ class ChartRun:
     measured: EvaluateOptions  # what is measured
     targets: Path | None = None  # cameras of held-out views
     target_images: Path | None = None  # folder of their photos; None: found by their cameras
-    opacity: OpacityChoice = "auto"  # how the scene's files store it
-    hints: ReadHints = AUTO  # for reading them
 
     def key(self, files: SceneFiles) -> str:
         """Return a digest of everything that the measurements depend on; the record has the hash of the files."""
         run = asdict(replace(self.record, command=""))
         how = {"measured": asdict(self.measured), "seed": self.settings.seed, "tool_version": __version__}
-        return digest({"run": run, **how, "opacity": self.opacity, "reading": vars(self.hints)})
+        return digest({"run": run, **how})
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Merge, score and time a scene, and save pictures; return a batch record's report and the picture files."""
         with use_threads(threads):
-            source = files, self.targets, self.target_images, self.record.scene_sha256
-            scene, held_out, notes = _load(*source, self.opacity, self.hints)
-            if self.record.method == SUPERPIXELS:
-                facts, pictures = self._measure_superpixels(scene, out)
-            else:
-                facts, pictures = self._measure(scene, held_out, out, threads)
+            scene, held_out, notes = _load(files, self.targets, self.target_images, self.record.scene_sha256)
+            facts, pictures = self._measure(scene, held_out, out, threads)
         facts["notes"] = (*notes, *facts.get("notes", ()))
         record = replace(self.record, environment=environment(threads), **facts)
         return {**document_head(), "notes": list(record.notes), "run": asdict(record)}, pictures
@@ -237,26 +224,6 @@ class ChartRun:
         }
         return facts, pictures
 
-    def _measure_superpixels(self, scene: Scene, out: Path) -> tuple[dict[str, Any], list[Path]]:
-        """Measure the quality of superpixels alone as approximations of a few photos, by name (paper, section 5)."""
-        if scene.images is None:
-            return {"notes": ("no photos to measure superpixels on",)}, []
-        photos = scene.images[pick_views(len(scene), self.record.views_asked or len(scene))]
-        pixels, points = photos.shape[1] * photos.shape[2], dict[str, float]()
-        for name, share in product(SEGMENTATIONS, SHARES):
-            score = partial(proxy_psnr, count=max(1, round(share * pixels)), segmentation=name)
-            points[f"{name} {share:g}"] = float(np.mean([min(value, MAX_DB) for value in parallel_map(score, photos)]))
-        shown = draw_means(photos[0], superpixels(photos[0], max(1, round(SHARES[-2] * pixels)), SEGMENTATIONS[0]))
-        path = picture_path(out.parent, out.name, 0, "render")
-        _write(path, shown)
-        return {"views": len(photos), "count": pixels, "scores": points}, [path]
-
-
-def proxy_psnr(image: np.ndarray, count: int, segmentation: str) -> float:
-    """Compute the PSNR (dB) of a photo ``[h,w,3]`` (sRGB, 0 to 1) with ``count`` superpixels in their mean colours."""
-    means = draw_means(image, superpixels(image, count, segmentation))
-    return psnr(means.astype(np.float64) / 255, image.astype(np.float64))
-
 
 @lru_cache(maxsize=1)
 def _load(
@@ -264,11 +231,9 @@ def _load(
     targets: Path | None,
     target_images: Path | None,
     sha256: str,
-    opacity: OpacityChoice,
-    hints: ReadHints,
 ) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
     """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
-    load = load_files(files, opacity=opacity, hints=hints)
+    load = load_files(files)
     held_out = None if targets is None else read_held_out(load, targets, target_images)
     return load.scene, held_out, tuple(load.notes)
 

@@ -33,7 +33,6 @@ class ChartOptions(Settings):
     photo_side: int = setting(0, "Resize larger photos to so many pixels on the longer side; 0: not.", least=0)
     lpips: str | None = setting(None, "Networks of LPIPS; by default those installed.", choices=("both", *NETS, "none"))
     lpips_views: int = setting(2, "Measure LPIPS on at most so many views of each split.", least=1)
-    proxy_views: int = setting(2, "Photos per scene on which superpixels alone are measured.", least=0)
     rerun: bool = setting(False, "Repeat runs that are done.")
 
 
@@ -105,9 +104,7 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
     for name, value in args.given(("grid", "set", "targets")).items():
         for element in value if isinstance(value, list) else [value]:
             words += [f"--{name}", element]
-    jobs, left_out = make_jobs(
-        sources, grid, measured, seed=settings.seed, proxy_views=own.proxy_views, command=shlex.join(words)
-    )
+    jobs, left_out = make_jobs(sources, grid, measured, seed=settings.seed, command=shlex.join(words))
     return jobs, options, [*notes, *left_out]
 
 

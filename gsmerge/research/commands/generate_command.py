@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
@@ -26,7 +25,6 @@ class SeriesOptions(Settings):
     """Settings of a series of scenes."""
 
     seed: int = setting(0, "Seed of all random numbers.", least=0)
-    ranges: str | None = setting(None, "TOML or JSON file with ranges of the errors; by default the built-in ones.")
     overwrite: bool = setting(False, "Replace scenes that the folder holds.")
 
 
@@ -64,7 +62,7 @@ def generate(args: opt.Args) -> None:
 
 def _settings(args: opt.Args) -> tuple[GenerateOptions, SeriesOptions]:
     """Parse the settings of the scenes, and of their series."""
-    from gsmerge.research.generate import GenerateOptions, read_ranges
+    from gsmerge.research.generate import GenerateOptions
 
     counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)
     if counts is None:
@@ -74,5 +72,4 @@ def _settings(args: opt.Args) -> tuple[GenerateOptions, SeriesOptions]:
         raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
     views, (width, height) = (int(counts[1]), int(counts[2] or counts[1])), map(int, sides.groups())
     options, series = args.make(GenerateOptions, SeriesOptions, views=views, width=width, height=height)
-    options = options if series.ranges is None else replace(options, ranges=read_ranges(Path(series.ranges)))
     return options, series

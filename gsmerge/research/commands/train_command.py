@@ -43,44 +43,35 @@ class RunOptions(Settings):
     opt.output("Folder of the checkpoints. A run in it is continued.", default=opt.REQUIRED),
 )  # fmt: skip
 def train(args: opt.Args) -> None:
-    """Train networks on scenes and their photos; after an interruption, or under torchrun, the same call goes on."""
+    """Train networks on scenes and their photos; after an interruption the same call goes on."""
     from gsmerge.report import document_head
     from gsmerge.research.training import (
         TrainOptions,
         choose_device,
-        join_processes,
         prepare_shards,
         preset_options,
     )
     from gsmerge.research.training import train as train_networks
-    from gsmerge.research.training.processes import local_count
-    from gsmerge.runtime.threads import available_threads, use_threads
+    from gsmerge.runtime.threads import use_threads
 
     out, values = args.output, args.values(TrainOptions, RunOptions)
     with opt.usage_errors():
         run = RunOptions(**{name: values.pop(name) for name in flat_settings(RunOptions) if name in values})
         options, device = change_settings(preset_options(args.preset), values), choose_device(run.device)
     options.require_weights()
-    threads = max(1, available_threads() // local_count())
-    with join_processes(device) as processes:
-        with opt.usage_errors():
-            processes.require_even(options.crops)
-        silent = args.silent or processes.rank > 0
-        apart = find_training_scenes(args.validation or [], out)
-        scenes = find_training_scenes(args.data, out, apart)
-        notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
-        say_notes(notes, quiet=silent)
-        with stage_progress(quiet=silent) as progress, use_threads(threads):
-            cache = Path(run.cache) if run.cache else out / "examples"
-            shards, validation = (prepare_shards(part, options, cache, processes, progress) for part in (scenes, apart))
+    apart = find_training_scenes(args.validation or [], out)
+    scenes = find_training_scenes(args.data, out, apart)
+    notes = [] if apart else ["without --validation, other crops of the same scenes choose the best checkpoint"]
+    say_notes(notes, quiet=args.silent)
+    with stage_progress(quiet=args.silent) as progress, use_threads():
+        cache = Path(run.cache) if run.cache else out / "examples"
+        shards, validation = (prepare_shards(part, options, cache, progress) for part in (scenes, apart))
 
-            def move(step: int, steps: int, loss: float) -> None:
-                if progress is not None:
-                    progress(f"train: loss {loss:.4f}", step, steps)
+        def move(step: int, steps: int, loss: float) -> None:
+            if progress is not None:
+                progress(f"train: loss {loss:.4f}", step, steps)
 
-            done = train_networks(shards, validation, out, options, device=device, processes=processes, progress=move)
-    if processes.rank:
-        return
+        done = train_networks(shards, validation, out, options, device=device, progress=move)
     document: dict[str, Any] = {**document_head(), "options": options.to_dict(), "notes": notes}
     document |= {name: str(value) if isinstance(value, Path) else value for name, value in asdict(done).items()}
     line = f"{done.best}: {done.step} steps, PSNR {done.psnr_learned:.2f} dB ({done.psnr_analytic:.2f} without)"

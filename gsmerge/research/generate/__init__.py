@@ -1,7 +1,7 @@
 """Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
 
 from gsmerge.research.generate.folders import SceneFolder, generate, generate_scene, plan
-from gsmerge.research.generate.noise import NoiseOptions, read_ranges
+from gsmerge.research.generate.noise import NoiseOptions
 from gsmerge.research.generate.synthetic_scene import GenerateOptions, SyntheticScene, make_scene
 
 __all__ = [
@@ -13,5 +13,4 @@ __all__ = [
     "generate_scene",
     "make_scene",
     "plan",
-    "read_ranges",
 ]

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, make_dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
 
-from gsmerge.errors import SceneError
-from gsmerge.io.bounds import read_table
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
@@ -82,22 +79,6 @@ class NoiseOptions:
                 ok = ok and (value[0] > 0 or f.name not in POSITIVE)
             if not ok:
                 raise ValueError(f"{f.name}: expected a range of possible values, got {value!r}")
-
-
-def read_ranges(path: Path) -> NoiseOptions:
-    """Read ranges from a TOML or JSON file: a table of names with two numbers each.
-
-    A SceneError if the file cannot be read, or holds an unknown name or an impossible range.
-    """
-    table = read_table(path)
-    unknown = sorted(table.keys() - {f.name for f in fields(NoiseOptions)})
-    if unknown:
-        raise SceneError(path, f"unknown range {unknown[0]!r}", "docs/internals/lab.md has the names")
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in table.items()}
-    try:
-        return NoiseOptions(**values)
-    except (ValueError, TypeError) as error:
-        raise SceneError(path, str(error), "docs/internals/lab.md has the ranges") from error
 
 
 RANGES = [f.name for f in fields(NoiseOptions) if f.name not in ("constant_opacity", "sh_degrees")]

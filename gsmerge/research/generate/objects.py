@@ -12,7 +12,6 @@ from gsmerge.research.generate.photograph import Light, Stage
 from gsmerge.research.generate.shapes import (
     LYING,
     Array,
-    Material,
     Shape,
     axis_rotation,
     ball,
@@ -216,14 +215,14 @@ def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> S
     return [rod(a, b, radius, material) for a, b in itertools.pairwise(points)]
 
 
-def window(pal: Palette, width: float, height: float, material: Material, *, glow: bool) -> Shapes:
+def window(pal: Palette, width: float, height: float) -> Shapes:
     """Build a window with frame and bars in the plane z = 0, foot at the origin."""
-    pane = replace(quad((0, -height / 2, -0.01), (width / 2, height / 2), material), shell=glow, glow=glow)
+    pane = quad((0, -height / 2, -0.01), (width / 2, height / 2), pal.material("sky", "crown"))
     frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
     w, h = width / 2, height
     bars = [((-w - t, -h - t), (w + t, -h)), ((-w - t, 0), (w + t, t)), ((-w - t, -h), (-w, 0)), ((w, -h), (w + t, 0))]
     bars += [((-t / 3, -h), (t / 3, 0)), ((-w, -0.55 * h - t / 3), (w, -0.55 * h + t / 3))]
-    return [pane, *(box((*a, -t), (*b, 0.0), frame) for a, b in bars)]
+    return [replace(pane, shell=True, glow=True), *(box((*a, -t), (*b, 0.0), frame) for a, b in bars)]
 
 
 def picture(pal: Palette, width: float, height: float) -> Shapes:
@@ -307,7 +306,7 @@ def _wall_objects(pal: Palette, half: float, height: float) -> Shapes:
             frame = picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
             out += place(frame, (at[0], -rng.uniform(0.35, 0.5) * height, 0))
         elif kind == 2:
-            pane = window(pal, wide, rng.uniform(0.35, 0.55) * height, pal.material("sky", "crown"), glow=True)
+            pane = window(pal, wide, rng.uniform(0.35, 0.55) * height)
             out += place(pane, (at[0], -0.35 * height, 0))
         elif kind == 3:
             out += place(shelf(pal, wide, rng.uniform(0.4, 0.85) * height), at)

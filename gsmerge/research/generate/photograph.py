@@ -14,12 +14,9 @@ from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, power
 from gsmerge.research.generate.shapes import (
     Array,
-    Material,
     Shape,
     ShapeArrays,
     bounds,
-    box,
-    concat,
     norm,
     pack,
     rotate,
@@ -57,27 +54,9 @@ class Stage:
     textures: tuple[Picture, ...]  # indexed by the shapes' materials
     light: Light
     focus: Array  # [3] point at which cameras are aimed
-    distance: tuple[float, float] = (1.0, 1.0)  # range of the distance of cameras from the focus
-    height: tuple[float, float] = (1.0, 1.0)  # range of the height of cameras above the ground
-    swing: float = 0.0  # largest angle of cameras to either side of -z, seen from the focus, degrees
-
-
-@dataclass(frozen=True)
-class Zone:
-    """A part of a scene in a box of opaque walls, with its own lights."""
-
-    stage: Stage
-    low: Array  # [3] lowest corner of the box
-    high: Array  # [3] highest corner
-
-
-@dataclass(frozen=True)
-class Portal:
-    """An opening between two zones."""
-
-    zones: tuple[int, int]
-    low: Array  # [3] lowest corner of a box around it
-    high: Array  # [3] highest corner
+    distance: tuple[float, float]  # range of the distance of cameras from the focus
+    height: tuple[float, float]  # range of the height of cameras above the ground
+    swing: float  # largest angle of cameras to either side of -z, seen from the focus, degrees
 
 
 @dataclass(frozen=True)
@@ -119,15 +98,6 @@ class LitStage:
     weights: Array  # [k] of the ambient maps
 
 
-@dataclass(frozen=True)
-class LitScene:
-    """Stages that are rendered together: the zones of a building, or a single stage."""
-
-    stages: tuple[LitStage, ...]
-    zones: tuple[Zone, ...] = ()  # none where there is one stage
-    portals: tuple[Portal, ...] = ()
-
-
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
     """Compute boxes x0, y0, x1, y1 ``[m,4]``, in samples, that contain each shape's image."""
     half = bounds(shapes)
@@ -148,13 +118,8 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
 
 
-def trace(
-    shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int, windows: NDArray[np.int32] | None = None
-) -> Hits:
-    """Cast ``samples`` x ``samples`` rays for each pixel.
-
-    ``windows`` ``[m,4]``: x0, y0, x1, y1 of the samples to which each shape is confined.
-    """
+def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
+    """Cast ``samples`` x ``samples`` rays for each pixel."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), FAR), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
@@ -162,54 +127,8 @@ def trace(
     eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     rects = screen_boxes(shapes, c2w, lens, samples)
-    if windows is not None:
-        rects = _overlap(rects, windows)
     cast(eye, axes, intrinsics, 1.0 / samples, *table, rects, hits.depth, hits.ids, hits.points, hits.normals)
     return hits
-
-
-def _overlap(a: NDArray[np.int32], b: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Compute the common part of rectangles ``[...,4]``."""
-    return np.concatenate([np.maximum(a[..., :2], b[..., :2]), np.minimum(a[..., 2:], b[..., 2:])], -1)
-
-
-def find_windows(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> dict[int, NDArray[np.int32]]:
-    """Find the stages that a view may see, each with the box x0, y0, x1, y1 ``[4]`` of its samples.
-
-    A straight line enters and leaves a zone, which is a box, through portals and at most once.
-    """
-    whole = np.array([0, 0, lens.width * samples, lens.height * samples], np.int32)
-    if not scene.portals:
-        return dict.fromkeys(range(len(scene.stages)), whole)
-    eye = c2w[:3, 3]
-    thick = max(float((portal.high - portal.low).min()) for portal in scene.portals)
-    rects = screen_boxes(pack([box(p.low, p.high, Material(0)) for p in scene.portals]), c2w, lens, samples)
-    out: dict[int, NDArray[np.int32]] = {}
-
-    def enter(zone: int, window: NDArray[np.int32], way: tuple[int, ...]) -> None:
-        stored = out.get(zone, window)
-        out[zone] = np.concatenate([np.minimum(stored[:2], window[:2]), np.maximum(stored[2:], window[2:])])
-        for portal, rect in zip(scene.portals, rects, strict=True):
-            if zone in portal.zones:
-                beyond = sum(portal.zones) - zone
-                part = _overlap(window, rect)
-                if beyond not in way and (part[:2] < part[2:]).all():
-                    enter(beyond, part, (*way, beyond))
-
-    for zone, space in enumerate(scene.zones):
-        if (eye > space.low - thick).all() and (eye < space.high + thick).all():  # two in a doorway
-            enter(zone, whole, (zone,))
-    return dict(sorted(out.items())) or dict.fromkeys(range(len(scene.stages)), whole)
-
-
-def trace_scene(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> tuple[Hits, dict[int, int]]:
-    """Cast rays against the stages that a view may see; return the hits and each stage's first shape id."""
-    windows = find_windows(scene, c2w, lens, samples)
-    parts = [scene.stages[zone].shapes for zone in windows]
-    counts = [len(part.kinds) for part in parts]
-    limits = np.repeat(np.stack(list(windows.values())), counts, axis=0)
-    hits = trace(concat(parts), c2w, lens, samples, limits)
-    return hits, dict(zip(windows, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
 
 
 def _axes(towards: Array) -> Array:
@@ -228,8 +147,8 @@ def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, 
     return (hits.depth - BEHIND * radius).astype(np.float32)
 
 
-def light_stage(stage: Stage, mips: tuple[list[Picture], ...] | None = None) -> LitStage:
-    """Prepare a stage for rendering: arrays, smaller textures (``mips``, if made already), shadow maps."""
+def light_stage(stage: Stage) -> LitStage:
+    """Prepare a stage for rendering: arrays, smaller textures, shadow maps."""
     opaque = pack([s for s in stage.shapes if not s.shell and not s.glow] or stage.shapes[:1])
     extent = bounds(opaque)
     reach = np.linalg.norm(extent, axis=1)
@@ -245,7 +164,7 @@ def light_stage(stage: Stage, mips: tuple[list[Picture], ...] | None = None) -> 
     return LitStage(
         stage,
         pack(stage.shapes),
-        tuple(pyramid(texture) for texture in stage.textures) if mips is None else mips,
+        tuple(pyramid(texture) for texture in stage.textures),
         axes,
         middle,
         radius,
@@ -307,17 +226,15 @@ def _lookup(texture: Picture, uv: Float) -> Float:
     return colors.reshape(-1, 3)[: len(uv)]
 
 
-def radiance(scene: LitScene, c2w: Array, lens: Pinhole, samples: int) -> Float:
+def radiance(view: LitStage, c2w: Array, lens: Pinhole, samples: int) -> Float:
     """Render the linear light ``[h,w,3]`` of a view."""
-    hits, firsts = trace_scene(scene, c2w, lens, samples)
+    hits = trace(view.shapes, c2w, lens, samples)
     h, w = hits.depth.shape
     out = np.zeros((h * w, 3), np.float32)
     ids = hits.ids.reshape(-1)
-    for zone, first in firsts.items():
-        view = scene.stages[zone]
-        seen = (ids >= first) & (ids < first + len(view.shapes.kinds))
-        if seen.any():
-            out[seen] = _reflect(view, ids[seen] - np.int32(first), hits, seen, c2w, lens, samples)
+    seen = ids >= 0
+    if seen.any():
+        out[seen] = _reflect(view, ids[seen], hits, seen, c2w, lens, samples)
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3))
 
 

@@ -158,14 +158,6 @@ def pack(shapes: Sequence[Shape]) -> ShapeArrays:
     )
 
 
-def concat(parts: Sequence[ShapeArrays]) -> ShapeArrays:
-    """Concatenate arrays of shapes."""
-    if len(parts) == 1:
-        return parts[0]
-    columns = zip(*((a.kinds, a.rotations, a.centres, a.sizes, a.waves) for a in parts), strict=True)
-    return ShapeArrays(tuple(s for a in parts for s in a.shapes), *(np.concatenate(column) for column in columns))
-
-
 def bounds(shapes: ShapeArrays) -> Array:
     """Compute half sizes ``[m,3]`` of the shapes' bounding boxes in shape frames."""
     half = shapes.sizes[:, :3].copy()

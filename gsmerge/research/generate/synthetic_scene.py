@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 
 from gsmerge.kernels.elementary import exp
-from gsmerge.research.generate.building import build_building
-from gsmerge.research.generate.floor_plan import draw_plan, draw_walk
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -22,17 +20,17 @@ from gsmerge.research.generate.photograph import (
     SAMPLES,
     Float,
     Hits,
-    LitScene,
+    LitStage,
     Pinhole,
     Stage,
     develop,
     find_exposure,
     light_stage,
     radiance,
-    trace_scene,
+    trace,
 )
 from gsmerge.research.generate.shapes import Array, compose, invert, norm
-from gsmerge.research.generate.textures import Palette, pyramid
+from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.types import Cameras, Gaussians
@@ -40,12 +38,9 @@ from gsmerge.types import Cameras, Gaussians
 PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
 SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
 MIXED = "mixed"
-BUILDING = "building"  # a style with a walk of its own, which "mixed" leaves out
-FOCAL = {BUILDING: (0.55, 0.8)}  # range of the focal length, in the longer sides of the photo
+FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
 METERED = 200  # views that the exposure is set by
-MAX_TARGETS = {BUILDING: 50}  # held-out views of a scene
 MAX_VIEWS = 2000
-MAX_TEXTURE = 512  # side of a building's textures, pixels, of which there are a dozen for every room
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
@@ -138,15 +133,13 @@ class GenerateOptions(Settings):
     """Settings of synthetic scenes."""
 
     views: tuple[int, int] = setting((6, 6), "Range of the number of views in a scene.",
-        "One target is between any two neighbours, or, in a building, at most 50 of these, evenly spread.", least=2,
-        most=MAX_VIEWS)  # fmt: skip
+        "One target is between any two neighbours.", least=2, most=MAX_VIEWS)  # fmt: skip
     width: int = setting(320, "Width of the views.", least=16, most=2048, unit="pixels")
     height: int = setting(240, "Height of the views.", least=16, most=2048, unit="pixels")
     photo_scale: int = setting(1, "Times the views' size that the photos have; the network sees the views' own.",
         least=1, most=8)  # fmt: skip
-    style: str = setting(MIXED, "Rooms or gardens, mixed: these two in turn, or building: many rooms.",
-        choices=(MIXED, *STYLES, BUILDING))  # fmt: skip
-    path: str = setting(MIXED, "Path of the cameras; mixed: any, or a walk in a building.", choices=(MIXED, *PATHS))
+    style: str = setting(MIXED, "Rooms or gardens; mixed: these two in turn.", choices=(MIXED, *STYLES))
+    path: str = setting(MIXED, "Path of the cameras; mixed: any.", choices=(MIXED, *PATHS))
     noise: float = setting(1.0, "Factor on the simulated errors of the network.", least=0, most=10)
     ranges: NoiseOptions = setting(NoiseOptions(), "The errors and habits.")
 
@@ -154,8 +147,6 @@ class GenerateOptions(Settings):
         super().__post_init__()
         if self.views[0] > self.views[1]:
             raise ValueError(f"views: expected the least and the most, got {self.views[0]} to {self.views[1]}")
-        if self.style == BUILDING and self.path not in (MIXED, "walk"):
-            raise ValueError(f"path: expected walk or mixed in a building, got {self.path!r}")
 
     def to_dict(self) -> dict[str, Any]:
         """Convert all settings to JSON types."""
@@ -182,16 +173,12 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     num_views = int(rng.integers(options.views[0], options.views[1] + 1))
     style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
     path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
-    path = "walk" if style == BUILDING else path
     noise = draw_noise(options.ranges, rng, options.noise)
-    focal = max(options.width, options.height) * rng.uniform(*FOCAL.get(style, (0.58, 1.75)))
+    focal = max(options.width, options.height) * rng.uniform(*FOCAL)
     lens = Pinhole(options.width, options.height, focal)
     scale = options.photo_scale
     large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # of the photos
-    if style == BUILDING:
-        scene, pose = _find_building(rng, large, num_views)
-    else:
-        scene, pose = _find_stage(rng, style, path, large, num_views)
+    scene, pose = _find_stage(rng, style, path, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
     metered = poses[:: 2 * -(-num_views // METERED)]
@@ -208,7 +195,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         if i not in errors:
             return image, moved[i], None
         deviation, seed = errors[i]
-        hits, _ = trace_scene(scene, poses[i], lens, 1)
+        hits = trace(scene.shapes, poses[i], lens, 1)
         depth = np.minimum(hits.depth, FAR) * noise.unit
         estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
         normals = np.einsum("hwk,ik->hwi", hits.normals, world[:3, :3]).astype(np.float32)
@@ -216,8 +203,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
         return image, estimate, predicted
 
-    held_out = _held_out(num_views, MAX_TARGETS.get(style, num_views))
-    shots = parallel_map(take, [*views, *held_out])
+    shots = parallel_map(take, [*views, *range(1, len(poses), 2)])
     return SyntheticScene(
         gaussians=Gaussians.concat([gaussians for _, _, gaussians in shots if gaussians is not None]),
         cameras=_cameras([pose for _, pose, _ in shots[:num_views]], lens),
@@ -230,15 +216,6 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     )
 
 
-def _held_out(num_views: int, most: int) -> list[int]:
-    """List the places of held-out photos: all, or ``most`` evenly spread, midpoints between neighbouring views.
-
-    Views have the even places, midpoints the odd ones.
-    """
-    count = min(num_views - 1, most)
-    return [2 * ((2 * k + 1) * (num_views - 1) // (2 * count)) + 1 for k in range(count)]
-
-
 def _shrink(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
@@ -249,35 +226,19 @@ def _texture_size(lens: Pinhole) -> int:
 
 def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
-) -> tuple[LitScene, Pose]:
+) -> tuple[LitStage, Pose]:
     """Draw a stage and a path through it on which all views are usable; after too many tries, return the last."""
     for _ in range(STAGE_TRIES):
-        scene = LitScene((light_stage(STYLES[style](Palette(rng, _texture_size(lens)))),))
+        scene = light_stage(STYLES[style](Palette(rng, _texture_size(lens))))
         for _ in range(PATH_TRIES):
-            pose = PATHS[path](scene.stages[0].stage, rng, num_views)
+            pose = PATHS[path](scene.stage, rng, num_views)
             poses = (pose(s) for s in np.linspace(0, 1, 2 * num_views - 1))
-            if all(is_usable(trace_scene(scene, at, _shrink(lens), 1)[0]) for at in poses):
+            if all(is_usable(trace(scene.shapes, at, _shrink(lens), 1)) for at in poses):
                 return scene, pose
     return scene, pose
 
 
-def _find_building(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitScene, Pose]:
-    """Draw a building and a walk through it that avoids all objects."""
-    plan = draw_plan(rng, num_views)
-    zones, portals = build_building(rng, min(_texture_size(lens), MAX_TEXTURE), plan)
-    walk = draw_walk(rng, plan, num_views)
-    mips = tuple(pyramid(texture) for texture in zones[0].stage.textures)
-    stages = parallel_map(lambda zone: light_stage(zone.stage, mips), zones)
-    phase = rng.uniform(0, 6.28)
-
-    def pose(s: float) -> Array:
-        place, gaze = walk(s)
-        return look_at(place, place + gaze, 0.03 * np.sin(0.7 * num_views * s + phase))
-
-    return LitScene(tuple(stages), tuple(zones), tuple(portals)), pose
-
-
-def _photo(scene: LitScene, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
+def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
     """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
     linear = radiance(scene, pose, lens, SAMPLES)

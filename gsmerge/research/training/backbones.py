@@ -77,12 +77,10 @@ class PredictedCapture:
         return make_scene(gaussians, valid, views.cameras, views.images, views.names, "view-major")[0]
 
 
-def bind_backbone(
-    examples: Sequence[Other | Capture], backbone: Backbone | None, options: TrainOptions
-) -> list[Other | PredictedCapture]:
+def bind_backbone(examples: Sequence[Other | Capture], backbone: Backbone | None) -> list[Other | PredictedCapture]:
     """Give the captures among examples their backbone, which is called by one thread at a time, without gradients.
 
-    ValueError if there are captures without a backbone, or with a loss that uses a fit.
+    ValueError if there are captures without a backbone.
     """
     lock = Lock()
 
@@ -94,6 +92,4 @@ def bind_backbone(
     captures = [example for example in examples if isinstance(example, Capture)]
     if captures and backbone is None:
         raise ValueError(f"backbone: expected a callable that predicts the Gaussians of {captures[0].name}, got none")
-    if captures and options.uses_fit:
-        raise ValueError("captures: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
     return [PredictedCapture(example, call) if isinstance(example, Capture) else example for example in examples]

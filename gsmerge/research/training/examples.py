@@ -1,13 +1,12 @@
 """Examples to learn from: scenes cut into superpixels and encoded without networks, with their photos.
 
 The networks get some of the scene's views; the photos of the others, and held-out photos, are novel views. Which
-views these are is fixed, or drawn anew for every window (:func:`select_views`). Where a loss uses a fit, an example
-also knows what a full fit changes, and the clusters that were fitted.
+views these are is fixed, or drawn anew for every window (:func:`select_views`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
-from gsmerge.networks.corrections import COLOR
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
 from gsmerge.research.training.scenes import (
@@ -27,17 +25,15 @@ from gsmerge.research.training.scenes import (
     make_training_scene,
     view_subsets,
 )
-from gsmerge.research.training.targets import Progress, Targets, fit_targets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, take
+from gsmerge.stages.merge import take
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Matches
+from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians
 
 NOT_STORED = ("pixels", "fronts")  # of Members: a pixel has one member, in order
 
@@ -73,8 +69,6 @@ class Example:
     photos: Photos  # p photos without colours: those of the views first, then novel ones
     images: np.ndarray  # [p,h,w,3] uint8, their colours, sRGB
     covers: np.ndarray  # [v,p,h,w] uint8: what the Gaussians of each view cover, see scenes.coverage
-    matches: Matches | None  # the clusters that were fitted; None: matched in every step
-    targets: Mapping[int, Targets]  # of the fit, by number of children K; empty without a fit
     colors: ColorMap = ColorMap()  # of the photos, whose bytes stay as they are
     drawn: bool = False  # whether its views are a random subset already, predicted from them alone
 
@@ -88,14 +82,12 @@ class Example:
         return [photo for photo in span if self.mask(photo).any()]
 
 
-def make_examples(
-    path: Path, options: TrainOptions, progress: Progress | None = None
-) -> Iterator[tuple[str, int, Callable[[], Example]]]:
+def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, int, Callable[[], Example]]]:
     """Yield (name, number of them in all, maker) of each example of a scene; see :func:`make_example`.
 
     There is one for each number of views and every density of the ``options``. Photos of a folder ``targets`` next to
     the ``.ply``, with their cameras, are novel views. A SceneError if the scene cannot be read, is not one Gaussian per
-    pixel, has no photos, or cannot be fitted.
+    pixel, or has no photos.
     """
     load = load_scene(path)
     scene, ply = load.scene, load.files.ply
@@ -109,7 +101,7 @@ def make_examples(
     for ids in subsets:
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
-            make = partial(make_example, training, options, density, scene_name(path), progress)
+            make = partial(make_example, training, options, density, scene_name(path))
             label = f"{len(ids)}-views-{share_text(density).rstrip('%')}"
             yield label, len(subsets) * len(options.densities), make
 
@@ -120,14 +112,8 @@ def scene_name(path: Path) -> str:
     return f"{path.parent.name}-{path.stem}" if path.is_file() else path.name
 
 
-def make_example(
-    training: TrainingScene, options: TrainOptions, density: float, name: str, progress: Progress | None = None
-) -> Example:
-    """Make an example: segment and encode a scene without networks; if a loss uses a fit, merge and fit it as well.
-
-    ``density`` is in superpixels per pixel; ``progress`` is called with (step, steps) of the fit. A SceneError if the
-    fit does not improve held-out patches of the photos.
-    """
+def make_example(training: TrainingScene, options: TrainOptions, density: float, name: str) -> Example:
+    """Make an example: segment and encode a scene without networks; ``density`` is in superpixels per pixel."""
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
     features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
@@ -136,20 +122,14 @@ def make_example(
     focals = np.sqrt(np.abs(scene.cameras.Ks[:, 0, 0] * scene.cameras.Ks[:, 1, 1]))
     # a footprint is a pixel in a Feature Gaussian's own view
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
-    example = Example(
+    return Example(
         name, unit, members, scene.cameras, features, feature_to_gaussians(features),
-        blank_photos(training.cameras, level), images, coverage(training, level), None, {},
+        blank_photos(training.cameras, level), images, coverage(training, level),
     )  # fmt: skip
-    if not options.uses_fit:
-        return example
-    matches = match(features, options.match_options())
-    return replace(
-        example, matches=matches, targets=fit_targets(training, merge(features, matches), options, name, progress)
-    )
 
 
 def select_views(example: Example, ids: Sequence[int]) -> Example:
-    """Keep the views ``ids`` (ascending) of an example without a fit; photos of other views become novel ones."""
+    """Keep the views ``ids`` (ascending) of an example; photos of other views become novel ones."""
     views, pixels = len(example.cameras), example.cameras.width * example.cameras.height
     if len(ids) == views:
         return example
@@ -198,9 +178,4 @@ def recolor(example: Example, rng: np.random.Generator) -> Example:
         part = getattr(example, name)
         shN = part.shN.take(colors.order, -1) * np.float32(colors.gain)
         changed[name] = replace(part, sh0=colors.change_sh0(part.sh0), shN=shN)
-    targets = {}
-    for k, target in example.targets.items():
-        corrections = target.corrections.copy()
-        corrections[:, COLOR] = corrections[:, COLOR][:, colors.order] * colors.gain
-        targets[k] = replace(target, corrections=corrections)
-    return replace(example, **changed, targets=targets, colors=colors)
+    return replace(example, **changed, colors=colors)

@@ -1,11 +1,9 @@
 """The training run: AdamW on windows of photos, validation, checkpoints; an interrupted run can be resumed.
 
-The first steps can learn from the corrections of the fit alone. Regression overshoots where the corrections are
-ambiguous, so all other steps compare renders with photos. Validation is on fixed crops, windows and whole photos of the
-validation examples, read one after the other.
+Validation is on fixed windows and whole photos of the validation examples, read one after the other.
 
 Random numbers depend only on seed and step, and the gradients of crops are added in order. So an interrupted run ends
-with the same bytes as one that was not, on any number of threads and of processes.
+with the same bytes as one that was not, on any number of threads.
 """
 
 from __future__ import annotations
@@ -29,96 +27,52 @@ from gsmerge.facts.views import even_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.measure.preview import save_picture, to_picture
 from gsmerge.networks.checkpoint import save_checkpoint
-from gsmerge.networks.corrections import COLOR, LOGIT, MEAN, ROTATION, SIZE
+from gsmerge.networks.corrections import LOGIT
 from gsmerge.research.captures import Capture
 from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
-from gsmerge.research.training.losses import (
-    WindowLoss,
-    correction_loss,
-    render_window,
-    scaled_corrections,
-    target_scales,
-    window_loss,
-    window_psnr,
-)
+from gsmerge.research.training.losses import WindowLoss, render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
-from gsmerge.research.training.predict import predict
-from gsmerge.research.training.processes import ALONE, Processes
-from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example, read_targets
+from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.research.training.windows import Crop, Window, sample_crop, sample_window, whole_photo
+from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map, use_threads
 
-PARTS = {"mean": MEAN, "size": SIZE, "turn": ROTATION, "logit": slice(LOGIT, LOGIT + 1), "color": COLOR}
 VALIDATION = 2**32  # takes the place of the step in the seed of validation's random numbers
 Row = dict[str, float]  # of the table of losses
-# Of each window: PSNR (dB) without and with networks, and the share that was merged; of each crop: loss, squares of the
-# errors [13] and of the targets [13].
-Scores = tuple[list[tuple[float, float, float]], list[tuple[float, Tensor, Tensor]]]
+Scores = list[tuple[float, float, float]]  # of each window: PSNR (dB) without and with networks, share merged
 Progress = Callable[[int, int, float], None]  # step, steps, loss
 FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-@dataclass(frozen=True)
-class TrainingRun:
-    """Settings that every step of a run reads."""
-
-    options: TrainOptions
-    scales: Mapping[int, Tensor]  # of the targets of each K; empty where no loss uses a fit
-    processes: Processes
-
-
-def validate(networks: Networks, shards: Sequence[Source], run: TrainingRun, out: Path) -> Row:
+def validate(networks: Networks, shards: Sequence[Source], options: TrainOptions, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
-    If a loss uses the fit, also measure the loss of corrections, and the explained share of the squared targets for
-    each kind of correction. For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
+    For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
     """
-    scores = [_score(networks, shards, i, run, out) for i in run.processes.share(range(len(shards)))]
-    every = run.processes.gather(scores)
-    analytic, learned, matched = np.mean([window for windows, _ in every for window in windows], 0).tolist()
-    row = {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
-    crops = [crop for _, scene_crops in every for crop in scene_crops]
-    if not crops:
-        return row
-    losses, errors, squares = zip(*crops, strict=True)
-    missed, whole = torch.stack(errors).sum(0), torch.stack(squares).sum(0)
-    shares = {
-        f"explained_{name}": float(1 - missed[columns].sum() / whole[columns].sum().clamp_min(1e-12))
-        for name, columns in PARTS.items()
-    }
-    return {"validation_loss": float(np.mean(losses)), **row, **shares}
+    scores = [window for i in range(len(shards)) for window in _score(networks, shards, i, options, out)]
+    analytic, learned, matched = np.mean(scores, 0).tolist()
+    return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(networks: Networks, shards: Sequence[Source], number: int, run: TrainingRun, out: Path) -> Scores:
+def _score(networks: Networks, shards: Sequence[Source], number: int, options: TrainOptions, out: Path) -> Scores:
     """Score one of the shards, and write its picture if it is the first of its scene."""
-    options = run.options
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_example(shards[number], options, rng)
     windows = [
         sample_window(draw_views(example, options, rng), options.levels, options.window, options.most, 1, rng)
         for _ in range(options.validation_windows)
     ]
-    num_crops = options.validation_crops if options.uses_fit else 0
-    crops = [sample_crop(example, options.levels, options.crop, options.inner, rng) for _ in range(num_crops)]
 
     def score_window(window: Window) -> tuple[float, float, float]:
         plain, _ = render_window(window, None, options)
         image, matched = render_window(window, networks, options)
         return window_psnr(window, plain), window_psnr(window, image), matched
 
-    def score_crop(crop: Crop) -> tuple[float, Tensor, Tensor]:
-        with torch.no_grad():
-            prediction = predict(crop, networks, options, 0)
-            corrections, targets = scaled_corrections(crop, prediction, run.scales, options)
-            loss = float(correction_loss(corrections, targets, options))
-            return loss, (corrections - targets).square().sum(0), targets.square().sum(0)
-
     if shards[number].scene not in {shard.scene for shard in shards[:number]}:
         _write_picture(out / f"validation-{example.name}.png", networks, example, options)
-    return parallel_map(score_window, windows), parallel_map(score_crop, crops)
+    return parallel_map(score_window, windows)
 
 
 def _write_picture(path: Path, networks: Networks, example: Example, options: TrainOptions) -> None:
@@ -148,12 +102,11 @@ class TrainingState:
 class TrainResult:
     """Files and figures of a training run."""
 
-    best: Path  # checkpoint with the highest PSNR of validation; before renders are compared, with the least loss
+    best: Path  # checkpoint with the highest PSNR of validation
     last: Path  # checkpoint of the last step
     losses: Path  # CSV, one row for each validation
     step: int  # steps done
     loss: float  # the last training loss
-    validation_loss: float | None  # the least validation loss; None where no loss uses a fit
     psnr_analytic: float  # PSNR (dB) of the windows of validation without networks
     psnr_learned: float  # the best PSNR with networks
     resumed: int  # step from which the run was resumed; 0 for a new one
@@ -168,7 +121,6 @@ def train(
     backbone: Backbone | None = None,
     threads: int | None = None,
     device: str = "cpu",
-    processes: Processes = ALONE,
     progress: Progress | None = None,
 ) -> TrainResult:
     """Train networks, or continue the run in the folder.
@@ -185,29 +137,25 @@ def train(
         threads: Threads to use; None: all processors. The result does not depend on it.
         device: Where the networks run, see :func:`choose_device`. Windows are rendered on the CPU. On CUDA a run
             repeats up to rounding, not to the bit.
-        processes: Processes that share the crops of every step.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:
-        ValueError: If there are no examples, captures have no backbone or a loss uses a fit of them, the crops of a
-            step cannot be shared evenly, or torch finds no CUDA device and ``device`` asks for it.
+        ValueError: If there are no examples, captures have no backbone, or torch finds no CUDA device and ``device``
+            asks for it.
         GsmergeError: If LPIPS has a weight, and its weights are not installed.
         SceneError: If a shard is damaged, or the folder holds another run or cannot be written.
     """
     options = options or TrainOptions()
     if not shards:
         raise ValueError("examples: expected at least one, got none")
-    processes.require_even(options.crops)
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    bound = bind_backbone([*shards, *validation], backbone, options)
+    bound = bind_backbone([*shards, *validation], backbone)
     sources = bound[: len(shards)]
     chosen = bound[len(shards) :] or sources
     chosen = [chosen[i] for i in even_views(len(chosen), min(len(chosen), options.validation_examples))]
     with use_threads(threads):
-        targets = (read_targets(shard) for shard in sources if isinstance(shard, Shard)) if options.uses_fit else ()
-        run = TrainingRun(options, target_scales(targets), processes)
-        return _train(run, sources, chosen, out, choose_device(device), progress)
+        return _train(options, sources, chosen, out, choose_device(device), progress)
 
 
 def choose_device(name: str) -> str:
@@ -224,14 +172,13 @@ def choose_device(name: str) -> str:
 
 
 def _train(
-    run: TrainingRun,
+    options: TrainOptions,
     shards: Sequence[Source],
     validation: Sequence[Source],
     out: Path,
     device: str,
     progress: Progress | None,
 ) -> TrainResult:
-    options, processes = run.options, run.processes
     with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
         torch.manual_seed(options.seed)
         networks = Networks(options.network).to(device)
@@ -242,25 +189,23 @@ def _train(
     head = {"options": options.to_dict(), **hashes}
     step, rows = _resume(out, state, head)
     resumed = step
-    with open_streams(shards, options, processes.share(range(options.crops))) as streams:
+    with open_streams(shards, options) as streams:
         while step < options.steps:
-            loss, share = _step(state, streams, run, step)
+            loss, share = _step(state, streams, options, step)
             losses.append(loss)
             step += 1
             if progress:
                 progress(step, options.steps, float(losses[-1]))
             if step % options.save_every == 0 or step == options.steps:
-                scores = validate(state.smooth, validation, run, out)
+                scores = validate(state.smooth, validation, options, out)
                 mean = float(torch.stack(losses).mean())
                 head_row = {"step": step, "rate": options.rate_at(step - 1), "loss": mean}
                 rows.append({**head_row, **({"diversity_share": share} if options.diversity_weight else {}), **scores})
                 losses = []
-                if processes.rank == 0:
-                    _save(out, state, rows, head, options)
+                _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
-    least = min((row["validation_loss"] for row in rows if "validation_loss" in row), default=None)
     most = max(row["psnr_learned"] for row in rows)
-    return TrainResult(*paths, step, rows[-1]["loss"], least, rows[-1]["psnr_analytic"], most, resumed)
+    return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], most, resumed)
 
 
 def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[str, Any], options: TrainOptions) -> None:
@@ -272,22 +217,13 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
         for module in networks.heads.values():
             assert isinstance(module, Head)
             module.out.bias[LOGIT] += options.opacity_shift
-    if is_best(rows, options):
+    if all(row["psnr_learned"] < rows[-1]["psnr_learned"] for row in rows[:-1]):
         save_checkpoint(out / "best.safetensors", networks.weights(), training)
     save_checkpoint(out / "last.safetensors", networks.weights(), training)
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
-
-
-def is_best(rows: Sequence[Row], options: TrainOptions) -> bool:
-    """Return whether the last row is the best, counting only rows with render scores once there are any."""
-    *before, last = rows
-    if last["step"] > options.photo_step:
-        earlier = [row["psnr_learned"] for row in before if row["step"] > options.photo_step]
-        return last["psnr_learned"] > max(earlier, default=-float("inf"))
-    return last["validation_loss"] < min((row["validation_loss"] for row in before), default=float("inf"))
 
 
 def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[Row]]:
@@ -302,12 +238,12 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step: int) -> tuple[Tensor, float]:
+def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> tuple[Tensor, float]:
     """Do one step; return its loss, and the share of the gradient from the diversification of siblings, 0 to 1.
 
     It is that norm over the sum of the norms of both parts, measured in validated steps, and 0 in others.
     """
-    options, parameters = run.options, list(state.networks.parameters())
+    parameters = list(state.networks.parameters())
     shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps
     streams.move_to(step)
 
@@ -321,13 +257,12 @@ def _step(state: TrainingState, streams: ExampleStreams, run: TrainingRun, step:
         rng = np.random.default_rng([options.seed, step, crop])
         example = streams.draw(step, crop, rng)
         with torch.enable_grad():
-            loss = _loss(state.networks, example, run, step, rng)
+            loss = _loss(state.networks, example, options, step, rng)
             apart = differentiate(loss.diversity, more=True) if shares else []
             parts = differentiate(loss.total, more=False)
         return torch.cat([*parts, loss.total.detach().to(parts[0])[None], *apart])  # which may be on a GPU
 
-    rows = run.processes.gather_rows(torch.stack(parallel_map(work, streams.crops)))
-    mean = rows.sum(0) / options.crops
+    mean = torch.stack(parallel_map(work, range(options.crops))).sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
     gradients, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
     for parameter, gradient in zip(parameters, gradients.split(sizes), strict=True):
@@ -349,20 +284,15 @@ def gradient_share(gradient: Tensor, part: Tensor) -> float:
     return own / max(own + rest, 1e-30)
 
 
-def _loss(networks: Networks, example: Example, run: TrainingRun, step: int, rng: np.random.Generator) -> WindowLoss:
-    """Compute the loss of a random crop or window of an example."""
-    options = run.options
-    if step >= options.photo_step:
-        example = draw_views(example, options, rng)
+def _loss(
+    networks: Networks, example: Example, options: TrainOptions, step: int, rng: np.random.Generator
+) -> WindowLoss:
+    """Compute the loss of a random window of an example."""
+    example = draw_views(example, options, rng)
     if options.recolor:
         example = recolor(example, rng)
-    if step < options.photo_step:
-        crop = sample_crop(example, options.levels, options.crop, options.inner, rng)
-        prediction = predict(crop, networks, options, step)
-        loss = correction_loss(*scaled_corrections(crop, prediction, run.scales, options), options)
-        return WindowLoss(loss, torch.zeros(()))
     window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
-    return window_loss(networks, window, run.scales, options, step, rng)
+    return window_loss(networks, window, options, step, rng)
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:

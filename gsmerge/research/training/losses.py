@@ -1,4 +1,4 @@
-"""Losses: renders compared with photos, corrections compared with those of the fit, and regularizers.
+"""Losses: renders compared with photos, and regularizers.
 
 A window of a photo is rendered from all Feature Gaussians that reach into it, each run through all networks (paper
 section 4.6). Pixels that the scene does not cover have no loss, so that networks need not guess them. LPIPS is that of
@@ -8,9 +8,10 @@ which are the paper's teacher, and siblings apart.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations, product
 
 import numpy as np
 import torch
@@ -19,8 +20,6 @@ from torch.nn import functional
 
 from gsmerge.fit.loss import loss_ssim
 from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_layers
-from gsmerge.networks.corrections import ROTATION, residual_limits
-from gsmerge.networks.options import RESIDUAL
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
@@ -29,19 +28,13 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import (
     Prediction,
     analytic_gaussians,
-    crop_targets,
     decode_crop,
-    match_crop,
     predict,
     refine_crop,
 )
-from gsmerge.research.training.targets import Targets, corrections_between, nearest_axes
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.research.training.windows import Crop, Window
-from gsmerge.stages.merge import take
+from gsmerge.research.training.windows import Window
 from gsmerge.types import SH_C0, Gaussians
-
-MAX_DEVIATIONS = 4.0  # standard deviations that targets are clamped to
 
 
 def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg") -> Tensor:
@@ -85,42 +78,6 @@ def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tenso
             yield (features / (lengths + float(EPSILON)))[0]
 
 
-def target_scales(every: Iterable[Mapping[int, Targets]]) -> dict[int, Tensor]:
-    """Compute the standard deviation ``[13]`` of the targets' columns for each K, at least a thousandth."""
-    sums: dict[int, Tensor] = {}
-    for levels in every:
-        for k, targets in levels.items():
-            values = torch.from_numpy(targets.corrections[targets.mask]).double()
-            part = torch.stack([torch.full((RESIDUAL,), len(values)), values.sum(0), values.square().sum(0)])
-            sums[k] = sums.get(k, 0) + part
-    variances = {k: squares / count - (total / count).square() for k, (count, total, squares) in sums.items()}
-    return {k: variance.clamp_min(0).sqrt().clamp_min(1e-3).float() for k, variance in variances.items()}
-
-
-def scaled_corrections(
-    crop: Crop, prediction: Prediction, scales: Mapping[int, Tensor], options: TrainOptions
-) -> tuple[Tensor, Tensor]:
-    """Compute corrections and targets of the scored children, both ``[j,13]``, in units of the targets' deviations.
-
-    Corrections are those of all stages together, from the analytic children. Targets are clamped to the bounds of the
-    networks, and to a few standard deviations.
-    """
-    targets, scored = crop_targets(crop)
-    analytic = analytic_gaussians(crop, prediction.matches).to("cpu")
-    corrections = corrections_between(analytic, prediction.gaussians, prediction.frames)
-    limits = 2 * torch.from_numpy(residual_limits(options.network.bounds))[:RESIDUAL]  # of all stages together
-    clamped = targets[scored].clamp(-limits, limits) / scales[crop.k]
-    return corrections[scored] / scales[crop.k], clamped.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
-
-
-def correction_loss(corrections: Tensor, targets: Tensor, options: TrainOptions) -> Tensor:
-    """Compute the mean smooth L1 of corrections ``[j,13]`` against targets; 0 if there are none."""
-    weights = torch.ones(RESIDUAL)
-    weights[ROTATION] = options.turn_weight
-    losses = torch.nn.functional.smooth_l1_loss(corrections, targets, reduction="none") * weights
-    return losses.sum() / (weights.sum() * max(1, len(targets)))
-
-
 @dataclass(frozen=True, eq=False)
 class WindowLoss:
     """Loss of a window; ``diversity`` is the part that keeps siblings apart. Weights are included."""
@@ -132,20 +89,18 @@ class WindowLoss:
 def window_loss(
     networks: Networks,
     window: Window,
-    scales: Mapping[int, Tensor],
     options: TrainOptions,
     step: int,
     rng: np.random.Generator,
 ) -> WindowLoss:
     """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 
-    It is the mean over all levels if they are trained jointly. ``scales`` are the standard deviations of the targets of
-    each K, see :func:`target_scales`. The diversification is a share of the photometric loss: its own scale is that of
-    volumes, which say nothing of how much it may weigh.
+    It is the mean over all levels if they are trained jointly. The diversification is a share of the photometric loss:
+    its own scale is that of volumes, which say nothing of how much it may weigh.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
-    regression, teacher, diversity = options.regularizer_weights(step)
+    teacher, diversity = options.regularizer_weights(step)
     refined, total, apart = refine_crop(crop, networks, options, step), torch.zeros(()), torch.zeros(())
     for k in levels:
         prediction = decode_crop(refined, crop, k)
@@ -153,9 +108,6 @@ def window_loss(
         if diversity and k > 1:
             spread = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
             apart = apart + diversity * float(loss.detach()) * spread / len(levels)
-        if regression:
-            scaled = scaled_corrections(crop, prediction, scales, options)
-            loss = loss + regression * correction_loss(*scaled, options)
         if teacher:
             loss = loss + teacher * teacher_loss(prediction, crop.example.members)
         total = total + loss / len(levels)
@@ -202,9 +154,7 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
     """
     with torch.no_grad():
         if networks is None:
-            features = take(window.crop.example.features, window.crop.rows)
-            matches = match_crop(window.crop, features, options)
-            gaussians, matched = analytic_gaussians(window.crop, matches).to("cpu"), 0.0
+            gaussians, matched = analytic_gaussians(window.crop, options).to("cpu"), 0.0
         else:
             prediction = predict(window.crop, networks, options, 0)
             gaussians, matched = prediction.gaussians, prediction.matched
@@ -241,6 +191,20 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     colors = SH_C0 * (g.sh0 - teacher.sh0).abs()
     parts = (turns, distances, stretches, (g.opacities - teacher.opacities).abs(), colors)
     return torch.stack([part.mean() for part in parts]).sum()
+
+
+def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
+    """Return the axis permutations with signs ``[n,3,3]`` that bring ``quats [n,4]`` nearest to a reference.
+
+    A Gaussian has 24 equal pairs of rotation and scales: rotations times the result, and scales in that order.
+    """
+    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
+    orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
+    proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
+    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
+    with torch.no_grad():
+        between = quat_to_rotmat(reference).transpose(1, 2) @ quat_to_rotmat(quats)
+        return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
 
 
 def _turn_angles(turns: Tensor) -> Tensor:

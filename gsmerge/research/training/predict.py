@@ -249,21 +249,20 @@ class TrainingContext(NetworkContext):
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
         """Run the head for K = 1; return the covariances of its Gaussians as tensors, with gradients."""
-        g, _ = self.correct_children(None, np.arange(len(features)), self.describe(features))
+        g = self.correct_children(None, np.arange(len(features)), self.describe(features))
         half = quat_to_rotmat(g.quats) * g.scales[:, None]
         return half @ half.transpose(1, 2)
 
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
-    ) -> tuple[Gaussians, Tensor]:
-        """Run the heads on children (None: of nothing); return the corrected ones, and the frames of their groups."""
+    ) -> Gaussians:
+        """Run the heads on children (None: of nothing); return the corrected ones."""
         if children is None:
             arrays = groups_to_arrays(group_features)
             round_ones = prepare_children(arrays.base[parents], parents, arrays, self.options)
             children = make_round_tensors(parents, group_features, round_ones)
         corrections = as_tensor(run_heads(children, parents, group_features, self))
-        frames = group_features.frames[torch.from_numpy(parents)]
-        return move_tensors(children, corrections, frames), frames
+        return move_tensors(children, corrections, group_features.frames[torch.from_numpy(parents)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,9 +272,7 @@ class Prediction:
     gaussians: Gaussians  # n corrected children, tensors with gradients
     parents: Tensor  # [n] int64, the merged Feature Gaussian of each, ascending
     merged: FeatureGaussians  # the crop's, merged and refined, without gradients
-    frames: Tensor  # [n,3,3] axes of each one's group as columns, world
     sizes: Tensor  # [n] size of each one's group, world units
-    matches: Matches  # the crop's clusters
     matched: float  # share of the crop's Feature Gaussians that were merged with others
 
 
@@ -294,7 +291,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     context = TrainingContext(networks, example.members, example.cameras, seed)
     encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))
-    matches = match_crop(crop, features_to_arrays(encoded), options)
+    matches = match(features_to_arrays(encoded), options.match_options())
     refined = refine_features(_merge(encoded, matches, context), context)
     return RefinedCrop(context, context.describe(refined), matches)
 
@@ -308,10 +305,10 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     described, context = refined.described, refined.context
     arrays = features_to_arrays(described.features)
     children, parents = _make_children(crop, arrays, described, context, k)
-    gaussians, frames = context.correct_children(children, parents, described)
+    gaussians = context.correct_children(children, parents, described)
     parent_ids, counts = torch.from_numpy(parents), np.bincount(refined.matches.clusters)
     matched = float(counts[counts > 1].sum()) / max(1, len(refined.matches.clusters))
-    return Prediction(gaussians, parent_ids, arrays, frames, described.sizes[parent_ids], refined.matches, matched)
+    return Prediction(gaussians, parent_ids, arrays, described.sizes[parent_ids], matched)
 
 
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
@@ -340,39 +337,8 @@ def _make_children(
     return children.to("cpu"), parents
 
 
-def analytic_gaussians(crop: Crop, matches: Matches) -> Gaussians:
+def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:
     """Decode the children of a crop without networks."""
-    merged = merge(take(crop.example.features, crop.rows), matches)
+    features = take(crop.example.features, crop.rows)
+    merged = merge(features, match(features, options.match_options()))
     return divide(merged, crop.example.members, np.full(len(merged), crop.k))[0]
-
-
-def match_crop(crop: Crop, parts: FeatureGaussians, options: TrainOptions) -> Matches:
-    """Match the Feature Gaussians ``parts`` of a crop, or return the clusters with which its example was fitted."""
-    matches = crop.example.matches
-    if matches is None:
-        return match(parts, options.match_options())
-    ids, local = np.unique(matches.clusters[crop.rows], return_inverse=True)
-    return Matches(local, len(ids))
-
-
-def crop_targets(crop: Crop) -> tuple[Tensor, Tensor]:
-    """Return target corrections ``[n,13]`` of a crop's children, and a mask ``[n]`` of children that count."""
-    matches = crop.example.matches
-    assert matches is not None
-    rows, targets = merged_rows(matches), crop.example.targets[crop.k]
-    inside, inner = np.zeros((2, matches.count), bool)
-    inside[rows[crop.rows]], inner[rows[crop.rows[crop.inner]]] = True, True
-    ids = np.flatnonzero(inside[targets.parents])
-    scored = targets.mask[ids] & inner[targets.parents[ids]]
-    return torch.from_numpy(targets.corrections[ids]), torch.from_numpy(scored)
-
-
-def merged_rows(matches: Matches) -> np.ndarray:
-    """Return the row ``[g]`` after merging of each Feature Gaussian before merging."""
-    alone, order, cuts = cluster_runs(matches)
-    rows = np.empty(len(matches.clusters), np.int64)
-    rows[alone] = np.arange(len(alone))
-    first = np.zeros(len(order), np.int64)
-    first[cuts] = 1
-    rows[order] = len(alone) + first.cumsum() - 1
-    return rows

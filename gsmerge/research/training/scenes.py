@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from gsmerge.facts.prepare import canonicalise
@@ -89,10 +88,3 @@ def covered_pixels(covers: np.ndarray) -> np.ndarray:
     for cover in covers:
         left *= 1 - cover.astype(np.float32) / 255
     return left <= 1 - OPAQUE
-
-
-def reduced_masks(masks: np.ndarray, photos: Photos) -> np.ndarray:
-    """Shrink masks ``[p,h,w]`` to the size of ``photos``; a pixel is True if more than half of it is."""
-    size = photos.width, photos.height
-    small = [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for mask in masks]
-    return np.stack(small)

@@ -8,8 +8,7 @@ Threads read ahead. Every crop of a step has a stream of its own: every ``crops`
 shuffled anew for each pass over them. A stream holds ``buffer`` examples, from which the crop draws one at random;
 every ``refresh`` steps the next in the order takes the place of the oldest. A capture takes the place of a shard: what
 its backbone predicts is another example at every place in the order. Which examples these are depends on seed and step
-alone. So a run that is resumed goes on as if it had not stopped, and so does one that is shared among
-processes, each of which reads the streams of its own crops.
+alone. So a run that is resumed goes on as if it had not stopped.
 """
 
 from __future__ import annotations
@@ -35,21 +34,18 @@ from gsmerge.pooling import Members
 from gsmerge.raster.photos import Photos
 from gsmerge.research.training.backbones import PredictedCapture
 from gsmerge.research.training.examples import NOT_STORED, Example, make_examples, scene_name
-from gsmerge.research.training.processes import ALONE, Processes
-from gsmerge.research.training.targets import Targets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.runtime.threads import work_alone
 from gsmerge.scene.content_hash import content_hash, digest, read_files
 from gsmerge.scene.files import find_scene_files
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 
 Report = Callable[[str, int, int], None]  # what is done, step, steps
-LAYOUT = 5  # version of the files and of what is in them
+LAYOUT = 6  # version of the files and of what is in them
 FORMAT = "gsmerge-example"
 REMEDY = "remove it; the next call makes it again"
-# Settings that an example depends on; fit_steps and levels only with a fit.
+# Settings that an example depends on
 SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
-FIT_SETTINGS = ("match", "overlap", "iou", "fit_steps", "levels")
 PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}
 # Each takes the place of the step in the seed of random numbers: of the order, and of what a capture draws
 ORDER, DRAWN = 2**32 + 1, 2**32 + 2
@@ -68,10 +64,9 @@ def prepare_shards(
     scenes: Sequence[Path],
     options: TrainOptions,
     folder: Path,
-    processes: Processes = ALONE,
     report: Report | None = None,
 ) -> list[Shard]:
-    """Return the shards of all scenes in order; missing ones are made, the work shared by all processes.
+    """Return the shards of all scenes in order; missing ones are made.
 
     ``scenes`` are folders or ``.ply`` files; ``report`` is called with (words, step, steps). A SceneError if a scene
     cannot be used, or the folder cannot be written.
@@ -80,11 +75,10 @@ def prepare_shards(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
-    lists, part = list[list[Shard]](), processes.share(scenes)
-    for number, scene in enumerate(part):
-        move = _in_all(report, sum(map(len, lists)), len(part) - number)
-        lists.append(_scene_shards(scene, options, folder, move))
-    return [shard for shards in processes.gather(lists) for shard in shards]
+    shards: list[Shard] = []
+    for number, scene in enumerate(scenes):
+        shards += _scene_shards(scene, options, folder, _in_all(report, len(shards), len(scenes) - number))
+    return shards
 
 
 def _in_all(report: Report | None, before: int, scenes: int) -> Report:
@@ -113,15 +107,10 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
 
 def _make_shards(scene: Path, options: TrainOptions, start: Path, report: Report) -> dict[str, str]:
     """Write the missing examples of a scene to files that begin with ``start``; return the hash of each by name."""
-    hashes, count, name = dict[str, str](), 0, scene_name(scene)
-
-    def move(step: int, steps: int) -> None:
-        report(f"{name}, fit {step} of {steps}" if steps else name, len(hashes), count)
-
-    move(0, 0)
-    for label, number, make in make_examples(scene, options, move):
-        count = number
-        move(0, 0)
+    hashes, name = dict[str, str](), scene_name(scene)
+    report(name, 0, 0)
+    for label, count, make in make_examples(scene, options):
+        report(name, len(hashes), count)
         path = start.with_name(f"{start.name}-{label}.safetensors")
         hashes[path.name] = _content_hash(path) or write_shard(path, make())
     return hashes
@@ -129,9 +118,8 @@ def _make_shards(scene: Path, options: TrainOptions, start: Path, report: Report
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
     """Return a hash of a scene's files and the settings that its examples depend on; SceneError without a scene."""
-    names = (*SETTINGS, *FIT_SETTINGS) if options.uses_fit else SETTINGS
-    head = {"layout": LAYOUT, "gsmerge": __version__, "fit": options.uses_fit, "views": options.example_views}
-    head |= {name: getattr(options, name) for name in names}
+    head = {"layout": LAYOUT, "gsmerge": __version__, "views": options.example_views}
+    head |= {name: getattr(options, name) for name in SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
     held_out = content_hash([targets]) if targets.is_dir() else None  # apart: names are relative to their folders
@@ -160,7 +148,7 @@ def write_shard(path: Path, example: Example) -> str:
     """Write an example to a file, replacing it, and return the hash of its arrays; SceneError if that fails."""
     arrays = dict(_arrays(example))
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
-    facts |= {"size": [example.cameras.width, example.cameras.height], "levels": list(example.targets)}
+    facts |= {"size": [example.cameras.width, example.cameras.height]}
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(save(arrays, {FORMAT: json.dumps(facts)}))  # save_file would change the file's mode
     return str(facts["sha256"])
@@ -176,11 +164,6 @@ def _arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
         yield f"{part}.Ks", np.ascontiguousarray(cameras.Ks)
     yield "images", example.images
     yield "covers", example.covers
-    if example.matches is not None:
-        yield "clusters", example.matches.clusters
-    for k, targets in example.targets.items():
-        for f in fields(Targets):
-            yield f"targets.{k}.{f.name}", getattr(targets, f.name)
 
 
 def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:
@@ -206,7 +189,6 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
         return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
     black = np.broadcast_to(np.float32(0), arrays["images"].shape)
-    clusters = arrays.get("clusters")
     return Example(
         name=shard.scene,
         unit=float(facts["unit"]),
@@ -217,8 +199,6 @@ def read_shard(shard: Shard, *, check: bool = True) -> Example:
         photos=Photos(black, **part("photos"), eps2d=facts["eps2d"]),
         images=arrays["images"],
         covers=arrays["covers"],
-        matches=None if clusters is None else Matches(clusters, int(clusters.max()) + 1),
-        targets={k: Targets(**part(f"targets.{k}")) for k in facts["levels"]},
     )
 
 
@@ -232,13 +212,6 @@ def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str
         raise SceneError(path, "expected an example, found a damaged file or none", REMEDY) from error
 
 
-def read_targets(shard: Shard) -> dict[int, Targets]:
-    """Read only the targets of a shard's example; SceneError if the file is missing or damaged."""
-    arrays, facts = _read(shard.path, "targets.")
-    names = [f.name for f in fields(Targets)]
-    return {k: Targets(*(arrays[f"targets.{k}.{n}"] for n in names)) for k in facts["levels"]}
-
-
 Source = Shard | PredictedCapture
 
 
@@ -250,10 +223,10 @@ def read_example(source: Source, options: TrainOptions, rng: np.random.Generator
 
 
 class ExampleStreams:
-    """Streams of examples, one stream for each crop that this process draws per step."""
+    """Streams of examples, one stream for each crop of a step."""
 
-    def __init__(self, shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> None:
-        self.shards, self.options, self.crops = shards, options, crops
+    def __init__(self, shards: Sequence[Source], options: TrainOptions) -> None:
+        self.shards, self.options = shards, options
         self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
         # Those in memory, or being read, by number of the shard; of a capture also by place in the order, else 0
         self.examples: dict[tuple[int, int], Future[Example]] = {}
@@ -262,7 +235,7 @@ class ExampleStreams:
     def move_to(self, step: int) -> None:
         """Load the shards that ``step`` may draw from and the next ones; forget all others."""
         ahead = self.options.buffer + 1
-        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in self.crops]
+        keys = [self._key(step, crop, slot) for slot in range(ahead) for crop in range(self.options.crops)]
         for key in self.examples.keys() - set(keys):
             self.examples.pop(key).cancel()
         for key in keys:
@@ -294,9 +267,9 @@ class ExampleStreams:
 
 
 @contextmanager
-def open_streams(shards: Sequence[Source], options: TrainOptions, crops: Sequence[int]) -> Iterator[ExampleStreams]:
+def open_streams(shards: Sequence[Source], options: TrainOptions) -> Iterator[ExampleStreams]:
     """Open streams of examples; their threads end with the block."""
-    streams = ExampleStreams(shards, options, crops)
+    streams = ExampleStreams(shards, options)
     try:
         yield streams
     finally:

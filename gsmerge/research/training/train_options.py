@@ -30,27 +30,24 @@ class TrainOptions(Settings):
         "A scene gives an example for each. The photos of the other views are novel views.", least=0, most=10**6,
         filled=True)  # fmt: skip
     random_views: tuple[int, ...] = setting((), "Least and most views of a subset that is drawn anew for every window, "
-        "as `[1, 12]` in the paper, in place of `views`; empty: those.",
-        "Not with a loss that uses the fit, whose result is that of one subset.", least=1, most=10**6)  # fmt: skip
+        "as `[1, 12]` in the paper, in place of `views`; empty: those.", least=1, most=10**6)  # fmt: skip
     recolor: bool = setting(False, "Whether every window has colours of its own: channels in any order, less contrast, "
         "negatives.",
         "Few scenes have few colours, and networks learn these.")  # fmt: skip
     densities: tuple[float, ...] = setting((0.025, 0.044), "Superpixels per pixel; a scene gives an example for each.",
-        "Two by default, since the full fit starts with 57 % of the usual number.", least=1e-6, most=1,
+        "Two by default, since a full fit starts with 57 % of the usual number.", least=1e-6, most=1,
         filled=True)  # fmt: skip
     segmentation: str = setting("rdseg", "Superpixel method.", choices=SEGMENTATIONS)
     match: Method = setting("overlap", "Merging across views.",
-        "Where no fit is used, what the networks make of a window is matched in every step.")  # fmt: skip
+        "What the networks make of a window is matched in every step.")  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
     iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)
     similarity: float = setting(0.8, "Least cosine of the latents of a match by `aabb`.", least=-1, most=1)
-    fit_steps: int = setting(300, "Steps of the full fit whose result is the target; fitted only where a loss uses it: "
-        "`regression_weight` or `photo_start` above 0.", **COUNT)  # fmt: skip
-    levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained, each needs a fit, if "
-        "there is one.", choices=SLOTS, filled=True, unique=True)  # fmt: skip
+    levels: tuple[int, ...] = setting(SLOTS, "Numbers of children K whose heads are trained.", choices=SLOTS,
+        filled=True, unique=True)  # fmt: skip
     joint: bool = setting(False, "Whether every window trains the heads of all levels, as in the paper, or that of a "
-        "level drawn at random.", "Not with a loss that uses the fit.")  # fmt: skip
-    buffer: int = setting(4, "Examples in memory for each crop of a step, which draws one of them.", **COUNT)
+        "level drawn at random.")  # fmt: skip
+    buffer: int = setting(4, "Examples in memory for each window of a step, which draws one of them.", **COUNT)
     refresh: int = setting(4, "Steps after which the next example takes the place of the oldest of these.", **COUNT)
     workers: int = setting(1, "Threads that read examples ahead.", **COUNT)
     steps: int = setting(6000, "Steps of the training.", **COUNT)
@@ -61,14 +58,7 @@ class TrainOptions(Settings):
     clip: float = setting(1.0, "Largest norm of the gradient.", **RATE)
     average: float = setting(0.998, "Weight of the previous mean in the running mean of the weights, which is "
         "validated and saved; less in the first steps.", **PART)  # fmt: skip
-    crops: int = setting(2, "Crops or windows per step, of all processes together; worked on in parallel.", **COUNT)
-    crop: int = setting(512, "Number of Feature Gaussians of a crop: a random one and its nearest.", **COUNT)
-    inner: float = setting(0.6, "Share of a crop that is scored; the rest are neighbours.", least=1e-6, most=1)
-    turn_weight: float = setting(0.1, "Weight of the rotation in the loss; it is small because axes of similar length "
-        "have no direction.", **WEIGHT)  # fmt: skip
-    photo_start: float = setting(0.0, "Share of the steps after which renders are compared with photos; 1: never.",
-        "Of two runs of 400 steps on two scenes, the one with 0.3 ended 0.9 dB below the one with 0.",
-        **PART)  # fmt: skip
+    crops: int = setting(2, "Windows per step, worked on in parallel.", **COUNT)
     novel: float = setting(0.75, "Share of the windows in novel views, if there are any.", **PART)
     photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT)
     photo_side: int = setting(0, "Longer side of the photos in pixels, where they are larger, in place of "
@@ -81,20 +71,16 @@ class TrainOptions(Settings):
     lpips_weight: float = setting(0.0, "Weight of LPIPS (VGG), whose weights must be installed; a step takes twice as "
         "long with it.", **WEIGHT)  # fmt: skip
     lpips_start: float = setting(0.0, "Share of the steps after which LPIPS has its weight.", **PART)
-    regression_weight: float = setting(0.1, "Weight of the regression when renders are compared; it falls to 0 until "
-        "the end of the run.", **WEIGHT)  # fmt: skip
     teacher_weight: float = setting(0.0, "Weight of the distance from the moments of the groups (paper eq. "
         "teacher_mean, teacher_cov).", **WEIGHT)  # fmt: skip
-    teacher_steps: int = setting(2000, "Steps that compare renders over which it falls to 0.", **COUNT)
+    teacher_steps: int = setting(2000, "Steps over which it falls to 0.", **COUNT)
     diversity_weight: float = setting(0.0, "Weight of the diversification of several children, as a share of the "
         "photometric loss: it is at most that loss times this.", **WEIGHT)  # fmt: skip
-    diversity_steps: int = setting(50_000, "Steps that compare renders over which it falls to 0.", **COUNT)
+    diversity_steps: int = setting(50_000, "Steps over which it falls to 0.", **COUNT)
     opacity_shift: float = setting(0.0, "Added to the raw correction of the opacity by the heads of the checkpoints.",
         "New captures have holes that scenes in training lack.", least=-8, most=8)  # fmt: skip
     save_every: int = setting(200, "Steps between checkpoints, validation and lines of the table.", **COUNT)
     validation_examples: int = setting(24, "Most examples for validation, spread evenly over all examples.",
-        **COUNT)  # fmt: skip
-    validation_crops: int = setting(8, "Crops of each of them, always the same; only where a loss uses the fit.",
         **COUNT)  # fmt: skip
     validation_windows: int = setting(4, "Windows of each of them, always the same.", **COUNT)
     seed: int = setting(0, "Seed of all random numbers.", **FROM_0)
@@ -105,15 +91,6 @@ class TrainOptions(Settings):
         super().__post_init__()
         if self.random_views and (len(self.random_views) != 2 or self.random_views[0] > self.random_views[1]):
             raise ValueError(f"random_views: expected the least and the most, got {list(self.random_views)}")
-        if self.random_views and self.uses_fit:
-            raise ValueError("random_views: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
-        if self.joint and self.uses_fit:
-            raise ValueError("joint: expected regression_weight 0 and photo_start 0, got a loss that uses a fit")
-
-    @property
-    def uses_fit(self) -> bool:
-        """Whether a loss compares corrections with those of a full fit."""
-        return self.regression_weight > 0 or self.photo_start > 0
 
     @property
     def example_views(self) -> tuple[int, ...]:
@@ -138,23 +115,10 @@ class TrainOptions(Settings):
         """Return the weight of LPIPS in a step, counted from 0."""
         return self.lpips_weight if step >= self.lpips_start * self.steps else 0.0
 
-    @property
-    def photo_step(self) -> int:
-        """First step, counted from 0, whose loss compares renders with photos."""
-        return math.ceil(self.photo_start * self.steps)
-
-    def regularizer_weights(self, step: int) -> tuple[float, float, float]:
-        """Return the weights of the regression, teacher and diversity losses in a step that compares renders."""
-        done = step - self.photo_step
-
-        def left(steps: int) -> float:
-            return max(0.0, 1 - done / max(1, steps))
-
-        return (
-            self.regression_weight * left(self.steps - self.photo_step),
-            self.teacher_weight * left(self.teacher_steps),
-            self.diversity_weight * left(self.diversity_steps),
-        )
+    def regularizer_weights(self, step: int) -> tuple[float, float]:
+        """Return the weights of the teacher and diversity losses in a step, counted from 0."""
+        teacher, diversity = (max(0.0, 1 - step / steps) for steps in (self.teacher_steps, self.diversity_steps))
+        return self.teacher_weight * teacher, self.diversity_weight * diversity
 
     def rate_at(self, step: int) -> float:
         """Return the learning rate of a step, counted from 0: linear warm-up, then a half cosine."""
@@ -169,7 +133,7 @@ class TrainOptions(Settings):
 
 
 # Table of hyperparameters, sections 4.1, 4.4 and 5.1 of the paper; settings that it does not give are the defaults, but
-# for the densities, of which the fit alone needs two.
+# for the densities.
 PAPER: Mapping[str, Any] = {
     "outputs": "absolute",
     "merger_start": "first",
@@ -191,12 +155,10 @@ PAPER: Mapping[str, Any] = {
     "rate": 5e-5,
     "least_rate": 1e-6,
     "clip": 10.0,
-    "photo_start": 0.0,
     "photo_loss": "mse",
     "photo_weight": 1.0,
     "ssim_weight": 0.05,
     "lpips_weight": 0.05,
-    "regression_weight": 0.0,
     "teacher_weight": 0.25,
     "teacher_steps": 2_000,
     "diversity_weight": 1.0,
@@ -210,7 +172,6 @@ SHIPPED: Mapping[str, Any] = {
     "color": 0.0,  # the bound of corrections
     "recolor": True,
     "views": (3, 0),
-    "fit_steps": 100,
     "steps": 2_600,
     "lpips_weight": 0.06,
     "lpips_start": 0.8,
@@ -218,7 +179,6 @@ SHIPPED: Mapping[str, Any] = {
     "photo_scale": 1,  # children of K = 4 are smaller than pixels of photos at half the size
     "window": 128,
     "save_every": 100,
-    "validation_crops": 4,
     "validation_windows": 6,
 }
 # The paper's training, shortened to what two processor cores do in an hour and a half.

@@ -1,4 +1,4 @@
-"""Parts of examples that a step works on: neighbouring Feature Gaussians, and windows of photos."""
+"""Parts of examples that a step works on: windows of photos, and the Feature Gaussians in them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ BORDER = 4  # pixels around a window, from which corrections may move Gaussians 
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A subset of an example's Feature Gaussians, in whole clusters if these are known, with K children each."""
+    """A subset of an example's Feature Gaussians, with K children each."""
 
     example: Example
     k: int  # Gaussians that each becomes
     rows: np.ndarray  # [r] ascending rows of its Feature Gaussians
-    inner: np.ndarray  # [r] bool, whether targets count; the others are neighbours
 
 
 @dataclass(frozen=True)
@@ -76,16 +75,6 @@ class Window:
         return np.ascontiguousarray(picture[b.top : b.top + b.height, b.left : b.left + b.width])
 
 
-def sample_crop(example: Example, levels: tuple[int, ...], count: int, inner: float, rng: np.random.Generator) -> Crop:
-    """Sample the ``count`` Feature Gaussians nearest to a random one; the nearest share ``inner`` of them is scored."""
-    k, means = levels[int(rng.integers(len(levels)))], example.features.means
-    order = np.argsort(np.square(means - means[rng.integers(len(means))]).sum(1), kind="stable")[:count]
-    near, close = np.zeros((2, len(means)), bool)
-    near[order], close[order[: max(1, int(inner * len(order)))]] = True, True
-    rows = _whole_clusters(example, near)
-    return Crop(example, k, rows, close[rows])
-
-
 def sample_window(
     example: Example, levels: tuple[int, ...], side: int, most: int, novel: float, rng: np.random.Generator
 ) -> Window:
@@ -112,14 +101,14 @@ def sample_window(
     while len(rows) > most and box.halved() != box:
         box = box.halved()
         rows = _rows(example, photo, box)
-    return Window(photo, box, Crop(example, k, rows, np.ones(len(rows), bool)))
+    return Window(photo, box, Crop(example, k, rows))
 
 
 def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
     """Return a window of a whole photo, with all Feature Gaussians."""
     height, width = example.images.shape[1:3]
     rows = np.arange(len(example.features))
-    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows, np.ones(len(rows), bool)))
+    return Window(photo, Box(0, 0, width, height), Crop(example, k, rows))
 
 
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
@@ -128,16 +117,7 @@ def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     tiled = tile_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR)
     reached = np.zeros(len(example.base), bool)
     reached[tiled.ids[np.unique(tiled.flatten_ids)]] = True
-    return _whole_clusters(example, reached)
-
-
-def _whole_clusters(example: Example, chosen: np.ndarray) -> np.ndarray:
-    """Find the ascending rows of the ``chosen [g]`` Feature Gaussians, and of those in the same clusters."""
-    if example.matches is not None:
-        inside = np.zeros(example.matches.count, bool)
-        inside[example.matches.clusters[chosen]] = True
-        chosen = inside[example.matches.clusters]
-    return np.flatnonzero(chosen)
+    return np.flatnonzero(reached)
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:

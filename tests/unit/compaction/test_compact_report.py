@@ -88,7 +88,7 @@ def test_summary_line_without_photos(files: tuple[Path, Path]) -> None:
 
 
 def test_the_curve_marks_the_result(files: tuple[Path, Path]) -> None:
-    points = [{"count": count, "psnr": 20.0, "ssim": 0.5, "lpips": None} for count in (10, 30, 90)]
+    points = [{"count": count, "psnr": 20.0, "ssim": 0.5} for count in (10, 30, 90)]
     *_, few, nearest, many = report.curve_lines(make_document(files, choices={"curve": points}))
     assert nearest.endswith("the result has 25")
     assert "result" not in few + many

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import gzip
-import struct
-import zlib
+import json
 from dataclasses import replace
 from operator import attrgetter
+from typing import Any
 
 import cv2
 import motions
@@ -23,11 +23,15 @@ from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import to_picture
-from gsmerge.pages import data
-from gsmerge.pages.data import ViewData, collect, encode_still, pack_splats, short_names
+from gsmerge.pages import data, splats
+from gsmerge.pages.data import ViewData, collect, encode_still, short_names
+from gsmerge.pages.drops import draw_drops
+from gsmerge.pages.splats import pack_splats
 from gsmerge.raster.metrics import psnr
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.clean import clean
 from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.types import Views
+from gsmerge.types import PicturedScene, Views
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +65,18 @@ def decoded(still: bytes | None) -> np.ndarray:
     return np.asarray(image[..., ::-1], np.float32) / 255
 
 
-def unpacked(packed: bytes | None) -> bytes:
-    """The uncompressed .spz of what the page holds: sums down every column."""
-    raw = gzip.decompress(packed)
-    count, degree = struct.unpack_from("<IB", raw, 8)
-    columns, at = [], 20
-    for width in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)):
-        planes = np.frombuffer(raw, np.uint8, width * count, at).reshape(width, count)
-        columns.append(np.cumsum(planes, axis=1, dtype=np.uint8).T.tobytes())
-        at += width * count
-    content = raw[:16] + b"".join(columns)
-    assert (len(raw), zlib.crc32(content)) == (at, struct.unpack_from("<I", raw, 16)[0])
-    return content
+def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
+    """The numbers of what the page holds: its head, and ``[n,columns]``."""
+    line, _, rest = gzip.decompress(packed or b"").partition(b"\n")
+    head = json.loads(line)
+    columns, at = [], 0
+    for size in head["sizes"]:
+        planes = np.frombuffer(rest, np.uint8, size * head["count"], at).reshape(size, -1).astype(np.int64)
+        signed = (planes << (8 * np.arange(size)[:, None])).sum(0)
+        columns.append(np.cumsum((signed >> 1) ^ -(signed & 1)))
+        at += size * head["count"]
+    assert len(rest) == at
+    return head, np.stack(columns, 1)
 
 
 def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
@@ -139,13 +143,10 @@ def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) 
 
 def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussians, scene: Scene) -> None:
     """What a view sees in the world it sees in the page's frame."""
-    raw = unpacked(actual.sides[1].splats)
-    count, _, fraction = struct.unpack_from("<IBB", raw, 8)
-    drawn = half.means[half.opacities >= data.MIN_OPACITY]
-    assert count == len(drawn)
-    triples = np.frombuffer(raw, np.uint8, 9 * count, 16).reshape(-1, 3)
-    fixed = np.pad(triples, ((0, 0), (0, 1))).view("<i4")[:, 0]
-    means = ((fixed + 2**23) % 2**24 - 2**23).reshape(-1, 3) / 2.0**fraction
+    head, columns = unpacked(actual.sides[1].splats)
+    drawn = half.means[half.opacities >= splats.MIN_OPACITY]
+    assert head["count"] == len(drawn)
+    means = columns[:, :3] / 2.0 ** head["fraction"]
     view = next(view for view in actual.views if view.place == 1)
     ours = means @ view.camera.viewmats[0, :3, :3].T + view.camera.viewmats[0, :3, 3]
     world = drawn @ scene.cameras.viewmats[1, :3, :3].T + scene.cameras.viewmats[1, :3, 3]
@@ -153,9 +154,63 @@ def test_cameras_and_gaussians_are_in_one_frame(actual: ViewData, half: Gaussian
     assert view.distance == pytest.approx(np.median(ours[:, 2]), rel=0.3)
 
 
+def test_rows_of_pixels_have_depths(actual: ViewData, scene: Scene) -> None:
+    """From which their positions follow, to a sixteenth of a pixel and a 2000th of the depth."""
+    head, columns = unpacked(actual.sides[0].splats)
+    ids, rights, downs, depths = columns[:, :4].T
+    np.testing.assert_array_equal(ids, np.arange(len(scene.gaussians)))
+    frame, (width, height) = scene_frame(scene), (scene.cameras.width, scene.cameras.height)
+    assert (head["width"], head["height"], len(head["cameras"])) == (width, height, 3)
+    camera = frame.enter_cameras(scene.cameras)[[1]]
+    rows = ids // (width * height) == 1
+    seen = frame.enter(scene.gaussians).means[rows] @ camera.viewmats[0, :3, :3].T + camera.viewmats[0, :3, 3]
+    pixels = ids[rows] % (width * height)
+    middles = np.stack([pixels % width, pixels // width], 1) + 0.5
+    projected = seen @ camera.Ks[0].T
+    shifts = np.stack([rights, downs], 1)[rows] / 8
+    assert np.abs(middles + shifts - projected[:, :2] / projected[:, 2:]).max() < 0.07
+    np.testing.assert_allclose(np.exp(depths[rows] / 1024), seen[:, 2], rtol=6e-4)
+
+
+def test_many_gaussians_are_less_exact(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    exact, _ = pack_splats(half)
+    monkeypatch.setattr(splats, "MANY", len(half) - 1)
+    coarse, _ = pack_splats(half)
+    assert len(coarse or b"") < 0.9 * len(exact or b"")
+    (_, fine), (head, rough) = unpacked(exact), unpacked(coarse)
+    assert np.abs(16 * rough[:, 3] - fine[:, 3]).max() <= 8
+    assert (head["steps"], head["levels"]) == ([16, 2, 2], 31)
+
+
+def test_a_light_page_has_no_gaussians_of_the_scene(small: Scene) -> None:
+    light = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), light=True)
+    assert [side.splats is None for side in light.sides] == [True, False]
+    assert not any("stills only" in note or "harmonics" in note for note in light.notes)
+
+
+def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
+    """Floaters and sky as ``compact --drop`` takes them, in the pictures that show them."""
+    half, frame = small.gaussians[::2], scene_frame(small)
+    entered, camera = frame.enter(half), frame.enter_cameras(small.cameras)
+    seen = PicturedScene(entered, camera, small.images, None, small.names)
+    _, counts = clean(entered, CleanOptions(drop="floaters,sky"), seen, frame.leave)
+    shown = collect("room", small, {"half": half}, (2, 1))
+    assert [side.dropped for side in shown.sides] == [{}, {word: n for word, n in counts.items() if n}]
+    assert counts["floaters"] > 0
+    assert all(view.drops[0] is None for view in shown.shown)
+    assert any(view.drops[1] for view in shown.shown)
+    near = near_plane(small) / frame.unit
+    mask = draw_drops(entered, {"sky": np.ones(len(half), bool)}, camera[[0]], near)
+    picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (small.cameras.height, small.cameras.width, 4)
+    assert set(map(tuple, picture[picture[..., 3] > 0])) == {(255, 170, 20, 255)}
+    assert draw_drops(entered, {"floaters": np.zeros(len(half), bool)}, camera[[0]], near) is None
+
+
 def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     half = small.gaussians[::2]
     monkeypatch.setattr(data, "MAX_GAUSSIANS", len(half) + 1)
+    monkeypatch.setattr(splats, "MAX_GAUSSIANS", len(half) + 1)
     actual = collect("room", small, {"half": half}, (2, 1))
     assert actual.sides[0].splats is None
     assert actual.sides[1].splats is not None
@@ -165,10 +220,10 @@ def test_too_many_gaussians_are_left_out(small: Scene, monkeypatch: pytest.Monke
 def test_harmonics_that_do_not_fit_are_left_out(half: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     curved = replace(half, shN=np.full((len(half), 15, 3), 0.1, np.float32))
     assert pack_splats(curved)[1] == 3
-    monkeypatch.setattr(data, "MAX_SPZ_BYTES", 45 * len(half))
+    monkeypatch.setattr(splats, "MAX_SPZ_BYTES", 45 * len(half))
     content, degree = pack_splats(curved)
     assert degree == 2
-    assert len(unpacked(content)) < 45 * len(half)
+    assert unpacked(content)[1].shape == (len(half), 13 + 24)
 
 
 def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
@@ -182,8 +237,10 @@ def test_harmonics_of_zeros_are_left_out(small: Scene) -> None:
 
 
 def test_pixels_in_order_take_less_than_their_spz(scene: Scene) -> None:
-    packed, _ = pack_splats(scene.gaussians)
-    assert len(packed) < 0.8 * len(spz_bytes(scene.gaussians))
+    frame, ids = scene_frame(scene), np.arange(len(scene.gaussians))
+    gaussians = frame.enter(scene.gaussians)
+    packed, _ = pack_splats(gaussians, frame.enter_cameras(scene.cameras), ids)
+    assert len(packed or b"") < 0.8 * len(pack_splats(gaussians)[0] or b"") < 0.8 * len(spz_bytes(gaussians))
 
 
 def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
@@ -191,7 +248,7 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
     means[0, 1], opacities[1] = np.nan, 0.003
     content, _ = pack_splats(replace(half, means=means, opacities=opacities))
     whole, _ = pack_splats(half)
-    counts = [struct.unpack_from("<I", unpacked(one), 8)[0] for one in (content, whole)]
+    counts = [unpacked(one)[0]["count"] for one in (content, whole)]
     assert counts[0] == counts[1] - 2
 
 
@@ -216,9 +273,7 @@ def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene)
     assert not lines[factor // 2 :: factor, factor // 2 :: factor].any()  # the middles of pixels
 
 
-def test_superpixels_as_asked_for(small: Scene) -> None:
-    asked = collect("room", small, {"half": small.gaussians[::2]}, (2, 1), segmentation=SegmentOptions(superpixels=50))
-    assert asked.num_superpixels == (50, 50)
+def test_without_photos_there_are_no_superpixels(small: Scene) -> None:
     none = collect("room", replace(small, images=None, pixel_ids=None), {"half": small.gaussians[::2]}, (2, 1))
     assert none.num_superpixels is None
     assert {view.outlines for view in none.views} == {None}

@@ -17,7 +17,7 @@ from page_policy import check_policy
 from gsmerge.measure.evaluate import Quality
 from gsmerge.measure.fog import Fog
 from gsmerge.pages.data import ViewData, collect
-from gsmerge.pages.page import headline, results_table, view_page
+from gsmerge.pages.page import headline, results_table, speed, speed_words, view_page
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 WEBP = "data:image/webp;base64,"
@@ -83,7 +83,7 @@ def test_what_the_script_reads(page: str, data: ViewData) -> None:
         assert base64.b64decode(address.removeprefix(WEBP)) == data.views[1].stills[still]
     assert base64.b64decode(stills[0][2].removeprefix(WEBP)) == data.views[0].stills[1]
     outlines = json.loads(block(page, "outline-pictures"))
-    assert [one and base64.b64decode(one.removeprefix("data:image/png;base64,")) for one in outlines] == [
+    assert [one and base64.b64decode(one.removeprefix("data:image/webp;base64,")) for one in outlines] == [
         view.outlines for view in data.shown
     ]
     assert page.index("data:image/webp") < page.index("<script")
@@ -106,11 +106,11 @@ def test_a_table_over_all_results(data: ViewData) -> None:
         three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:])
     )
     head, rows = results_table(three)
-    assert head == ["", "Gaussians", "Share", "File", "PSNR (dB)", "SSIM", "LPIPS", "Near fog", "Far fog", "Holes"]
-    assert rows[0] == ["input", "1,000", "100.0 %", "2.0 MB", "20.00", "0.500", "-", "-", "-", "-"]
-    assert rows[1][:8] == ["half", "500", "50.0 %", "2.0 kB", "25.00", "0.750", "-", "0.250"]
+    assert head == ["", "File", "PSNR (dB)", "SSIM", "LPIPS", "Gaussians", "Share", "Near fog", "Far fog", "Holes"]
+    assert rows[0] == ["input", "2.0 MB", "20.00", "0.500", "-", "1,000", "100.0 %", "-", "-", "-"]
+    assert rows[1][:8] == ["half", "2.0 kB", "25.00", "0.750", "-", "500", "50.0 %", "0.250"]
     assert rows[1][-1] == "0.013"
-    assert [row[:3] + row[6:7] for row in rows[2:]] == [
+    assert [row[:1] + row[5:7] + row[4:5] for row in rows[2:]] == [
         ["tenth", "100", "10.0 %", "0.250"],
         ["least", "10", "1.0 %", "0.250"],
     ]
@@ -121,7 +121,7 @@ def test_a_table_over_all_results(data: ViewData) -> None:
 
 def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
     sides = tuple(replace(side, mean=Quality(), fog=None) for side in data.sides)
-    assert results_table(replace(data, sides=sides))[0] == ["", "Gaussians", "Share", "File"]
+    assert results_table(replace(data, sides=sides))[0] == ["", "File", "Gaussians", "Share"]
 
 
 def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
@@ -131,9 +131,47 @@ def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
     assert tenth["figures"][2:] == [["19.00 dB", False], ["0.500", False]]
     assert [one["headline"].split("\u00a0")[0] for one in (half, tenth, least)] == ["50.0", "10.0", "1.0"]
     assert "farther" in tenth["headline"]
-    choice = re.findall('<select id="result".*?</select>', page, re.DOTALL)[0]
-    assert re.findall('value="(.)">(.*?)<', choice) == [("2", "half"), ("3", "tenth"), ("4", "least")]
-    assert '<select id="result"' not in view_page(data)
+    assert '<select id="result"' not in page
+
+
+def test_the_slider_is_over_sizes(data: ViewData) -> None:
+    """From the smallest to the largest; it begins at the first result, and one result has none."""
+    page = view_page(with_three_results(data))
+    read = json.loads(block(page, "data"))
+    assert read["sizes"] == [4, 3, 2]
+    assert [one["words"] for one in read["results"]] == [
+        "50.0\u00a0% · 2.0 kB · 25.0\u00a0dB", "10.0\u00a0% · 400 B · 19.0\u00a0dB", "1.0\u00a0% · 400 B · 19.0\u00a0dB"
+    ]  # fmt: skip
+    assert re.findall('<input id="size"[^>]* max="(.)" value="(.)">', page) == [("2", "2")]
+    assert '<input id="size"' not in view_page(data)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (0.27, 0.03, ", 9\u00a0\u00d7\u00a0faster to draw"),
+        (0.03, 0.02, ", 1.5\u00a0\u00d7\u00a0faster to draw"),
+        (0.03, 0.03, ""),
+    ],
+)
+def test_how_much_faster_it_draws(before: float, after: float, words: str, data: ViewData) -> None:
+    timed = replace(
+        data, sides=tuple(replace(side, seconds=one) for side, one in zip(data.sides, (before, after), strict=True))
+    )
+    assert speed_words(speed(timed)) == words
+    assert f">{words}</span></h1>" in view_page(timed)
+    assert speed(replace(data, sides=data.sides[:1])) is None
+
+
+def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
+    bare = tuple(replace(side, dropped={}) for side in data.sides)
+    dropping = (bare[0], replace(bare[1], dropped={"sky": 12}))
+    views = tuple(replace(view, drops=(None, b"png")) for view in data.views)
+    page = view_page(replace(data, sides=dropping, views=views))
+    assert 'data-set="drops"' in page
+    assert json.loads(block(page, "drop-pictures"))[0] == [None, None, "data:image/png;base64,cG5n"]
+    assert json.loads(block(page, "data"))["sources"][2]["dropped"] == {"sky": 12}
+    assert 'data-set="drops"' not in view_page(replace(data, sides=bare))
 
 
 def test_colours_are_readable_in_both_schemes(page: str) -> None:

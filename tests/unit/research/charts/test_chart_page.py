@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments import make_grid, make_proxies
+from experiments import make_grid
 
 from gsmerge.research.charts.chart_page import make_page, make_table
 from gsmerge.research.charts.figures import draw_figures, make_figures
@@ -59,7 +59,6 @@ def outline(page: str) -> Outline:
 
 
 def page_of(records: list[RunRecord], folder: Path, most_figures: int = 1) -> str:
-    records = [*records, *make_proxies()]
     figures = make_figures(Results(records))[-most_figures:]
     return make_page(records, figures, draw_figures(figures, folder / "charts"), folder, "gsmerge lab chart")
 
@@ -90,17 +89,17 @@ def test_the_page_fetches_nothing(page: str) -> None:
 def test_every_reference_inside_the_page_is_there(page: str) -> None:
     actual = outline(page)
     inside = {value[1:] for value in actual.fetched if value.startswith("#")}
-    assert len(inside) == 7
+    assert len(inside) == 6
     assert inside - set(actual.ids) == set()
 
 
 def test_the_page_says_what_was_found(page: str) -> None:
-    assert f"{54 + len(make_proxies())} runs on 3 scene(s): apples, fern, fox" in page
+    assert "54 runs on 3 scene(s): apples, fern, fox" in page
     assert "PSNR (dB) at equal size: no baseline&#39;s point lies above ours (6 points; 6 below ours" in page
     assert "gsmerge lab chart scenes --grid budget=1%,4.4%" in page
     assert "<td>processor</td><td>one</td>" in page
     assert "Failed runs" not in page
-    for title in ("Results", "At equal cost", "Quality against time", "Superpixels alone", "When merging pays"):
+    for title in ("Results", "At equal cost", "Quality against time", "When merging pays"):
         assert f">{title}</h2>" in page
 
 

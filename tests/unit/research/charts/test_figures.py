@@ -7,7 +7,7 @@ from pathlib import Path
 
 import matplotlib
 import pytest
-from experiments import make_grid, make_proxies, make_record
+from experiments import make_grid, make_record
 from matplotlib.axes import Axes
 from sweeps import sweep
 
@@ -26,7 +26,7 @@ from gsmerge.research.charts.lines import Interval, Line, Point, Results
 from gsmerge.research.charts.measure_run import RunRecord
 
 METHODS = ("gsmerge", "voxel")
-NAMES = ["quality-seconds", "quality-ratio", "stages", "proxy", "count-views", "quality-views", "break-even"]
+NAMES = ["quality-seconds", "quality-ratio", "stages", "count-views", "quality-views", "break-even"]
 
 
 def figures_of(records: list[RunRecord]) -> list[Figure]:
@@ -34,7 +34,7 @@ def figures_of(records: list[RunRecord]) -> list[Figure]:
 
 
 def test_all_figures() -> None:
-    figures = figures_of([*make_grid(), *make_proxies()])
+    figures = figures_of(make_grid())
     assert [figure.name for figure in figures] == NAMES
     assert all("3 scenes" in f.caption or "3 scene(s)" in f.caption for f in figures)
     assert all(len(row) == len(f.head) for f in figures for row in f.rows)
@@ -46,8 +46,6 @@ def test_all_figures() -> None:
     assert even.bars["frames"][0] == 110  # 6 s are 109.1 times 55 ms
     assert even.rows[0] == ("gsmerge", "6.00", "5.0", "110")
     assert [line.name for line in counts.panels[0].lines] == ["gsmerge", "gsmerge, no fit", "input"]
-    assert [line.name for line in by_name["proxy"].panels[0].lines][:2] == ["rdseg", "bass-adaptive"]
-    assert by_name["proxy"].panels[0].lines[0].points[2].x == pytest.approx(1000)
 
 
 def test_bars_and_break_even_are_over_the_same_scenes() -> None:
@@ -72,7 +70,6 @@ def test_figures_need_their_data() -> None:
     alone = figures_of([make_record("fern", "gsmerge")])
     assert [f.name for f in alone] == ["quality-seconds", "quality-ratio", "stages"]
     assert "one scene has no intervals" in alone[0].caption
-    assert [f.name for f in figures_of(make_proxies())] == ["proxy"]
 
 
 @pytest.mark.parametrize("count", [1, 3, 10, 25])

@@ -1,4 +1,4 @@
-"""Runs: records that come back whatever is beside them, measurements, pictures and superpixels alone."""
+"""Runs: records that come back whatever is beside them, measurements and pictures."""
 
 from __future__ import annotations
 
@@ -13,21 +13,13 @@ import pytest
 import scenes
 from experiments import make_record
 
-import gsmerge
 from gsmerge.batch.records import DONE, FAILED, RECORDS, record
 from gsmerge.io.jsonl import append_line
-from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.measure_run import (
-    SEGMENTATIONS,
-    SHARES,
-    ChartRun,
     RunRecord,
     keep_pictures,
-    proxy_psnr,
     read_runs,
 )
-from gsmerge.scene.files import find_scene_files
-from gsmerge.settings.compact import CompactOptions
 
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:
@@ -107,19 +99,3 @@ def test_units_change_no_picture(factor: float, tmp_path: Path) -> None:
     usual, other = (cv2.imread(str(paths[0])) for paths, _ in pictures)
     assert usual.mean() > 20
     assert np.abs(usual.astype(int) - other).mean() < 1
-
-
-def test_superpixels_alone_are_measured_on_photos(made_scene: Path, tmp_path: Path) -> None:
-    images = gsmerge.read_scene(made_scene).images
-    coarse, fine = (proxy_psnr(images[0], count, "rdseg") for count in (20, 600))
-    assert 10 < coarse < fine - 3
-    run = ChartRun(
-        RunRecord("room", "superpixels", method="superpixels", views_asked=1), CompactOptions(), EvaluateOptions()
-    )
-    report, pictures = run.run(find_scene_files(made_scene), tmp_path / "superpixels", 1)
-    scores = report["run"]["scores"]
-    assert len(scores) == len(SEGMENTATIONS) * len(SHARES)
-    assert scores["rdseg 0.01"] > scores["slic 0.01"]
-    assert scores["rdseg 0.1"] > scores["rdseg 0.01"]
-    assert [path.name for path in pictures] == ["superpixels.0.render.jpg"]
-    assert pictures[0].stat().st_size > 100

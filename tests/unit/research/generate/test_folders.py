@@ -107,7 +107,7 @@ def test_what_is_there_is_kept_and_the_rest_added(folder: Path, tmp_path: Path) 
 def test_other_scenes_and_strangers_are_not_replaced(tmp_path: Path) -> None:
     generate(tmp_path, 1, TINY)
     before = contents(tmp_path)
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="--set overwrite=true"):
         generate(tmp_path, 1, TINY, seed=5)
     assert contents(tmp_path) == before
     generate(tmp_path, 1, TINY, seed=5, overwrite=True)
@@ -123,7 +123,7 @@ def test_other_scenes_and_strangers_are_not_replaced(tmp_path: Path) -> None:
 def test_a_damaged_record_is_no_scene(tmp_path: Path) -> None:
     generate(tmp_path, 1, TINY)
     (tmp_path / "scene_0000" / "generated.json").write_text("[")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="--set overwrite=true"):
         generate(tmp_path, 1, TINY)
 
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from messages import refuses
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.errors import SceneError
 from gsmerge.geometry import project, quat_to_rotmat
 from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.research.generate import GenerateOptions, NoiseOptions, read_ranges
+from gsmerge.research.generate import GenerateOptions, NoiseOptions
 from gsmerge.research.generate.noise import (
     ERRORS,
     Noise,
@@ -170,13 +168,3 @@ def test_what_is_drawn_lies_in_the_ranges() -> None:
 def test_settings_that_make_no_sense_are_refused(kind: type, name: str, value: object) -> None:
     with refuses(ValueError, name, value):
         kind(**{name: value})
-
-
-def test_ranges_come_from_files(tmp_path: Path) -> None:
-    path = tmp_path / "ranges.json"
-    path.write_text('{"grain": [0.001, 0.002], "sh_degrees": [0], "constant_opacity": 0}')
-    assert read_ranges(path) == NoiseOptions(grain=(0.001, 0.002), sh_degrees=(0,), constant_opacity=0)
-    for text in ('{"grian": [0, 1]}', '{"grain": 3}', '{"grain": ["a", 1]}', '{"grain": [2, 1]}'):
-        path.write_text(text)
-        with pytest.raises(SceneError, match=r"docs/internals/lab\.md"):
-            read_ranges(path)

@@ -10,7 +10,6 @@ import pytest
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
     Light,
-    LitScene,
     Pinhole,
     Stage,
     develop,
@@ -72,7 +71,7 @@ def test_a_thing_throws_shade_on_the_ground() -> None:
     view = light_stage(stage(ground, box((-0.5, -1, -0.5), (0.5, -0.6, 0.5), LOOK)))
     from_side = look_at(np.array([0.0, -0.45, -3.0]), np.array([0.0, 0.0, 0.0]))
     lens = Pinhole(60, 60, 60.0)
-    image, hits = radiance(LitScene((view,)), from_side, lens, 1), trace(view.shapes, from_side, lens, 1)
+    image, hits = radiance(view, from_side, lens, 1), trace(view.shapes, from_side, lens, 1)
     y, x = np.mgrid[:60, :60] + 0.5
     rays = np.stack([(x - 30) / 60, (y - 30) / 60, np.ones_like(x)], -1) @ from_side[:3, :3].T
     world = from_side[:3, 3] + rays * hits.depth[..., None]

@@ -14,7 +14,7 @@ from messages import refuses
 from re10k_chunks import entry, save, torch
 from scenes import arc, make_scene, room
 from tiny_scene import Tiny
-from training_runs import OPTIONS, PAPER, written
+from training_runs import PAPER, written
 
 from gsmerge.errors import SceneError
 from gsmerge.facts.views import subset
@@ -84,7 +84,7 @@ def files(out: Path) -> dict[str, bytes]:
 
 def test_every_draw_is_predicted_from_its_own_views(scene: Scene, data: Path) -> None:
     guess, rng = Guess(scene), np.random.default_rng(0)
-    (capture,) = bind_backbone(list_captures(data), guess, PAPER)
+    (capture,) = bind_backbone(list_captures(data), guess)
     for draw in range(12):
         example = capture.draw(PAPER, rng)
         ids = guess.calls[draw]
@@ -105,7 +105,7 @@ def test_every_draw_is_predicted_from_its_own_views(scene: Scene, data: Path) ->
 
 def test_without_random_views_subsets_are_spread(scene: Scene, data: Path) -> None:
     guess, rng = Guess(scene), np.random.default_rng(0)
-    (capture,) = bind_backbone(list_captures(data), guess, PAPER)
+    (capture,) = bind_backbone(list_captures(data), guess)
     options = replace(PAPER, random_views=(), views=(2, 3), photo_side=16)
     sizes = {capture.draw(replace(options, photo_side=0), rng).images.shape[1:3] for _ in range(8)}
     assert set(guess.calls) == {(0, 7), (0, 4, 7)}
@@ -127,7 +127,7 @@ def test_pixels_may_lack_a_gaussian(scene: Scene, data: Path) -> None:
         means[::7] = np.nan
         return replace(guess(images, cameras).numpy(), means=means)
 
-    (capture,) = bind_backbone(list_captures(data), with_holes, PAPER)
+    (capture,) = bind_backbone(list_captures(data), with_holes)
     example = capture.draw(PAPER, np.random.default_rng(0))
     assert not example.members.opacities[::7].any()
     assert np.isfinite(example.base.means).all()
@@ -190,8 +190,6 @@ def test_what_cannot_be_trained_on_is_refused(scene: Scene, data: Path, tmp_path
     captures = list_captures(data)
     with refuses(ValueError, "backbone", "room"):
         train(captures, [], tmp_path, RUN)
-    with refuses(ValueError, "captures", "regression_weight"):
-        train(captures, [], tmp_path, OPTIONS, backbone=Guess(scene))
     with refuses(ValueError, "backbone", "room", 10):
         train(captures, [], tmp_path, RUN, backbone=lambda *_: scene.gaussians[:10])
 

@@ -25,11 +25,11 @@ from gsmerge.research.training.predict import (
     differentiate_axes,
     features_to_arrays,
     features_to_tensors,
-    match_crop,
     pool_tensors,
     predict,
 )
 from gsmerge.research.training.windows import Crop, whole_photo
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, pool_runs
 from gsmerge.types import FeatureGaussians, Matches, as_array
 
@@ -113,16 +113,15 @@ def test_axes_turn_with_their_covariance() -> None:
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    """Two views in which every cluster is known, so that no step changes a choice."""
-    whole = make_example(make_training_scene(make_scene(room(), arc(2, 24, 18)), range(2)), PAPER, 0.1, "room")
-    matches = match_crop(whole_photo(whole, 0).crop, whole.features, PAPER)
-    assert matches.count < len(whole.features)
-    return replace(whole, matches=matches)
+    return make_example(make_training_scene(make_scene(room(), arc(2, 24, 18)), range(2)), PAPER, 0.1, "room")
 
 
 @pytest.fixture
-def fixed_choices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neighbours, and what other views say of a group, stay as they were first: they jump, and have no gradient."""
+def fixed_choices(example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clusters, neighbours, and what other views say of a group, stay: they jump, and have no gradient."""
+    matches = match(example.features, PAPER.match_options())
+    assert matches.count < len(example.features)
+    monkeypatch.setattr("gsmerge.research.training.predict.match", lambda *_: matches)
 
     def keep(module: object, name: str) -> None:
         first, function = dict[int, np.ndarray](), getattr(module, name)

@@ -19,17 +19,17 @@ from gsmerge.research.training import Example, make_example, make_training_scene
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
 from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.predict import Prediction, match_crop, predict
-from gsmerge.research.training.windows import Window, sample_window, whole_photo
+from gsmerge.research.training.predict import Prediction, predict
+from gsmerge.research.training.windows import Window, sample_window
+from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
-from gsmerge.types import SH_C0, Gaussians, Matches
+from gsmerge.types import SH_C0, Gaussians
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    """Without a fit, so in a moment."""
     return make_example(make_training_scene(make_scene(room(), arc(4, 48, 36)), range(4)), PAPER, 0.1, "room")
 
 
@@ -37,15 +37,6 @@ def windows(example: Example, count: int) -> list[Window]:
     rng = np.random.default_rng(0)
     drawn = (draw_views(example, PAPER, rng) for _ in range(count))
     return [sample_window(part, PAPER.levels, PAPER.window, PAPER.most, 0.5, rng) for part in drawn]
-
-
-def test_no_fit_where_no_loss_uses_it(example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (example.matches, example.targets) == (None, {})
-    monkeypatch.setattr("gsmerge.research.training.targets.fit_full", lambda *_, **__: pytest.fail("a fit"))
-    training = make_training_scene(make_scene(room(), arc(2, 32, 24)), range(2))
-    make_example(training, replace(preset_options("paper"), lpips_weight=0.0), 0.1, "room")
-    with pytest.raises(BaseException, match="a fit"):
-        make_example(training, replace(preset_options("default"), fit_steps=2), 0.1, "room")
 
 
 def test_photos_have_the_longer_side_that_is_asked_for() -> None:
@@ -90,11 +81,10 @@ def test_some_views_of_an_example_are_an_example_of_some_views(example: Example)
 
 def test_the_preset_s_examples_have_clusters(example: Example) -> None:
     """Boxes of one surface that is seen from two places hardly ever share 0.7, which was their limit once."""
-    crop = whole_photo(example, 0).crop
     paper = preset_options("paper")
-    sizes = np.bincount(match_crop(crop, example.features, paper).clusters)
+    sizes = np.bincount(match(example.features, paper.match_options()).clusters)
     assert float(sizes[sizes > 1].sum()) > 0.1 * len(example.features)
-    strict = np.bincount(match_crop(crop, example.features, replace(paper, iou=0.7)).clusters)
+    strict = np.bincount(match(example.features, replace(paper, iou=0.7).match_options()).clusters)
     assert int(strict[strict > 1].sum()) < 0.5 * int(sizes[sizes > 1].sum())
     shares = [predict(window.crop, noisy_networks(TINY), PAPER, 0).matched for window in windows(example, 12)]
     assert max(shares) > 0.1
@@ -104,7 +94,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
     networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()
     for window in windows(example, 4):
-        loss = window_loss(networks, window, {}, PAPER, 0, np.random.default_rng(0)).total
+        loss = window_loss(networks, window, PAPER, 0, np.random.default_rng(0)).total
         names, parameters = zip(*networks.named_parameters(), strict=True)
         for name, part in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
             if part is not None:
@@ -125,15 +115,13 @@ def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Pa
         if name.startswith("merger"):
             assert not np.array_equal(start, after.arrays[name]), name
     assert np.abs(after.arrays["merger.out.weight"]).max() > 1e-4
-    assert done.validation_loss is None
     header = (tmp_path / "run" / "losses.csv").read_text().splitlines()[0]
     assert header == "step,rate,loss,diversity_share,psnr_analytic,psnr_learned,matched"
 
 
 def teacher_of(example: Example) -> Prediction:
     """The Gaussians of the paper's two equations, by hand, for a whole example."""
-    crop, m = whole_photo(example, 0).crop, example.members
-    merged = merge(example.features, match_crop(crop, example.features, PAPER))
+    m, merged = example.members, merge(example.features, match(example.features, PAPER.match_options()))
     means, covars, colors = [], [], []
     for first, last in zip(merged.starts[:-1].tolist(), merged.starts[1:].tolist(), strict=True):
         ids = merged.members[first:last]
@@ -155,8 +143,7 @@ def teacher_of(example: Example) -> Prediction:
         torch.from_numpy(1 - np.exp(-depths)).float().clamp(0, MAX_OPACITY),
         torch.from_numpy(np.stack(colors)).float()[:, None], torch.zeros(count, 0, 3),
     )  # fmt: skip
-    frames, sizes = torch.eye(3).expand(count, 3, 3), torch.ones(count)
-    return Prediction(gaussians, torch.arange(count), merged, frames, sizes, Matches(np.arange(count), count), 0.0)
+    return Prediction(gaussians, torch.arange(count), merged, torch.ones(count), 0.0)
 
 
 def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:

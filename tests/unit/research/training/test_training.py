@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from messages import refuses
 from scenes import arc, make_scene, room
-from training_runs import OPTIONS, TINY, noisy_networks, torch, written
+from training_runs import OPTIONS, TINY, torch, written
 
 from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.networks.corrections import LOGIT, residual_limits
+from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.options import Bounds
-from gsmerge.networks.tensors import move_tensors
 from gsmerge.research.training import (
     Example,
     Shard,
@@ -24,13 +23,8 @@ from gsmerge.research.training import (
     preset_options,
     train,
 )
-from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.predict import analytic_gaussians, crop_targets, merged_rows, predict
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
-from gsmerge.research.training.targets import corrections_between
-from gsmerge.research.training.windows import Crop, sample_crop
 from gsmerge.settings.setting import change_settings
-from gsmerge.stages.merge import merge
 from gsmerge.types import Scene
 
 
@@ -56,81 +50,19 @@ def shard(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Shard:
     return written(example, tmp_path_factory.mktemp("shards"))
 
 
-def everything(example: Example, k: int) -> Crop:
-    rows = np.arange(len(example.features))
-    return Crop(example, k, rows, np.ones(len(rows), bool))
-
-
 def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
 
 
-def test_targets_lead_from_the_start_to_the_fit(example: Example) -> None:
-    """Each analytic child has one, in the order that children come in."""
-    for k, targets in example.targets.items():
-        analytic = analytic_gaussians(everything(example, k), example.matches)
-        assert len(analytic) == len(targets.parents) == len(targets.mask)
-        assert targets.mask.any()
-        assert targets.corrections[targets.mask].any(1).all()
-        assert not targets.corrections[~targets.mask].any()
-        assert np.bincount(targets.parents).max() == k
-
-
-def test_differences_undo_corrections(example: Example) -> None:
-    start = analytic_gaussians(everything(example, 1), example.matches).to("cpu")
-    start = replace(start, opacities=start.opacities.clamp(0.1, 0.9))
-    raw = torch.randn(len(start), 13, generator=torch.Generator().manual_seed(0))
-    frames = torch.linalg.qr(torch.randn(len(start), 3, 3, generator=torch.Generator().manual_seed(1)))[0]
-    frames = frames * torch.linalg.det(frames)[:, None, None]
-    expected = 0.5 * torch.from_numpy(residual_limits(TINY.bounds))[:13] * raw.tanh()
-    actual = corrections_between(start, move_tensors(start, expected, frames), frames)
-    torch.testing.assert_close(actual, expected, atol=2e-4, rtol=1e-3)
-
-
-def test_rows_after_merging(example: Example) -> None:
-    rows, merged = merged_rows(example.matches), merge(example.features, example.matches)
-    weights = np.bincount(rows, example.features.weights)
-    np.testing.assert_allclose(weights, merged.weights, rtol=1.3e-6, atol=1e-5)
-    assert len(merged) < len(example.features)
-
-
-def test_crops_hold_whole_clusters_and_their_targets(example: Example) -> None:
-    sizes = np.bincount(example.matches.clusters)
-    rows = merged_rows(example.matches)
-    for seed in range(4):
-        crop = sample_crop(example, (2,), 40, 0.5, np.random.default_rng(seed))
-        inside = np.bincount(example.matches.clusters[crop.rows], minlength=len(sizes))
-        assert ((inside == 0) | (inside == sizes)).all()
-        corrections, scored = crop_targets(crop)
-        prediction = predict(crop, Networks(TINY), OPTIONS, 0)
-        assert len(prediction.gaussians) == len(corrections) == len(scored)
-        expected = np.isin(example.targets[2].parents, rows[crop.rows])
-        np.testing.assert_array_equal(corrections, example.targets[2].corrections[expected])
-        assert 0 < int(scored.sum()) < int(example.targets[2].mask[expected].sum())
-
-
-def test_a_crop_alone_is_like_the_middle_of_a_larger_one(example: Example) -> None:
-    networks = noisy_networks(TINY)
-    small = sample_crop(example, (1,), 90, 0.1, np.random.default_rng(3))
-    with torch.no_grad():
-        whole = predict(everything(example, 1), networks, OPTIONS, 0)
-        some = predict(small, networks, OPTIONS, 0)
-    rows = merged_rows(example.matches)
-    kept = np.unique(rows[small.rows])
-    inner = np.isin(kept, rows[small.rows[small.inner]])
-    torch.testing.assert_close(some.gaussians.means[inner], whole.gaussians.means[kept][inner], atol=1e-5, rtol=1e-4)
-
-
-def test_training_lowers_the_loss(shard: Shard, tmp_path: Path) -> None:
+def test_a_run_has_a_table_and_the_best_checkpoint(shard: Shard, tmp_path: Path) -> None:
     options = replace(OPTIONS, steps=21, save_every=7)
     done = train([shard], [], tmp_path, options)
     rows = list(csv.DictReader((tmp_path / "losses.csv").read_text().splitlines()))
     assert [int(row["step"]) for row in rows] == [7, 14, 21]
-    losses = [float(row["validation_loss"]) for row in rows]
-    assert losses[-1] < losses[0]
-    assert done.validation_loss == pytest.approx(min(losses))
-    assert float(rows[-1]["explained_size"]) > 0.3
+    learned = [float(row["psnr_learned"]) for row in rows]
+    assert done.psnr_learned == pytest.approx(max(learned))
     best = load_checkpoint(done.best)
+    assert best.training["step"] == 7 * (learned.index(max(learned)) + 1)
     assert best.networks.options == TINY
     assert best.training["data"] == [shard.sha256]
     assert best.training["options"] == options.to_dict()
@@ -184,7 +116,6 @@ def test_settings_are_checked(tmp_path: Path) -> None:
         {"seed": 1.5},
         {"views": ()},
         {"views": (-1,)},
-        {"photo_start": 1.5},
         {"novel": -0.1},
         {"photo_scale": 0},
         {"window": 5},
@@ -196,8 +127,7 @@ def test_settings_are_checked(tmp_path: Path) -> None:
         {"overlap": 2},
         {"iou": -0.1},
         {"photo_side": -1},
-        {"random_views": (1, 2)},  # with a fit
-        {"random_views": (3, 2), "photo_start": 0.0, "regression_weight": 0.0},
+        {"random_views": (3, 2)},
     ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             replace(OPTIONS, **wrong)
@@ -224,12 +154,11 @@ def test_presets_are_settings() -> None:
     paper = preset_options("paper")
     assert (paper.photo_loss, paper.photo_weight, paper.ssim_weight, paper.lpips_weight) == ("mse", 1, 0.05, 0.05)
     assert (paper.teacher_weight, paper.diversity_weight, paper.steps) == (0.25, 1, 300_000)
-    assert (paper.rate_at(1999), paper.photo_step, paper.clip) == (5e-5, 0, 10)
+    assert (paper.rate_at(1999), paper.clip) == (5e-5, 10)
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
     assert preset_options("default") == TrainOptions()
     network = replace(paper.network, width=16, bounds=Bounds(mean=0.5))
     assert change_settings(paper, {"steps": 10, "width": 16, "mean": 0.5}) == replace(paper, steps=10, network=network)
-    assert not paper.uses_fit
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1
     shipped = preset_options("shipped")
@@ -241,15 +170,10 @@ def test_presets_are_settings() -> None:
 
 
 def test_what_holds_the_gaussians_fades() -> None:
-    options = replace(
-        OPTIONS, steps=100, photo_start=0.2, regression_weight=0.8, teacher_weight=0.25, teacher_steps=10,
-        diversity_weight=1.0, diversity_steps=1000,
-    )  # fmt: skip
-    assert options.photo_step == 20
-    assert options.regularizer_weights(20) == (0.8, 0.25, 1)
-    assert options.regularizer_weights(25) == pytest.approx((0.75, 0.125, 0.995))
-    assert options.regularizer_weights(60) == pytest.approx((0.4, 0, 0.96))
-    assert replace(options, photo_start=1.0).photo_step == 100
+    options = replace(OPTIONS, teacher_weight=0.25, teacher_steps=10, diversity_weight=1.0, diversity_steps=1000)
+    assert options.regularizer_weights(0) == (0.25, 1)
+    assert options.regularizer_weights(5) == pytest.approx((0.125, 0.995))
+    assert options.regularizer_weights(40) == pytest.approx((0, 0.96))
 
 
 def test_device_of_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
