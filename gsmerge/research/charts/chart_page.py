@@ -15,7 +15,6 @@ from gsmerge.research.charts.lines import (
     Interval,
     Results,
     line_key,
-    make_verdict_tables,
     ours_first,
     size_label,
 )
@@ -48,7 +47,6 @@ def make_page(
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],
         results=_results(results),
-        verdicts=_verdicts(results),
         figures=[(figure, data_uri(drawings[figure.name], "image/svg+xml")) for figure in figures],
         views=_views(results, folder),
         max_error=MAX_ERROR,
@@ -97,28 +95,6 @@ def _results(results: Results) -> Table:
             row.append(mean if interval is None else _interval(interval, digits))
         rows.append(row)
     return ("Method", "Size", "Scenes", *COSTS, *(METRICS[metric].label for metric in results.metrics)), rows
-
-
-def _verdicts(results: Results) -> list[tuple[str, Table]]:
-    """State whether any baseline's point lies above ours, and list the points."""
-    head = ("Baseline", "Size", "Cost", "Quality", "Ours there", "Ours ahead by", "Verdict")
-    tables: list[tuple[str, Table]] = []
-    for compared in make_verdict_tables(results):
-        words = [verdict.words for _, verdict in compared.rows]
-        above, digits = words.count("baseline above"), compared.decimals
-        answer = f"{above} baseline point(s) lie above ours" if above else "no baseline's point lies above ours"
-        sentence = (
-            f"{compared.title}: {answer} ({len(words)} points; {words.count('ours above')} below ours,"
-            f" {words.count('undecided')} undecided, {words.count('ours has none so cheap')} cheaper than anything of"
-            " ours, so not compared)."
-        )
-        rows = []
-        for label, verdict in compared.rows:
-            ahead = "" if verdict.ahead is None else _interval(verdict.ahead, digits)
-            quality = f"{verdict.quality:.{digits}f}", _number(verdict.ours, digits), ahead
-            rows.append((verdict.baseline, label, f"{verdict.cost:.4g}", *quality, verdict.words))
-        tables.append((sentence, (head, rows)))
-    return tables
 
 
 def _views(results: Results, folder: Path) -> list[tuple[str, list[tuple[str, str]], int]]:

@@ -1,11 +1,10 @@
-"""Lines over scenes from records: which runs belong together, means with intervals, and comparisons at equal cost."""
+"""Lines over scenes from records: which runs belong together, and means with intervals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,7 +19,6 @@ MIN_SCENES = 3  # scenes that an interval is shown of; that of two scenes is too
 MIN_SHARE = 0.5  # of the scenes that a point of a line must have
 MIN_SHARE_VIEWS = 0.4  # the same over the number of views: not all scenes have as many views
 TYPICAL_RATIO = 0.044  # share of the Gaussians: runs nearest it represent all sizes
-RATIOS = (0.0045, 0.22)  # of the points of baselines that are compared: 0.5 % to 20 %, with room for rounding
 SIZES = ("budget", "superpixels")  # settings that say how many Gaussians there will be
 ONE_SIZE = ("unmerged", "unmerged-fit")  # methods that keep all Gaussians
 PARTS = {  # what scores are means over, the most meaningful first
@@ -80,27 +78,6 @@ class Line:
     points: tuple[Point, ...]  # by ascending size or number of views
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """Comparison of one baseline point with our curve at the same cost."""
-
-    baseline: str  # name of the baseline's line
-    cost: float  # mean cost of the point
-    quality: float  # mean quality of the point, over the scenes where ours is known at that cost
-    ours: float | None  # our quality at the same cost; None where no scene has so cheap a result of ours
-    ahead: Interval | None  # our quality less the baseline's, paired by scene; None with ours
-    words: str  # ours above, baseline above, undecided or ours has none so cheap
-
-
-@dataclass(frozen=True)
-class VerdictTable:
-    """Comparisons of baseline points with our curve at equal cost."""
-
-    title: str  # metric and cost
-    rows: tuple[tuple[str, Verdict], ...]  # one per point of a baseline, with the label of its size
-    decimals: int  # of the metric
-
-
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
@@ -135,46 +112,6 @@ def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     halves = [factor * (interval.high - interval.mean) for interval in map(mean_interval, centred.T.tolist())]
     means = values.mean(0).tolist()
     return [Interval(mean, mean - half, mean + half, num_scenes) for mean, half in zip(means, halves, strict=True)]
-
-
-def quality_at(costs: Sequence[float], qualities: Sequence[float], cost: float) -> float | None:
-    """Interpolate the best quality at a cost, linearly in log cost; None below the cheapest point.
-
-    Costs are positive, and higher quality is better. Points with a higher cost and no better quality than another point
-    are ignored. Beyond the most expensive point the quality is constant.
-    """
-    if not len(costs) or cost < min(costs):
-        return None
-    order = np.lexsort((-np.asarray(qualities), np.asarray(costs)))
-    best = np.maximum.accumulate(np.asarray(qualities)[order])
-    front = np.diff(best, prepend=-math.inf) > 0
-    return float(np.interp(math.log(cost), np.log(np.asarray(costs)[order][front]), best[front]))
-
-
-def judge(
-    baseline: str, points: ByScene, ours: Mapping[str, Sequence[tuple[float, float]]], *, higher: bool = True
-) -> Verdict:
-    """Judge whether a baseline's point lies above our curve at equal cost, scene by scene.
-
-    ``points`` has the (cost, quality) of the baseline by scene, at least one; ``ours`` has all points of ours. A winner
-    is named only if zero lies outside the interval of the difference, or if the baseline has only one scene.
-    """
-    sign = 1.0 if higher else -1.0
-    our_qualities: dict[str, float] = {}
-    for scene, (cost, _) in points.items():
-        curve = ours.get(scene, ())
-        best = quality_at([c for c, _ in curve], [sign * q for _, q in curve], cost)
-        if best is not None:
-            our_qualities[scene] = best
-    cost = _mean_cost(points)
-    quality = float(np.mean([points[scene][1] for scene in our_qualities or points]))
-    if not our_qualities:
-        return Verdict(baseline, cost, quality, None, None, "ours has none so cheap")
-    ahead = paired_difference(our_qualities, {scene: sign * points[scene][1] for scene in our_qualities})
-    words = "ours above" if ahead.low > 0 else "baseline above" if ahead.high < 0 else "undecided"
-    if len(our_qualities) == 1 < len(points):  # one scene of several is no evidence for the others
-        words = "undecided"
-    return Verdict(baseline, cost, quality, sign * float(np.mean(list(our_qualities.values()))), ahead, words)
 
 
 def line_key(record: RunRecord) -> LineKey:
@@ -335,24 +272,3 @@ def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
         return paired_intervals(np.array(values, np.float64))
     means = [float(np.mean([y for _, y in column.values()])) for column in columns]
     return [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]
-
-
-def make_verdict_tables(results: Results) -> list[VerdictTable]:
-    """Compare baseline points with ours at equal time and at equal size, one table each."""
-    tables = []
-    for (cost, words), metric in product((("seconds", "time"), ("ratio", "size")), results.metrics):
-        score, ours = f"{metric}_{results.part}", dict[str, list[tuple[float, float]]]()
-        for record in results.runs:
-            at, value = record.value(cost), record.value(score)
-            if record.method == OURS and record.views_asked == results.views and at and value is not None:
-                ours.setdefault(record.scene, []).append((at, value))
-        rows = [
-            (point.label, judge(line.name, point.by_scene, ours, higher=METRICS[metric].higher))
-            for line in results.by_size(cost, score)
-            for point in line.points
-            if not line.ours and (cost != "ratio" or RATIOS[0] <= point.x <= RATIOS[1])
-        ]
-        if rows and ours:
-            title = f"{METRICS[metric].label} at equal {words}"
-            tables.append(VerdictTable(title, tuple(rows), METRICS[metric].digits))
-    return tables

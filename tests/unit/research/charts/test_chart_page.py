@@ -95,11 +95,10 @@ def test_every_reference_inside_the_page_is_there(page: str) -> None:
 
 def test_the_page_says_what_was_found(page: str) -> None:
     assert "54 runs on 3 scene(s): apples, fern, fox" in page
-    assert "PSNR (dB) at equal size: no baseline&#39;s point lies above ours (6 points; 6 below ours" in page
     assert "gsmerge lab chart scenes --grid budget=1%,4.4%" in page
     assert "<td>processor</td><td>one</td>" in page
     assert "Failed runs" not in page
-    for title in ("Results", "At equal cost", "Quality against time", "When merging pays"):
+    for title in ("Results", "Quality against time", "When merging pays"):
         assert f">{title}</h2>" in page
 
 

@@ -12,14 +12,11 @@ from messages import refuses
 
 from gsmerge.research.charts.lines import (
     Results,
-    judge,
     line_key,
     line_names,
-    make_verdict_tables,
     mean_interval,
     paired_difference,
     paired_intervals,
-    quality_at,
     size_label,
 )
 
@@ -108,23 +105,6 @@ def test_the_input_is_a_level() -> None:
     assert Results(make_grid()).input_mean(PSNR, ["unknown"]) is None
 
 
-def test_verdict_tables() -> None:
-    tables = make_verdict_tables(Results(make_grid()))
-    assert [t.title for t in tables[3:]] == [
-        "PSNR (dB) at equal size",
-        "SSIM at equal size",
-        "LPIPS (VGG) at equal size",
-    ]
-    assert [t.title.split(" at ")[1] for t in tables] == ["equal time"] * 3 + ["equal size"] * 3
-    assert {verdict.words for _, verdict in tables[0].rows} == {"ours has none so cheap"}
-    assert [label for label, _ in tables[3].rows] == ["1%", "4.4%", "20%"] * 2
-    for table in tables[3:]:
-        assert {verdict.words for _, verdict in table.rows} == {"ours above"}
-    voxel = tables[3].rows[1][1]
-    assert voxel.ahead.mean == pytest.approx(7)
-    assert make_verdict_tables(Results(r for r in make_grid() if r.method != "gsmerge")) == []
-
-
 @pytest.mark.parametrize(("count", "factor"), [(2, 12.706), (3, 4.303), (5, 2.776), (11, 2.228), (31, 2.042)])
 def test_t_factors_are_those_of_the_tables(count: int, factor: float) -> None:
     values = [0.0, 1.0] + [0.5] * (count - 2)
@@ -166,60 +146,3 @@ def test_paired_intervals_of_one_scene_or_one_condition() -> None:
     one_scene = paired_intervals(np.array([[1.0, 2.0]]))
     assert [(i.low, i.high) for i in one_scene] == [(1, 1), (2, 2)]
     assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
-
-
-def test_quality_between_beyond_and_below() -> None:
-    costs, qualities = [1.0, 100.0, 10.0], [20.0, 26.0, 22.0]
-    assert quality_at(costs, qualities, math.sqrt(10)) == pytest.approx(21)
-    assert quality_at(costs, qualities, 10) == pytest.approx(22)
-    assert quality_at(costs, qualities, 1e6) == 26
-    assert quality_at(costs, qualities, 0.99) is None
-    assert quality_at([], [], 1.0) is None
-    assert quality_at([1, 10, 100], [20, 25, 22], 100) == 25  # a worse and dearer point does not pull the front down
-
-
-def test_quality_at_a_point_is_the_best_of_those_as_cheap() -> None:
-    rng = np.random.default_rng(1)
-    costs, qualities = rng.integers(1, 9, 40).tolist(), rng.integers(1, 9, 40).tolist()
-    for i in range(40):
-        if all(qualities[j] < qualities[i] for j in range(40) if costs[j] < costs[i]):
-            best = max(qualities[j] for j in range(40) if costs[j] <= costs[i])
-            assert quality_at(costs, qualities, costs[i]) == best
-
-
-OURS = {scene: [(1.0, 20.0 + i), (10.0, 24.0 + i)] for i, scene in enumerate("abc")}
-
-
-@pytest.mark.parametrize(
-    ("shift", "words"),
-    [((-1.0, -1.1, -0.9), "ours above"), ((1, 1.1, 0.9), "baseline above"), ((-1, 1, 0), "undecided")],
-)
-def test_verdicts(shift: tuple[float, ...], words: str) -> None:
-    points = {scene: (10.0, 24.0 + i + shift[i]) for i, scene in enumerate("abc")}
-    actual = judge("voxel", points, OURS)
-    assert (actual.baseline, actual.words) == ("voxel", words)
-    assert actual.ahead.mean == pytest.approx(-np.mean(shift))
-    assert actual.ours == pytest.approx(25)
-    assert actual.quality == pytest.approx(25 + np.mean(shift))
-
-
-def test_verdicts_where_less_is_better() -> None:
-    ours = {"a": [(1.0, 0.3), (10.0, 0.2)]}
-    actual = judge("voxel", {"a": (10.0, 0.25)}, ours, higher=False)
-    assert actual.words == "ours above"
-    assert actual.ours == pytest.approx(0.2)
-    assert actual.quality == pytest.approx(0.25)
-    assert actual.ahead.mean == pytest.approx(0.05)
-
-
-def test_nothing_is_said_where_ours_has_nothing_as_cheap() -> None:
-    actual = judge("random", {"a": (0.1, 30.0)}, OURS)
-    assert (actual.ours, actual.ahead, actual.quality) == (None, None, 30)
-    assert actual.words == "ours has none so cheap"
-
-
-def test_one_scene_of_several_says_nothing() -> None:
-    curve = {"a": [(1.0, 20.0)], "b": [(9.0, 20.0)]}
-    actual = judge("voxel", {"a": (2.0, 15.0), "b": (2.0, 15.0)}, curve)
-    assert (actual.words, actual.ahead and actual.ahead.count) == ("undecided", 1)
-    assert judge("voxel", {"a": (2.0, 15.0)}, curve).words == "ours above"
