@@ -13,6 +13,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
+from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
@@ -112,9 +113,10 @@ def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileChe
     """Read the Gaussians of a scene, with the cameras and photos that belong to them."""
     load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
     info, views = load.info, load.views
+    notes, num_photos = (*load.notes, *degree_notes(info)), 0 if views.images is None else len(views.images)
     return FileCheck(
-        str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=tuple(load.notes),
-        num_views=len(views.cameras), num_photos=0 if views.images is None else len(views.images),
+        str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
+        num_views=len(views.cameras), num_photos=num_photos,
     )  # fmt: skip
 
 

@@ -40,12 +40,14 @@ from gsmerge.types import Gaussians, Scene
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
     from gsmerge.networks.weights import NetworkWeights
+    from gsmerge.raster.photos import PhotoScore
 
 AUTO_STEPS = 2  # times the usual steps with budget auto: fewer Gaussians cost less, and need them for detail
 SHORT_STEPS = 60  # of a fit that a better start still matters to
 MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians in the pixels
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
+KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -80,7 +82,8 @@ class Plan:
     fit: FitOptions  # Fit to the photos
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
-    target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target
+    target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
+    keeps_input: bool  # see :func:`keeps_input`
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
@@ -89,6 +92,7 @@ class Plan:
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+    before: PhotoScore | None = None  # Of the input, where photos and not pixels decide the count
 
     @property
     def networks(self) -> NetworkWeights | None:
@@ -111,11 +115,6 @@ class Plan:
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
-    def keeps_psnr(self) -> bool:
-        """Whether the target is that of :func:`kept_psnr`."""
-        return self.target_psnr is not None and self.settings["quality"] is None
-
-    @property
     def limits(self) -> CountLimits:
         """Limits of the number of Gaussians."""
         return self.superpixels.limits
@@ -136,7 +135,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     """
     scene, reference, size = prepared.scene, prepared.reference, prepared.size
     _check_photos(prepared, options)
-    target = options.budget.target_psnr or kept_psnr(size, options)
+    keeps = keeps_input(size, options)
+    target = KEPT_PSNR if keeps and size.rendered else options.budget.target_psnr
     cuts = options.method == OURS and size.num_views > 0  # views into superpixels
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
@@ -160,7 +160,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         fit = _fit_photos(prepared, options, choices.fit)
     tree = None
     budget = options.budget
-    searches = target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
+    searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
     if cuts and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
@@ -171,11 +171,12 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         clean=clean_options,
         unseen=unseen,
         target_psnr=target,
+        keeps_input=keeps,
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         size=file_size(options.budget),
-        scored_views=_choose_scored_views(prepared, decisive=target is not None),
+        scored_views=_choose_scored_views(prepared, decisive=keeps or target is not None),
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
@@ -192,7 +193,7 @@ class SceneChoices:
     match: Method  # Of merging across views
     checkpoint: str  # Name of the networks to load; "none"
     fit: FitOptions  # With the steps that are taken
-    kept_psnr: float | None  # see :func:`kept_psnr`
+    keeps_input: bool  # see :func:`keeps_input`
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
         """Return all settings by flat name, with the values that the plan chose."""
@@ -206,7 +207,7 @@ def choose_for_scene(
 
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
-    kept = kept_psnr(scene, options)
+    keeps = keeps_input(scene, options)
     if not scene.photos:
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
@@ -218,7 +219,7 @@ def choose_for_scene(
     fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, kept)
+    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
@@ -270,17 +271,18 @@ def _whole_needed(options: CompactOptions) -> list[str]:
     return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
 
 
-def kept_psnr(scene: SceneSize, options: CompactOptions) -> float | None:
-    """Return the PSNR (dB) from the input that decides the count; None where options, photos or pixels decide it.
+def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
+    """Return whether the count is the fewest that keep the input, as neither options nor pixels decide it.
 
-    A share of the Gaussians says little where they belong to no pixels: a scene that is compact already needs most of
-    its Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
+    Without photos the result has to be ``KEPT_PSNR`` from the input; with them it may show them ``KEPT_LOSS`` worse. A
+    share of the Gaussians says little where they belong to no pixels: a scene that is compact already needs most of its
+    Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
     asked = budget.quality is not None or budget.budget not in (None, AUTO, *DEVICES)
     asked |= options.segment.superpixels != SHARE or options.decode.k != AUTO or options.method != OURS
     asked |= options.checkpoint not in ("auto", "none")  # networks alone seldom come so near
-    return KEPT_PSNR if scene.rendered and not asked else None
+    return not (asked or scene.aligned or (budget.auto and not scene.rendered))
 
 
 def _check_photos(prepared: Prepared, options: CompactOptions) -> None:

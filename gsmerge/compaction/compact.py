@@ -12,7 +12,7 @@ from weakref import ref
 
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
-from gsmerge.compaction.search import level_counts, search_count
+from gsmerge.compaction.search import add_target, level_counts, search_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -73,9 +73,9 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene in one piece."""
     method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
     prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
-    plan = make_plan(prepared, options)  # every "auto" is decided once; options end here
+    plan = add_target(make_plan(prepared, options), prepared)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
-    trial = replace(plan, clean=CleanOptions()) if plan.keeps_psnr else plan  # what is left out would count as errors
+    trial = replace(plan, clean=CleanOptions()) if plan.keeps_input else plan  # what is left out would count as errors
     for count in search:
         search.add(build_scored(method.build, prepared, trial, count))
     rebuild = partial(build_scored, method.build, prepared, plan)

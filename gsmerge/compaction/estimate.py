@@ -17,7 +17,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import choose_for_scene, load_networks, resolve_budget, stands_alone
+from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, choose_for_scene, load_networks, resolve_budget, stands_alone
 from gsmerge.report import document_head
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.memory import human_bytes
@@ -35,8 +35,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` is a number, the fewest: more are
-        taken until the result is so many dB from the input; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` or ``loss_kept`` is a
+        number, the fewest: more are taken until the result is so many dB from the input, or shows the photos at most so
+        much worse; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
         known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
@@ -61,7 +62,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
-        "psnr_kept": choices.kept_psnr,
+        "psnr_kept": KEPT_PSNR if choices.keeps_input and size.rendered else None,
+        "loss_kept": KEPT_LOSS if choices.keeps_input and not size.rendered else None,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
@@ -87,6 +89,8 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
         method = "neighbours merged pair by pair, because no view is known"
     count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
     number = f"at most {count}" if kept is None else f"{count}, or more until {kept:g} dB from the input are kept"
+    if run["loss_kept"] is not None:
+        number = f"{count}, or more until the photos are shown within {run['loss_kept']:g} dB of the input"
     return [
         f"compact    {number},"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"

@@ -106,6 +106,7 @@ class Candidate:
     cameras: Cameras  # The given views as the Gaussians were made from them, in the world
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
+    kept_psnr: float | None = None  # The same over the pixels that the input covers, where it decides the count
 
 
 def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
@@ -116,30 +117,38 @@ def score(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> 
     gaussians, cameras = moved.frame.leave(gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         _note_moves(prepared, cameras, plan)
-    psnr = _measure_candidate(gaussians, moved, plan)
-    return Candidate(count, fitted, gaussians, cameras, psnr, current_record())
+    psnr, kept = _measure_candidate(gaussians, moved, plan)
+    return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), kept)
 
 
 def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
     """Replace a candidate's Gaussians by a subset, and measure it again."""
     with record_part() as record:
-        psnr = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
+        psnr, _ = _measure_candidate(gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
     return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
 
 
-def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> float | None:
-    """Measure the PSNR (dB) of Gaussians on the scored photos, or against renders of the input."""
+def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
+    """Measure the PSNR (dB) of Gaussians on the scored photos, or against renders of the input.
+
+    The second number is that of the pixels that decide the count.
+    """
     if moved.reference.name == RENDERS:
         fidelity = _fidelity(moved.frame.enter(gaussians), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
         choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
-        return fidelity
-    measured = measure_result(gaussians, moved, plan)
+        return fidelity, fidelity
+    measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)
     if measured is None:
-        return None
+        return None, None
     choose(scored_views=len(plan.scored_views))
-    return measured.psnr
+    return measured.psnr, measured.psnr if covers_all(plan.before) else measured.covered_psnr
+
+
+def covers_all(before: PhotoScore | None) -> bool:
+    """Return whether an input with this score is compared over whole pictures: it covers all of them, or nothing."""
+    return before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr)
 
 
 @stage("score")
@@ -200,7 +209,7 @@ def _score_photos(
     ``name``: name of the stage in the record.
     """
     with stage(name):
-        near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None
+        near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_input
         photos = scene_photos(views)
         return score_photos(gaussians, photos, plan.scored_views, quarter=quarter, near=near, covered=covered)
 
@@ -210,7 +219,7 @@ def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: P
 
     ``before`` is the score of the input.
     """
-    if before is None or before.share >= WHOLE or not math.isfinite(before.covered_psnr):
+    if before is None or covers_all(before):
         return None
     after = measure_result(gaussians, prepared, plan, before.covered)
     return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
@@ -226,11 +235,11 @@ def make_result(
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
     ``search`` are the facts of :meth:`gsmerge.compaction.search.CountSearch.facts`. The input is scored last, when
-    memory is free again. The report contains the seconds, choices and notes of the current record, followed by those of
-    the candidates.
+    memory is free again, unless the plan has its score. The report contains the seconds, choices and notes of the
+    current record, followed by those of the candidates.
     """
     run, seconds = current_record(), search["seconds"]
-    input_score = measure_input(prepared, plan)
+    input_score = measure_input(prepared, plan) if plan.before is None else plan.before
     before = None if input_score is None else input_score.psnr
     rendered = prepared.reference.name == RENDERS
     comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides

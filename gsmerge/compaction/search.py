@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
-from gsmerge.compaction.result import Candidate
+from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan
+from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import choose, record_part, report_progress, stage
@@ -40,6 +40,7 @@ KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaus
 SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
+PHOTOS_NEAR = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
 MAX_RUNS = 6
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
 FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
@@ -68,10 +69,11 @@ class CountSearch:
         """Yield counts; each candidate is added before the next one is asked for."""
         yield self.first
         target, limits = self.plan.target_psnr, self.plan.limits
-        usual = self.plan.keeps_psnr and not self.plan.auto_count
+        keeps = self.plan.keeps_input
+        usual = keeps and not self.plan.auto_count
         least = min(limits.default, limits.max_count) if usual else limits.min_count
-        most = limits.max_count if self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
-        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, 0.0)
+        most = limits.max_count if keeps or self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
+        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, PHOTOS_NEAR if keeps else 0.0)
         while target is not None and len(self.candidates) < MAX_RUNS:
             count = next_count(self.tried, target, least, most, *steps)
             if count in self.tried:
@@ -81,7 +83,7 @@ class CountSearch:
     @property
     def tried(self) -> dict[int, float]:
         """PSNR (dB) by count, in the order of the runs."""
-        return {candidate.count: candidate.psnr or 0.0 for candidate in self.candidates if candidate.count is not None}
+        return {run.count: run.kept_psnr or 0.0 for run in self.candidates if run.count is not None}
 
     def add(self, candidate: Candidate) -> None:
         """Add the candidate built for the last count."""
@@ -98,11 +100,14 @@ class CountSearch:
         return next(candidate for candidate in self.candidates if candidate.count == chosen)
 
     @property
+    def met(self) -> bool:
+        """Whether a candidate reaches the target."""
+        return self.plan.target_psnr is not None and max(self.tried.values()) >= self.plan.target_psnr
+
+    @property
     def unmet(self) -> str | None:
         """Reason why the target is not met; None if it is met."""
-        if self.plan.target_psnr is None or max(self.tried.values()) >= self.plan.target_psnr:
-            return None
-        if self.plan.keeps_psnr:
+        if self.plan.target_psnr is None or self.plan.keeps_input or self.met:
             return None
         psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
         reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
@@ -115,20 +120,36 @@ class CountSearch:
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
-            met = (best.psnr or 0.0) >= self.plan.target_psnr
-            choices["search"] = {"count": best.count, "psnr": best.psnr, "met": met, "tried": tried}
+            choices["search"] = {"count": best.count, "psnr": best.kept_psnr, "met": self.met, "tried": tried}
         return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
 
     @property
     def notes(self) -> list[str]:
         """Note that says how many Gaussians were kept by default, where they are more than usual."""
         count, limits = self.best.count or 0, self.plan.limits
-        if not self.plan.keeps_psnr or count <= limits.default:
+        if not self.plan.keeps_input or count <= limits.default:
             return []
-        kept, target = f"{count:,} of {limits.num_input:,} Gaussians", self.plan.target_psnr
+        kept = f"kept {count:,} of {limits.num_input:,} Gaussians"
+        short = f"be below {self.plan.target_psnr:g} dB from it"
+        good = f"are {self.plan.target_psnr:g} dB from the input or better"
+        if not self.rendered:
+            short = f"show the photos over {KEPT_LOSS:g} dB worse"
+            good = f"show the photos at most {KEPT_LOSS:g} dB worse than the input"
+        if not self.met:
+            return [f"{kept}: each of the {len(self.tried)} counts tried would {short}"]
         if count > MOSTLY * limits.num_input:
-            return [f"the scene is compact already: kept {kept}, since fewer would be below {target:g} dB from it"]
-        return [f"kept {kept}, about the fewest that are {target:g} dB from the input or better"]
+            return [f"the scene is compact already: {kept}, since fewer would {short}"]
+        return [f"{kept}, about the fewest that {good}"]
+
+
+def add_target(plan: Plan, prepared: Prepared) -> Plan:
+    """Return the plan with the PSNR that keeps the input, if photos show how good the input is."""
+    if not plan.keeps_input or plan.target_psnr is not None:
+        return plan
+    before = measure_input(prepared, plan)
+    assert before is not None, "a scene with photos"
+    psnr = before.psnr if covers_all(before) else before.covered_psnr
+    return replace(plan, before=before, target_psnr=psnr - KEPT_LOSS)
 
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:

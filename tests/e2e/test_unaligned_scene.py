@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +11,15 @@ import numpy as np
 import pytest
 import unaligned_scenes
 from messages import names
+from PIL import Image
 from plyfile import PlyData
 from sweeps import sweep
 
 import gsmerge
 from gsmerge import read_scene
+from gsmerge.compaction.search import MAX_RUNS
+from gsmerge.plan import KEPT_LOSS
+from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
@@ -57,6 +62,28 @@ def test_a_result_compacted_again_looks_as_it_did(
     shown = [gsmerge.render(gaussians, views).images.clip(0, 1) for gaussians in (before, after)]
     assert -10 * np.log10(np.square(shown[0] - shown[1]).mean((1, 2, 3))).mean() >= least
     assert len(after) < len(before)
+
+
+@pytest.mark.parametrize("odd", [0, 2])  # photos of another scene, which decide nothing
+def test_a_result_compacted_again_shows_the_photos_as_it_did(
+    compacted_scene: Path, made_scene: Path, odd: int, tmp_path: Path, run: Run
+) -> None:
+    small, images, again = tmp_path / "small.ply", tmp_path / "images", tmp_path / "again.ply"
+    shutil.copy(compacted_scene / "small.ply", small)
+    shutil.copy(compacted_scene / "small.cameras.json", tmp_path / "small.cameras.json")
+    shutil.copytree(made_scene / "images", images)
+    for seed, photo in enumerate(sorted(images.iterdir())[:odd]):
+        with Image.open(photo) as image:
+            noise = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
+            Image.fromarray(noise).resize(image.size).save(photo)
+    document = json.loads(run("compact", small, "--images", images, "-o", again, "--json", code=0).out)
+    assert document["worse"] is None
+    assert len(document["choices"]["search"]["tried"]) <= MAX_RUNS
+    assert document["output"]["num_gaussians"] < document["input"]["num_gaussians"]
+    psnr = document["psnr_input_views"]
+    assert psnr["after"] > psnr["before"] - MAX_LOSS
+    planned = run("compact", small, "--images", images, "--dry-run", code=0).out
+    assert f"within {KEPT_LOSS:g} dB of the input" in " ".join(planned.split())
 
 
 def test_a_poor_result_is_a_warning(compacted_scene: Path, tmp_path: Path, run: Run) -> None:

@@ -9,13 +9,27 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.estimate import estimate
+from gsmerge.compaction.result import score
+from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
-from gsmerge.plan import EFFORTS, KEPT_PSNR, Plan, choose_for_scene, choose_networks, make_plan, resolve_fit, steps_for
+from gsmerge.fit import Fitted
+from gsmerge.plan import (
+    EFFORTS,
+    KEPT_LOSS,
+    KEPT_PSNR,
+    Plan,
+    choose_for_scene,
+    choose_networks,
+    make_plan,
+    resolve_fit,
+    steps_for,
+)
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORTS as NAMES
 
@@ -178,7 +192,7 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
-    assert (kept.target_psnr, kept.keeps_psnr) == (KEPT_PSNR, True)
+    assert (kept.target_psnr, kept.keeps_input) == (KEPT_PSNR, True)
     assert len(kept.scored_views) == len(rows)
     assert estimate(rows, options_of(**settings))["psnr_kept"] == KEPT_PSNR
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
@@ -188,9 +202,47 @@ def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings:
 def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
-    assert not plan_of(rows, **settings).keeps_psnr
-    for known in (scene, unaligned_scenes.without_order(scene), replace(scene, images=None)):
-        assert plan_of(known).target_psnr is None
+    for known in (rows, unaligned_scenes.without_order(scene)):
+        assert not plan_of(known, **settings).keeps_input
+    for known in (scene, replace(scene, images=None)):
+        assert not plan_of(known).keeps_input
+
+
+def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
+    noise = np.random.default_rng(0).random(scene.images.shape, np.float32)
+    rows = unaligned_scenes.without_order(replace(scene, images=noise))
+    plan, prepared = plan_of(rows), prepare(rows, options_of().prepare)
+    assert (plan.keeps_input, plan.target_psnr) == (True, KEPT_PSNR)  # of renders
+    assert add_target(plan, prepared) is plan
+    report = compact(rows, threads=1).report
+    assert (report.choices["fidelity"]["views"], report.worse) == (len(rows), None)
+    assert len(report.choices["search"]["tried"]) <= MAX_RUNS
+
+
+def test_photos_decide_the_count_where_rows_belong_to_no_pixels(scene: Scene) -> None:
+    rows = unaligned_scenes.without_order(scene)
+    prepared, plan = prepare(rows, options_of().prepare), plan_of(rows)
+    assert (plan.keeps_input, plan.target_psnr, len(plan.scored_views)) == (True, None, len(rows))
+    known = add_target(plan, prepared)
+    assert known.target_psnr == pytest.approx(psnr_of(rows.gaussians, prepared.input_scene) - KEPT_LOSS, abs=0.05)
+    assert add_target(known, prepared) is known
+    estimated = estimate(rows, options_of())
+    assert (estimated["psnr_kept"], estimated["loss_kept"]) == (None, KEPT_LOSS)
+    assert not plan_of(rows, budget="auto").keeps_input  # the photos' own curve decides
+
+
+def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) -> None:
+    """Elsewhere a worse result would be called better."""
+    rows = unaligned_scenes.without_order(scene)
+    x = rows.gaussians.means[:, 0]
+    rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.7))])
+    prepared = prepare(rows, options_of().prepare)
+    plan = add_target(plan_of(rows), prepared)
+    assert plan.before is not None
+    assert plan.target_psnr == plan.before.covered_psnr - KEPT_LOSS > plan.before.psnr
+    again = score(None, Fitted(prepared.scene.gaussians, prepared.scene.cameras, None), prepared, plan)
+    assert again.psnr == pytest.approx(plan.before.psnr, abs=0.01)
+    assert again.kept_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
 
 
 def test_views_that_are_placed_are_scored(scene: Scene) -> None:

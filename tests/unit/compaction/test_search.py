@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 from messages import noted, refuses
 
 from gsmerge.budget import exact_count, max_allowed
 from gsmerge.compaction.search import (
+    CLOSE,
     MAX_RUNS,
     CountSearch,
     CurvePoint,
@@ -24,7 +25,7 @@ from gsmerge.compaction.search import (
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.pipeline import Build
-from gsmerge.plan import Plan
+from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 
 
@@ -39,16 +40,14 @@ def make_plan(
     default: int | None = None,
     levels: int = 1,
     *,
-    keeps_psnr: bool = False,
+    keeps_input: bool = False,
 ) -> Plan:
     """What a search reads of a plan."""
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
-    return cast(
-        "Plan",
-        SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, keeps_psnr=keeps_psnr, auto_count=False),
-    )
+    kept = {"keeps_input": keeps_input, "auto_count": False}
+    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, **kept))
 
 
 @pytest.mark.parametrize(
@@ -156,8 +155,12 @@ def search(curve: Callable[[int], float], target: float, start: int, least: int,
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
     for count in counts:
-        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))
+        counts.add(built(count, curve(count)))
     return counts
+
+
+def built(count: int | None, psnr: float) -> Any:
+    return SimpleNamespace(count=count, psnr=psnr, kept_psnr=psnr, gaussians=range(count or 0))
 
 
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
@@ -203,12 +206,12 @@ def test_search_begins_within_its_limits(default: int, first: int) -> None:
     assert search_count(prepared, plan, cast("Build", None)).first == first
 
 
-def keep(curve: Callable[[int], float], default: int, most: int) -> CountSearch:
-    """Run the search that keeps 32.5 dB from the input by default."""
-    plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_psnr=True)
-    counts = CountSearch(plan, default, rendered=True)
+def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bool = True) -> CountSearch:
+    """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
+    plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_input=True)
+    counts = CountSearch(plan, default, rendered)
     for count in counts:
-        counts.add(SimpleNamespace(count=count, psnr=curve(count), gaussians=range(count)))
+        counts.add(built(count, curve(count)))
     return counts
 
 
@@ -233,6 +236,32 @@ def test_what_is_compact_already_is_kept() -> None:
     assert actual.best.count == 5000
     assert noted(actual.notes, "compact already", "5,000 of 5,000")
     assert actual.unmet is None
+
+
+@pytest.mark.parametrize("slope", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("needed", [1.1, 3.0, 12.0])
+def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: float) -> None:
+    """Beyond the four times the usual count that a quality may take."""
+    actual = keep(lambda count: 32.5 + slope * math.log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
+    assert actual.met
+    assert actual.best.count <= 1000 * needed * 2 ** (KEPT_LOSS / slope) * CLOSE
+    assert len(actual.tried) <= 5
+    assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
+
+
+@pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - math.log2(count / 1000)])
+def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]) -> None:
+    """As of another scene. The best is kept, even if it is the usual count."""
+    actual = keep(curve, 1000, 20_000, rendered=False)
+    assert len(actual.tried) <= MAX_RUNS
+    assert (actual.best.count, actual.met, actual.unmet) == (1000, False, None)
+    assert actual.notes == []
+
+
+def test_a_count_that_is_too_few_is_not_called_enough() -> None:
+    actual = keep(lambda count: 20 + math.log2(count / 1000), 1000, 3000, rendered=False)
+    assert actual.best.count == 3000
+    assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
 
 
 def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:
