@@ -193,6 +193,32 @@ def page_data(
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]  # fmt: skip
     means = entered[evaluation.results[:2][-1].name].means
+    views = _page_views(splits, evaluation, stills, frame, means)
+    shown, num_superpixels = with_outlines(_shown(views), pictures)
+    *drawn, outside = (
+        replace(view, drops=tuple(
+            draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
+        ))
+        for view in (*shown, _outside_view(scene, named, frame, len(views)))
+    )  # fmt: skip
+    measured = evaluation.notes if results else ()  # which are about what was fitted
+    notes = (*measured, *_limits(sides, len(shown), len(views)))
+    share, _ = evaluation.results[0].mean_covered("context")
+    lacks_pixels = share is not None and share < WHOLE
+    return ViewData(
+        title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
+        lacks_pixels,
+    )  # fmt: skip
+
+
+def _page_views(
+    splits: Mapping[str, tuple[Cameras, np.ndarray, Sequence[str]]],
+    evaluation: Evaluation,
+    stills: Stills,
+    frame: Frame,
+    means: np.ndarray,
+) -> list[PageView]:
+    """List the measured views of ``splits`` (cameras in the world, photos, names); ``means [n,3]`` are canonical."""
     views: list[PageView] = []
     for split, (places, photos, names) in splits.items():
         if split not in evaluation.num_views:  # only held-out views were measured
@@ -211,21 +237,7 @@ def page_data(
                 stills=tuple(stills[result.name, split, i] for result in evaluation.results),
                 scores=tuple(result.scores[len(views)].masked for result in evaluation.results),
             ))  # fmt: skip
-    shown, num_superpixels = with_outlines(_shown(views), pictures)
-    *drawn, outside = (
-        replace(view, drops=tuple(
-            draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
-        ))
-        for view in (*shown, _outside_view(scene, named, frame, len(views)))
-    )  # fmt: skip
-    measured = evaluation.notes if results else ()  # which are about what was fitted
-    notes = (*measured, *_limits(sides, len(shown), len(views)))
-    share, _ = evaluation.results[0].mean_covered("context")
-    lacks_pixels = share is not None and share < WHOLE
-    return ViewData(
-        title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels,
-    )  # fmt: skip
+    return views
 
 
 def _outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
