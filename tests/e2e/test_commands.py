@@ -185,7 +185,7 @@ def test_a_view_of_one_scene(small_copy: Path, run: Run) -> None:
     assert "note" not in outcome.err
     run("compact", small_copy, *QUICK, "--quiet", code=0)
     run("view", small_copy / "scene.compact.ply", "--no-open", code=0)
-    assert "<title>scene.compact</title>" in (small_copy / "scene.compact.view.html").read_text()
+    assert f"<title>{small_copy.name}</title>" in (small_copy / "scene.compact.view.html").read_text()
     bare = small_copy / "away" / "bare.ply"
     bare.parent.mkdir()
     (small_copy / "scene.ply").rename(bare)
