@@ -114,7 +114,7 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
     path = copied / "out" / "batch.jsonl"
     lines = path.read_bytes().splitlines(keepends=True)
     assert b"budget 2%" in lines[2]
-    path.write_bytes(lines[0] + lines[1] + lines[3] + lines[2][:-40])
+    path.write_bytes(lines[0] + lines[1] + lines[2][:-40])
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err
     assert set(budgets(merges)) == {"2%"}
