@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes
+from gsmerge.io.archives import damaged_member
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
@@ -84,7 +84,7 @@ def damage(path: Path) -> list[str]:
     suffix = path.suffix.lower()
     if os.path.isdir(path):
         return [f"{file.name}: {problem}" for file in list_plys(path) for problem in damage(file)]
-    found = _damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
+    found = damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
     left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
     return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
 
@@ -149,13 +149,3 @@ def _read_gsm(path: Path) -> FileCheck:
         problems.append(_problem(error, path))
         return FileCheck(str(path), "", problems=tuple(problems), notes=notes)
     return FileCheck(str(path), "state", len(state), problems=tuple(problems), notes=notes)
-
-
-def _damaged_member(path: Path) -> str | None:
-    """Name a file in an archive that does not have its checksum; None if all have."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            name = archive.testzip()
-    except Exception as error:  # whatever a damaged archive makes the library raise
-        return f"cannot be unpacked ({' '.join(str(error).split())})"
-    return None if name is None else f"{name}: not what was written, by its checksum"

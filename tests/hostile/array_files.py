@@ -14,7 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from .case import EITHER, HEIGHT, READ, VIEWS, WIDTH, Case, Spoil, cameras_of, names, sparse, without_transforms
+from .case import (
+    EITHER,
+    HEIGHT,
+    READ,
+    VIEWS,
+    WIDTH,
+    Case,
+    Spoil,
+    add_bomb,
+    cameras_of,
+    names,
+    sparse,
+    without_transforms,
+)
 
 MARKER = "executed"
 Arrays = dict[str, Any]
@@ -89,6 +102,16 @@ def bytes_of(kind: str, change: Callable[[bytes], bytes]) -> Spoil:
     return spoil
 
 
+def with_bomb(kind: str, name: str, method: int) -> Spoil:
+    """A file with a member that unpacks to far more than it promises; an array of that name is replaced."""
+
+    def spoil(folder: Path) -> None:
+        saved(kind, lambda arrays, _: arrays.pop(name, None))(folder)
+        add_bomb(folder / kind, f"{name}.npy", method, member(np.zeros((VIEWS, 4, 4))))
+
+    return spoil
+
+
 def bomb(size: int, shape: tuple[int, ...]) -> Callable[[Any], bytes]:
     head = member(np.zeros(0, np.uint8), "|u1", shape)
     return lambda _: head + bytes(size)
@@ -124,6 +147,10 @@ def _of_kind(kind: str, poses: str, Ks: str, images: str) -> dict[str, Case]:
         "an unknown compression": Case(bytes_of(kind, lambda data: patched(data, 8, 10, lambda _: 99)), EITHER),
         "the directory alone": Case(bytes_of(kind, lambda data: data[data.index(b"PK\x01\x02") :])),
         "8 GB of zeros": Case(lambda folder: _zeros(folder, kind)),
+        "poses of bzip2": Case(with_bomb(kind, poses, zipfile.ZIP_BZIP2), says=(f"{poses}.npy", "method 12")),
+        "poses of LZMA": Case(with_bomb(kind, poses, zipfile.ZIP_LZMA), says=(f"{poses}.npy", "method 14")),
+        "poses that promise less": Case(with_bomb(kind, poses, zipfile.ZIP_DEFLATED), EITHER),
+        "bzip2 that nothing reads": Case(with_bomb(kind, "more", zipfile.ZIP_BZIP2), says=("more.npy", "method 12")),
     }
     for shape in ((2**40, 2**40), (VIEWS, 2**31, 2**31), (2**62,), (-1, 3)):
         cases[f"poses said to be {shape}"] = Case(zipped(kind, poses, lambda v, s=shape: member(v, shape=s)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,16 @@ def sparse(path: Path, size: int, start: bytes = b"") -> None:
     with path.open("wb") as file:
         file.write(start)
         file.truncate(size)
+
+
+def add_bomb(path: Path, name: str, method: int, start: bytes = b"") -> None:
+    """Add a member to an archive that unpacks to 268 MB, of which the directory promises 512 bytes."""
+    with zipfile.ZipFile(path, "a", method) as archive:
+        with archive.open(name, "w") as file:
+            file.write(start)
+            for _ in range(16):
+                file.write(bytes(1 << 24))
+        archive.getinfo(name).file_size = 512
 
 
 def edit_json(name: str, change: Callable[[Any], Any]) -> Spoil:

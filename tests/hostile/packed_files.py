@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .case import EITHER, READ, Case, Spoil
+from .case import EITHER, READ, Case, Spoil, add_bomb
 
 LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
 BOX = {"min": [-9, -9, -9], "max": [9, 9, 9]}
@@ -70,6 +70,17 @@ def sog(
     return spoil
 
 
+def sog_bomb(method: int) -> Spoil:
+    """A ``meta.json`` that unpacks to far more than the directory promises."""
+
+    def spoil(folder: Path) -> Sequence[object]:
+        path = alone(folder) / "a.sog"
+        add_bomb(path, "meta.json", method)
+        return [path]
+
+    return spoil
+
+
 def spz(count: int, degree: int) -> Spoil:
     """Equal Gaussians of that degree, which pack a thousandfold."""
 
@@ -119,6 +130,8 @@ def _cases() -> dict[str, Case]:
     return {
         "sog: as it is": Case(sog(bands=3), READ),
         "sog: count of 400 digits": Case(sog(lambda meta, files: meta.update(count=10**400))),
+        "sog: meta.json of bzip2": Case(sog_bomb(zipfile.ZIP_BZIP2), says=("meta.json", "method 12")),
+        "sog: meta.json that promises less": Case(sog_bomb(zipfile.ZIP_DEFLATED)),
         "sog: a million equal Gaussians": Case(sog(count=1_000_000, bands=3)),
         "spz: half a million of degree 4": Case(spz(500_000, 4)),
         "lod: as it is": Case(index(chunks=2), READ),

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
@@ -213,7 +214,7 @@ def array_names(path: Path) -> frozenset[str]:
 def array_shape(path: Path, name: str) -> tuple[int, ...]:
     """Read the shape of an array in an ``.npz`` from its header; empty if it is missing or cannot be read."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_archive(path) as archive:
             return _read_header(archive, _members(archive)[name])[0]
     except Exception:  # whatever a damaged archive makes the libraries raise
         return ()
@@ -229,7 +230,7 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     if not zipfile.is_zipfile(path):
         raise SceneError(path, "expected a readable .npz file, found something else")
     try:
-        with zipfile.ZipFile(path) as archive, warnings.catch_warnings():
+        with open_archive(path) as archive, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers in old styles
             members = {name: info for name, info in _members(archive).items() if name in names}
             budget.check_memory(sum(info.file_size for info in members.values()), "arrays")

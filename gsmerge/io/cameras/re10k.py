@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import MAX_VIEWS, ReadBudget, read_budget, read_errors
 from gsmerge.io.cameras.camera_file import View, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
@@ -179,10 +180,8 @@ def read_torch_file(budget: ReadBudget) -> Any:
     """
     path, problem = budget.path, "expected a chunk written by torch.save, found"
     try:
-        with read_errors(path), zipfile.ZipFile(path) as archive:
+        with read_errors(path), open_archive(path, (zipfile.ZIP_STORED,)) as archive:
             members = archive.infolist()
-            if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-                raise SceneError(path, f"{problem} packed members")
             _check_places(budget, members)
             (structure,) = (member for member in members if member.filename.split("/")[1:] == ["data.pkl"])
             content = archive.read(structure)

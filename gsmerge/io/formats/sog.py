@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.archives import open_archive, read_member
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import expm1, log1p
@@ -76,7 +77,7 @@ class _Bundle:
         info = self.archive.getinfo(name)
         if info.file_size > limit:
             raise ValueError(f"{name} of {info.file_size} bytes")
-        return self.archive.read(info)
+        return read_member(self.archive, info)
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ class SogContent:
 def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.sog``; SceneError if it is another file, another version, or damaged."""
     budget = read_budget(path)
-    with _damage(path), zipfile.ZipFile(path) as archive:
+    with _damage(path), open_archive(path) as archive:
         content = _read_content(_Bundle(archive, budget.file_bytes), budget)
     return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, mip=content.mip)
 

@@ -1,0 +1,48 @@
+"""Archives of zip that are read: what they unpack to is bounded by what they promise."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import read_budget
+from gsmerge.types import StrPath
+
+# For others, zipfile unpacks each piece of packed bytes whole, whatever the directory promises
+_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
+_PIECE = 1 << 14  # bytes that are unpacked in a budget's step
+
+
+@contextmanager
+def open_archive(path: StrPath, methods: Collection[int] = tuple(_METHODS)) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; SceneError unless all its members are stored or deflated, or packed by one of ``methods``."""
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.compress_type not in methods:
+                allowed = " or ".join(_METHODS[method] for method in methods)
+                problem = f"{info.filename!r:.80}: expected a member that is {allowed}, found one packed"
+                raise SceneError(path, f"{problem} by method {info.compress_type}", "pack it again")
+        yield archive
+
+
+def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """Read the bytes that the directory promises, and unpack no more, as ``ZipFile.read`` does."""
+    with archive.open(info) as file:
+        return file.read(info.file_size)
+
+
+def damaged_member(path: Path) -> str | None:
+    """Describe what is wrong with an archive's members by their checksums; None if nothing is."""
+    try:
+        with open_archive(path) as archive:
+            pieces = sum(-(-info.file_size // _PIECE) for info in archive.infolist())
+            read_budget(path).check_steps(pieces, f"pieces of {_PIECE:,} unpacked bytes")
+            name = archive.testzip()
+    except SceneError as error:
+        return str(error).removeprefix(f"{path}: ")
+    except Exception as error:  # whatever a damaged archive makes the library raise
+        return f"cannot be unpacked ({' '.join(str(error).split())})"
+    return None if name is None else f"{name}: not what was written, by its checksum"
