@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, TextIO
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import OUT_OF_MEMORY, SceneError
 from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
@@ -82,11 +82,20 @@ def parse_json(text: str, budget: ReadBudget) -> Any:
 
 @contextmanager
 def read_errors(path: StrPath) -> Iterator[None]:
-    """Turn an OSError of the block into a SceneError that names the file."""
+    """Turn an OSError of the block, or a lack of memory, into a SceneError that names the file."""
     try:
         yield
     except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+        raise SceneError(path, f"cannot be read ({error.strerror or error})") from error
+    except MemoryError as error:
+        raise SceneError(path, OUT_OF_MEMORY) from error
+
+
+def check_safetensors(path: Path) -> None:
+    """Raise ValueError, before a file of any size is mapped, unless it begins as a safetensors file."""
+    with read_errors(path), path.open("rb") as file:
+        if file.read(9)[8:] != b"{":
+            raise ValueError("no header")
 
 
 def check_file(path: Path) -> int:

@@ -16,7 +16,7 @@ from safetensors.numpy import save
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
+from gsmerge.io.bounds import ReadBudget, check_safetensors, parse_json, read_budget, read_errors
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
@@ -66,7 +66,8 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
     budget = read_budget(path)
     try:
-        with safe_open(path, "np") as file:
+        check_safetensors(path)
+        with read_errors(path), safe_open(path, "np") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch

@@ -23,7 +23,7 @@ from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.facts.prepare import Frame
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
+from gsmerge.io.bounds import ReadBudget, check_pixels, check_safetensors, parse_json, read_budget, read_errors
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
 from gsmerge.settings.budget import AUTO
@@ -223,7 +223,8 @@ def read_gsm(path: str | PathLike[str]) -> GsmFile:
     path = Path(path)
     budget = read_budget(path)
     try:
-        with safe_open(path, "np") as file:
+        check_safetensors(path)
+        with read_errors(path), safe_open(path, "np") as file:
             names = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
             metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch

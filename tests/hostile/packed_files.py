@@ -1,4 +1,4 @@
-"""``.sog``, ``.spz`` and ``lod-meta.json`` that promise more than they have, or contradict themselves."""
+"""Packed scenes and states that promise more than they have, contradict themselves, or are 1 TB."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .case import EITHER, READ, Case, Spoil, add_bomb
+from .case import EITHER, READ, Case, Spoil, add_bomb, sparse
 
 LOSSLESS = (cv2.IMWRITE_WEBP_QUALITY, 101)
 BOX = {"min": [-9, -9, -9], "max": [9, 9, 9]}
@@ -94,6 +94,15 @@ def spz(count: int, degree: int) -> Spoil:
     return spoil
 
 
+def enlarged(name: str, start: bytes = b"") -> Spoil:
+    def spoil(folder: Path) -> Sequence[object]:
+        path = alone(folder) / name
+        sparse(path, 2**40, start)
+        return [path]
+
+    return spoil
+
+
 def leaf(*files: int, count: int = 900) -> dict[str, Any]:
     children = [{"bound": BOX, "lods": {"0": {"file": file, "offset": 0, "count": count}}} for file in files]
     return {"bound": BOX, "children": children}
@@ -134,6 +143,11 @@ def _cases() -> dict[str, Case]:
         "sog: meta.json that promises less": Case(sog_bomb(zipfile.ZIP_DEFLATED)),
         "sog: a million equal Gaussians": Case(sog(count=1_000_000, bands=3)),
         "spz: half a million of degree 4": Case(spz(500_000, 4)),
+        "spz: 1 TB of zeros": Case(enlarged("a.spz"), named="a.spz"),
+        "spz: 1 TB after a header": Case(enlarged("a.spz", gzip.compress(bytes(9), 1)), named="a.spz"),
+        "splat: 1 TB of zeros": Case(enlarged("a.splat"), named="a.splat"),
+        "gsm: 1 TB of zeros": Case(enlarged("a.gsm"), says=("header",)),
+        "gsm: 1 TB after a header": Case(enlarged("a.gsm", struct.pack("<Q", 2) + b"{}"), named="a.gsm"),
         "lod: as it is": Case(index(chunks=2), READ),
         "lod: 100,000 names": Case(index(filenames=many), READ),
         "lod: a chunk by two names": Case(linked),

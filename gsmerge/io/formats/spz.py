@@ -35,7 +35,7 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
-GZIP_MAGIC = b"\x1f\x8b"
+GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which versions 1 to 3, and 4 begin with
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
 # As the extra asks for; the second works beside a wheel and in a checkout
@@ -71,9 +71,12 @@ class _Header:
 def read_rows(path: Path) -> arrays.StoredRows:
     """Read the Gaussians of a ``.spz``; SceneError if damaged, UsageError without ``zstandard`` for version 4."""
     check_file(path)
-    with read_errors(path):
-        packed = path.read_bytes()
-    read = _zstandard_parts if packed[:4] == MAGIC.to_bytes(4, "little") else _gzip_parts
+    with read_errors(path), path.open("rb") as file:
+        packed = file.read(len(ZSTANDARD_MAGIC))
+        if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # others are refused, whatever their size
+            file.seek(0)
+            packed = file.read()
+    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
     header, parts = read(path, packed)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     rows = arrays.Packed(header.count, header.num_higher, lambda at: _unpack([part[at] for part in parts], header))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from former_formats import spz4_bytes
+from hostile.case import sparse
 from messages import refuses
 from slow_readers import assert_damage_is_one_line, corners
 
@@ -146,6 +147,12 @@ DAMAGED = OLDER | {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert_damage_is_one_line(tmp_path / f"{name}.spz", DAMAGED[name], capsys)
+
+
+def test_another_file_of_any_size_is_refused_by_its_start(tmp_path: Path) -> None:
+    sparse(tmp_path / "a.spz", 2**40)
+    with refuses(SceneError, "a.spz", "gzip"):
+        read_gaussians(tmp_path / "a.spz")
 
 
 @pytest.mark.parametrize("version", [3, 4])
