@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 from typing import Any
 
@@ -72,7 +71,7 @@ def pack_splats(
         planes.append(signed.view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes())
         sizes.append(size)
     line = json.dumps(head | {"steps": steps, "levels": levels, "sizes": sizes}).encode() + b"\n"
-    return gzip.compress(line + b"".join(planes), LEVEL, mtime=0), degree
+    return spz.gzip_bytes(line + b"".join(planes), LEVEL), degree
 
 
 def _pixel_places(means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:

@@ -36,6 +36,7 @@ TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in 
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which versions 1 to 3, and 4 begin with
+SYSTEM, UNIX = 9, b"\3"  # place of the system in the header of gzip, and the one that is written for all
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
 # As the extra asks for; the second works beside a wheel and in a checkout
@@ -245,7 +246,14 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """
     columns = spz_columns(gaussians, MAX_DEGREE, mip=arrays.MIP_COMMENT in comments)
     parts = (part.tobytes() for part in columns.parts)
-    return gzip.compress(b"".join([columns.header, *parts]), mtime=0)  # the same bytes at any time
+    return gzip_bytes(b"".join([columns.header, *parts]))
+
+
+def gzip_bytes(data: bytes, level: int = 9) -> bytes:
+    """Compress to a gzip stream that is the same at any time, and on each system and version of Python."""
+    packer = zlib.compressobj(level, wbits=31)  # without a time
+    packed = packer.compress(data) + packer.flush()
+    return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]
 
 
 def zstandard() -> ModuleType:

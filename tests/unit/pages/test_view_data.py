@@ -18,7 +18,7 @@ from messages import noted
 from gsmerge import Gaussians, Scene, evaluate, render
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.row_colors import ROW_COLORS
-from gsmerge.io.formats.spz import spz_bytes
+from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane
 from gsmerge.measure.lpips import lpips_available
@@ -67,7 +67,9 @@ def decoded(still: bytes | None) -> np.ndarray:
 
 def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
     """The numbers of what the page holds: its head, and ``[n,columns]``."""
-    line, _, rest = gzip.decompress(packed or b"").partition(b"\n")
+    assert packed is not None
+    assert packed[9:10] == UNIX
+    line, _, rest = gzip.decompress(packed).partition(b"\n")
     head = json.loads(line)
     columns, at = [], 0
     for size in head["sizes"]:

@@ -18,7 +18,7 @@ from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
-from gsmerge.io.formats.spz import spz_bytes
+from gsmerge.io.formats.spz import gzip_bytes, spz_bytes
 
 zstandard = pytest.importorskip("zstandard")
 
@@ -147,6 +147,16 @@ DAMAGED = OLDER | {
 @pytest.mark.parametrize("name", DAMAGED)
 def test_damage_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert_damage_is_one_line(tmp_path / f"{name}.spz", DAMAGED[name], capsys)
+
+
+@pytest.mark.parametrize(("level", "word"), [(7, b"\0"), (9, b"\2")])
+def test_streams_name_no_time_and_the_same_system(level: int, word: bytes) -> None:
+    """Python 3.10 to 3.13 write one of two systems into what ``gzip.compress`` returns."""
+    data = spz_bytes(corners())
+    actual = gzip_bytes(data, level)
+    assert actual[:10] == b"\x1f\x8b\x08" + bytes(5) + word + b"\3"
+    assert gzip.decompress(actual) == data
+    assert data[:10] == gzip_bytes(b"")[:10]
 
 
 def test_another_file_of_any_size_is_refused_by_its_start(tmp_path: Path) -> None:
