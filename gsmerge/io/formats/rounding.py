@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.streamed import write_levels
-from gsmerge.io.formats.table import COLMAP, INDEX, LEVELS, SITE, SITE_SCENE, input_format, output_format
+from gsmerge.io.formats.table import COLMAP, INDEX, LEVELS, PLY, SITE, SITE_SCENE, input_format, output_format
 from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
@@ -37,7 +37,7 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     shift = ",".join(f"{-float(f'{value:.3g}'):.0f}" for value in middle)
     remedy = f"move the input and its cameras near the origin first: gsmerge convert --translate={shift}"
     if np.abs(middle).max() < np.abs(means - middle).max():  # some are farther from the others than these from it
-        remedy = "write a .ply, or crop what is far away"
+        remedy = ("" if chosen is PLY else "write a .ply, or ") + "crop what is far away"
     lost = f"positions lose digits in {chosen.ending} so far from the origin"
     return [f"{lost}: Gaussians move by some {100 * moved**0.5:.0f} % of their size; {remedy}"]
 
