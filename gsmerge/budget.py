@@ -42,7 +42,7 @@ def file_size(options: BudgetOptions) -> FileSize | None:
     """Return the size that a budget in bytes asks for; None for any other budget."""
     if not options.in_bytes:
         return None
-    file = output_format(options.output, levels=True)
+    file = output_format(options.output or PLY.ending, levels=True)
     in_one = file.encode is None and file is not PLY
     return FileSize(parse_bytes(str(options.budget)), file, options.levels if in_one else 1)
 

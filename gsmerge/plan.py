@@ -87,6 +87,7 @@ class Plan:
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # Whether the scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
+    output: str  # Name of the output's file, which may round what it keeps; "": none
     size: FileSize | None  # What the output's file may have at most; None: any
     scored_views: tuple[int, ...]  # Given views that input and result are scored on
     seed: int  # Everything random depends on it alone
@@ -175,6 +176,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         max_drop=options.budget.max_drop,
         auto_count=options.budget.auto,
         levels=options.budget.levels,
+        output=options.budget.output,
         size=file_size(options.budget),
         scored_views=_choose_scored_views(prepared, decisive=keeps or target is not None),
         seed=options.seed,

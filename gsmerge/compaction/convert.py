@@ -34,6 +34,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
+from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, SITE, input_format
 from gsmerge.io.formats.write import Photos, output_notes
@@ -101,7 +102,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
-    notes += output_notes(options.output, gaussians.sh_degree, photos)
+    notes += output_notes(options.output, gaussians.sh_degree, photos) + rounding_notes(options.output, gaussians)
     comments = list(dict.fromkeys(comment for info in infos for comment in kept_comments(info)))
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)

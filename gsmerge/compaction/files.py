@@ -17,6 +17,7 @@ from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
+from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.runtime.memory import release_memory
@@ -88,7 +89,7 @@ def compact_files(
         compacted, results = perf_counter(), (result, *result.coarser)
         comments = [RESULT_COMMENT, *load.comments]
         views_named = result.cameras[views], name_photos(files.images, names), scene_title(files.ply)
-        notes = output_notes(out, result.gaussians.sh_degree, views_named[1])
+        notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
         written = _write_results(add, outputs, first, results, comments, views_named, parts)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)

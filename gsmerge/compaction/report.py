@@ -48,7 +48,7 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
             :func:`gsmerge.evaluate` is exact.
-        psnr_after: The same from the result.
+        psnr_after: The same from the result; where a file is written and rounds positions visibly, from the file.
         choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). Where there are no photos
             and the rows belong to no pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many
             ``views``: of the scene, or ``held_out`` ones that were placed for lack of cameras.

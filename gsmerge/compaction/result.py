@@ -16,6 +16,7 @@ from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
+from gsmerge.io.formats.rounding import as_written
 from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss
@@ -135,7 +136,7 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     The second number is that of the pixels that decide the count.
     """
     if moved.reference.name == RENDERS:
-        fidelity = _fidelity(moved.frame.enter(gaussians), moved, plan)
+        fidelity = _fidelity(moved.frame.enter(_written(gaussians, plan)), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
         choose(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
@@ -181,10 +182,18 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 def measure_result(
     gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
 ) -> PhotoScore | None:
-    """Score a result's Gaussians on the scored photos, and over ``covered`` pixels of each; None without photos."""
+    """Score a result's Gaussians, as its file keeps them, on the scored photos, and over ``covered`` pixels of each.
+
+    None without photos.
+    """
     if not prepared.reference.of_views:
         return None
-    return _score_photos("score", gaussians, prepared.result_views(), prepared, plan, covered)
+    return _score_photos("score", _written(gaussians, plan), prepared.result_views(), prepared, plan, covered)
+
+
+def _written(gaussians: Gaussians, plan: Plan) -> Gaussians:
+    """Return Gaussians as the file of the output keeps them; as they are where there is none."""
+    return as_written(plan.output, gaussians) if plan.output else gaussians
 
 
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:

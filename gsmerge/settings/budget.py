@@ -32,7 +32,9 @@ class BudgetOptions(Settings):
         "The best is what the scene's own curve reaches. Where rows belong to no pixels and no number is asked for, "
         "the result keeps the input: its renders at 32.5 dB without photos, the photos within 0.3 dB with them.",
         metavar="30dB|-0.2dB")  # fmt: skip
-    output: str = setting("a.ply", "Name of the file whose bytes a size counts, with its ending.", internal=True)
+    output: str = setting(
+        "", "Name of the file that is written and whose bytes a size counts, with its ending.", internal=True
+    )
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
         "Each is fitted by itself.", least=1, most=8)  # fmt: skip

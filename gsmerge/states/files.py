@@ -19,6 +19,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.fit import FitOptions
 from gsmerge.io import atomic_output, lock_folder, lost_harmonics, output_format, write_gaussians
 from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
+from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import PLY, count_for_bytes
 from gsmerge.plan import resolve_fit
 from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line
@@ -183,7 +184,7 @@ def compact_file(
         "ratio": len(gaussians) / max(state.settings.num_input, 1),
         "fit": decoded.fit and decoded.fit.to_dict(),
         **seconds_document(seconds),
-        "notes": [*decoded.notes, *notes],
+        "notes": [*decoded.notes, *notes, *rounding_notes(out, gaussians)],
     }
 
 

@@ -204,11 +204,10 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     harmonic_codes = np.zeros(CODES) if labels is None else _check_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
-        logs = low + (high - low) * (lower[block] + 256.0 * upper[block]) / 65535
         modes, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
-        codes = np.zeros((len(logs), 0, 3), np.uint8) if labels is None else palette[labels[block]]
+        codes = np.zeros((len(modes), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
-            means=np.sign(logs) * expm1(np.abs(logs)),
+            means=_open_means(lower[block] + 256.0 * upper[block], low, high),
             quats=arrays.from_smallest_three(modes, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
@@ -261,11 +260,9 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
         meta[key] = {**numbers, "files": list(files)}
         textures.update(files)
 
-    logs = np.sign(columns.means) * log1p(np.abs(columns.means))
-    low, high = (end(logs, axis=0) for end in (np.min, np.max))
-    fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
+    fixed, low, high = _fix_means(columns.means)
     halves = {"means_l.webp": _texture(fixed & 255), "means_u.webp": _texture(fixed >> 8)}
-    add("means", halves, mins=_shorten(low), maxs=_shorten(high))
+    add("means", halves, mins=low, maxs=high)
     scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
     add("scales", {"scales.webp": _texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales))
     largest, smallest = arrays.smallest_three(columns.quats)
@@ -287,6 +284,25 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
         bands = arrays.sh_degree(num_higher)
         add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
     return {**textures, META: json.dumps(meta).encode("ascii")}
+
+
+def round_means(means: np.ndarray) -> np.ndarray:
+    """Return means ``[n,3]`` as a ``.sog`` of them holds them."""
+    fixed, low, high = _fix_means(means)
+    return _open_means(fixed, np.array(low), np.array(high))
+
+
+def _fix_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
+    """Quantise means to 16 bits of their signed logarithms; also returns the ends of these as they are written."""
+    logs = np.sign(means) * log1p(np.abs(means))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    fixed = np.round((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(int)
+    return fixed, _shorten(low), _shorten(high)
+
+
+def _open_means(fixed: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    logs = low + (high - low) * fixed / 65535
+    return np.asarray(np.sign(logs) * expm1(np.abs(logs)))
 
 
 def _shorten(values: np.ndarray) -> list[float]:

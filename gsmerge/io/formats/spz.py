@@ -207,17 +207,27 @@ def _octave(size: float) -> int:
     return math.frexp(size)[1] - 1
 
 
+def round_means(means: np.ndarray) -> np.ndarray:
+    """Return means ``[n,3]`` as a ``.spz`` of them holds them."""
+    fixed, fraction = _fix_means(means, FINE)
+    return fixed / 2.0**fraction
+
+
+def _fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
+    """Quantise means; also returns the bits behind the point, by the scene's size and its farthest Gaussian."""
+    fraction = 0
+    if len(means):
+        size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
+        enough = fine - _octave(max(size, 1e-6))
+        room = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
+        fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
+    return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4"), fraction
+
+
 def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
     """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN or inf."""
     columns = arrays.to_columns(gaussians, max_degree)
-    fraction = 0  # bits behind the point, by the scene's size and its farthest Gaussian
-    if len(columns):
-        middle = np.median(columns.means, axis=0)
-        size = np.median(np.abs(columns.means - middle).max(axis=1))
-        enough = fine - _octave(max(size, 1e-6))
-        room = _octave(LARGEST / max(np.abs(columns.means).max(), 1e-6))
-        fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
-    fixed = np.clip(np.round(columns.means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4")
+    fixed, fraction = _fix_means(columns.means, fine)
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others

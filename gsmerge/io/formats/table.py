@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from gsmerge.errors import UsageError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
@@ -31,6 +33,7 @@ class Format:
     max_degree: int  # of the harmonics that are written; -1: it is only read
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
     each: Sequence[float] = ()  # bytes of a Gaussian by degree: of a .sog or .spz those of results, as measured
+    round_means: Callable[[np.ndarray], np.ndarray] = lambda means: means  # as it holds them, but for float32
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
     def names(self, path: StrPath) -> bool:
@@ -53,10 +56,13 @@ PLY = Format(
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks, each a .sog without its zip", _lazy("streamed.read_rows"), None,
-    3, each=_SOG,
+    3, each=_SOG, round_means=_lazy("sog.round_means"),
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
-SITE = Format("index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3)
+SITE = Format(
+    "index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3,
+    round_means=_lazy("sog.round_means"),
+)  # fmt: skip
 SITE_SCENE = "scene.sog"
 FILES = (  # of endings that end alike the longest first
     Format(
@@ -65,11 +71,11 @@ FILES = (  # of endings that end alike the longest first
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        each=(17.0, 18.5, 18.9, 19.2),
+        each=(17.0, 18.5, 18.9, 19.2), round_means=_lazy("spz.round_means"),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
-        each=_SOG,
+        each=_SOG, round_means=_lazy("sog.round_means"),
     ),
     Format(".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0, each=(32.0,)),
     Format(

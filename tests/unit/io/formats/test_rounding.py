@@ -1,0 +1,60 @@
+"""What files keep of positions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from messages import noted
+
+from gsmerge.io.formats.rounding import as_written, rounding_notes
+from gsmerge.io.formats.table import COLMAP, INDEX, OUTPUT_FORMATS
+from gsmerge.types import Gaussians
+
+NAMES = ("lod-meta.json", "site/index.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
+
+
+@pytest.fixture
+def near() -> Gaussians:
+    """Gaussians around the origin, in float64, with a sky a thousand times as far."""
+    rng, n = np.random.default_rng(0), 200
+    far = np.where(np.arange(n) < 150, 1.0, 1e3)[:, None]
+    return Gaussians(
+        means=rng.uniform(-3, 3, (n, 3)) * far,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        scales=np.float32(rng.uniform(0.02, 0.05, (n, 3)) * far),
+        opacities=np.full(n, 0.5, np.float32),
+        sh0=np.zeros((n, 1, 3), np.float32),
+        shN=np.zeros((n, 0, 3), np.float32),
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_near_the_origin_nothing_is_lost_or_copied(near: Gaussians, name: str) -> None:
+    assert rounding_notes(name, near) == []
+    assert as_written(name, near) is near
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_far_from_it_positions_are_those_of_the_file(near: Gaussians, name: str) -> None:
+    pytest.importorskip("pxr") if "usd" in name else None
+    far = replace(near, means=near.means + 3e6 * np.array([1, -1, 1]))
+    assert noted(rounding_notes(name, far), "--translate=-3000000,3000000,-3000000")
+    actual = as_written(name, far)
+    assert len(actual) == len(far)
+    assert np.abs(actual.means).min() > 2e6
+    if name in ("a.ply", "a.splat", "a.glb", "a.usdc"):
+        np.testing.assert_array_equal(actual.means, far.means.astype(np.float32))
+
+
+def test_colmap_keeps_float64(near: Gaussians) -> None:
+    assert rounding_notes(COLMAP.ending, replace(near, means=near.means + 1e9)) == []
+
+
+def test_what_is_far_apart_takes_digits_of_a_spz_alone(near: Gaussians) -> None:
+    factor = np.where(np.arange(len(near)) < 150, 1, 1e4)[:, None]
+    apart = replace(near, means=near.means * factor, scales=near.scales * factor)
+    assert noted(rounding_notes("a.spz", apart), "write a .ply")
+    assert [rounding_notes(name, apart) for name in ("a.ply", INDEX)] == [[], []]
+    assert len(np.unique(as_written("a.spz", apart).means[:150])) < 20
