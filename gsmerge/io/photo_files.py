@@ -6,10 +6,10 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -37,6 +37,9 @@ _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
 _DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
 _TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
+_TILE_TAGS = (322, 323)  # width and length, pixels
+_BITS_TAG, _SAMPLES_TAG = 258, 277
+_MIN_SAMPLE_BYTES = 4  # of a pixel of a tile: OpenCV decodes to RGBA
 _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _BAND = 256  # rows of a mask that are converted at once
@@ -262,6 +265,8 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
                 image = Image.open(file, formats=_FORMATS)
             tags = getattr(image, "tag_v2", None)
             width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
+            if tags is not None:
+                _check_tile(ReadBudget(path, file.seek(0, io.SEEK_END)), tags)
     except SceneError:
         raise
     except Image.DecompressionBombError as error:
@@ -274,7 +279,10 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def _check_tags(path: Path, file: BinaryIO) -> None:
-    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them."""
+    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them.
+
+    ValueError if a tag that sizes depend on is there twice, of which each decoder takes another.
+    """
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     start = file.read(16)
@@ -288,6 +296,16 @@ def _check_tags(path: Path, file: BinaryIO) -> None:
     tags = np.frombuffer(data, entry, len(data) // entry.itemsize)
     sizes = _TAG_BYTES[np.minimum(tags["type"], len(_TAG_BYTES) - 1)]
     ReadBudget(path, num_bytes).check_memory(float((tags["count"] * sizes.astype(np.float64)).sum()), "tags")
+    if any((tags["tag"] == tag).sum() > 1 for tag in (_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _SAMPLES_TAG, *_TILE_TAGS)):
+        raise ValueError("a tag twice")
+
+
+def _check_tile(budget: ReadBudget, tags: Mapping[int, Any]) -> None:
+    """Raise SceneError if a tile of a TIFF, for which decoders make room, takes more memory than the file allows."""
+    width, length = (tags.get(tag, 0) for tag in _TILE_TAGS)
+    sample_bytes = tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8
+    num_bytes = max(_MIN_SAMPLE_BYTES, sample_bytes) * width * length
+    budget.check_memory(num_bytes, f"a tile of {width} x {length} pixels")
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
