@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
 
-from .case import EITHER, HEIGHT, READ, REFUSED, WIDTH, Case, Spoil, names, sparse
+from .case import EITHER, HEIGHT, READ, REFUSED, VIEWS, WIDTH, Case, Spoil, edit_json, names, sparse
 
 Change = Callable[[bytes], bytes]
 
@@ -109,6 +112,20 @@ def as_masks(data: bytes) -> Spoil:
     return spoil
 
 
+def one_photo(folder: Path) -> None:
+    """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
+    shutil.rmtree(folder / "images")
+    cv2.imwrite(str(folder / "p.webp"), np.zeros((2000, 2000, 3), np.uint8))
+
+    def change(data: dict[str, Any]) -> None:
+        frames = data["frames"] * (300 // VIEWS)
+        data["frames"] = [{**frame, "file_path": "p.webp"} for frame in frames]
+        for key in ("w", "h"):
+            del data[key]
+
+    edit_json("transforms.json", change)(folder)
+
+
 def jpeg_size(width: int, height: int) -> Change:
     def change(data: bytes) -> bytes:
         at = data.index(b"\xff\xc0") + 5
@@ -133,6 +150,7 @@ def _cases() -> dict[str, Case]:
         ),
         "three bombs": Case(every(bomb)),
         "solid of 8190 x 8190": Case(every(lambda _: black(8190, 8190))),
+        "300 frames of one photo": Case(one_photo, says=("300 of 2000 x 2000",)),
         "60 texts of 1 MB": Case(every(with_texts), READ),
         "a million chunks without data": Case(every(with_empty_chunks), EITHER),
         "script": Case(first(lambda data: b"#!/bin/sh\ntouch executed\n")),
