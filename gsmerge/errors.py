@@ -98,7 +98,8 @@ def refuse_without_torch() -> Iterator[None]:
 
 
 OUT_OF_MEMORY = "out of memory; use fewer --threads or --jobs, or a smaller scene"
-_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread")
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't allocate memory", "can't start new thread",
+              "Insufficient memory")  # the last of OpenCV  # fmt: skip
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:

@@ -6,10 +6,10 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -37,8 +37,12 @@ _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
 _DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
 _TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
+_TILE_TAGS = (322, 323)  # width and length, pixels
+_BITS_TAG, _SAMPLES_TAG = 258, 277
+_MIN_SAMPLE_BYTES = 4  # of a pixel of a tile: OpenCV decodes to RGBA
 _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
+_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
 _BAND = 256  # rows of a mask that are converted at once
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
@@ -83,16 +87,33 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
 
 def decode_images(paths: Sequence[Path]) -> Photos:
-    """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use."""
-    sizes = [image_size(path) for path in paths]
-    for path, (w, h) in zip(paths, sizes, strict=True):
-        if (w, h) != sizes[0]:
-            w0, h0 = sizes[0]
-            raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {paths[0]}")
+    """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use.
 
-    if sum(3 * width * height for width, height in sizes) > _AT_ONCE:
-        return PhotoReader(len(paths), sizes[0], lambda photo: decode_image(paths[photo], sizes[0]))
-    return parallel_map(lambda path: decode_image(path, sizes[0]), paths)
+    A file that several of ``paths`` name is decoded once. SceneError if an image cannot be read, two differ in size, or
+    all together take more memory than their files allow.
+    """
+    files = list(dict.fromkeys(paths))
+    sizes = {path: image_size(path) for path in files}
+    for path, (w, h) in sizes.items():
+        w0, h0 = size = sizes[files[0]]
+        if (w, h) != size:
+            raise SceneError(path, f"expected images of one size, found {w} x {h} here and {w0} x {h0} in {files[0]}")
+    if not files:
+        return []
+    _check_together(paths, sum(map(check_file, files)), size)
+    if _CHANNELS * size[0] * size[1] * len(files) > _AT_ONCE:
+        return PhotoReader(len(paths), size, lambda photo: decode_image(paths[photo], size))
+    decoded = dict(zip(files, parallel_map(lambda path: decode_image(path, size), files), strict=True))
+    return [decoded[path] for path in paths]
+
+
+def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
+    """Raise SceneError if the photos of a scene take more memory together than the bytes of their files allow."""
+    num_bytes, most = _CHANNELS * len(paths) * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
+    if num_bytes > most:
+        problem = f"expected photos of at most {most / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
+        found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
+        raise SceneError(paths[0].parent, f"{problem}, {found}", "make them smaller, or leave some out")
 
 
 def change_photos(photos: Photos, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None) -> Photos:
@@ -200,7 +221,7 @@ def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
-    _stored_size(path)  # refuses what is no image, or too large
+    size = _stored_size(path)  # refuses what is no image, or too large
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -211,10 +232,16 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
             with Image.open(io.BytesIO(pixels.data), formats=("PNG", *_FORMATS)) as image:
                 channel = choose(image)
                 return None if channel is None else np.asarray(channel)
-    except SceneError:
+    except (SceneError, MemoryError):
         raise
     except Exception as error:  # whatever damage makes the library raise
-        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
+        raise _undecodable(path, size) from error
+
+
+def _undecodable(path: Path, size: Size) -> SceneError:
+    """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
+    np.empty((_CHANNELS + _DECODING_BYTES, *size), np.uint8)  # libraries do not tell
+    return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
 def image_size(path: Path) -> Size:
@@ -262,7 +289,9 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
                 image = Image.open(file, formats=_FORMATS)
             tags = getattr(image, "tag_v2", None)
             width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
-    except SceneError:
+            if tags is not None:
+                _check_tile(ReadBudget(path, file.seek(0, io.SEEK_END)), tags)
+    except (SceneError, MemoryError):
         raise
     except Image.DecompressionBombError as error:
         problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels an image, found more"
@@ -274,7 +303,10 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
 
 
 def _check_tags(path: Path, file: BinaryIO) -> None:
-    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them."""
+    """Raise SceneError if the tags of a TIFF refer to more bytes than allowed, since its decoder copies all of them.
+
+    ValueError if a tag that sizes depend on is there twice, of which each decoder takes another.
+    """
     num_bytes = file.seek(0, io.SEEK_END)
     file.seek(0)
     start = file.read(16)
@@ -288,6 +320,16 @@ def _check_tags(path: Path, file: BinaryIO) -> None:
     tags = np.frombuffer(data, entry, len(data) // entry.itemsize)
     sizes = _TAG_BYTES[np.minimum(tags["type"], len(_TAG_BYTES) - 1)]
     ReadBudget(path, num_bytes).check_memory(float((tags["count"] * sizes.astype(np.float64)).sum()), "tags")
+    if any((tags["tag"] == tag).sum() > 1 for tag in (_WIDTH_TAG, _HEIGHT_TAG, _BITS_TAG, _SAMPLES_TAG, *_TILE_TAGS)):
+        raise ValueError("a tag twice")
+
+
+def _check_tile(budget: ReadBudget, tags: Mapping[int, Any]) -> None:
+    """Raise SceneError if a tile of a TIFF, for which decoders make room, takes more memory than the file allows."""
+    width, length = (tags.get(tag, 0) for tag in _TILE_TAGS)
+    sample_bytes = tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8
+    num_bytes = max(_MIN_SAMPLE_BYTES, sample_bytes) * width * length
+    budget.check_memory(num_bytes, f"a tile of {width} x {length} pixels")
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
@@ -329,7 +371,7 @@ def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
+        raise _undecodable(path, size)
     if image.shape != (height, width, 3):
         raise SceneError(path, f"expected {width} x {height} pixels as its header says, found others", "replace it")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)

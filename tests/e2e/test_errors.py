@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from messages import ERROR, says
@@ -42,6 +43,7 @@ class Broken:
         (KeyError("lost"), 1, "unexpected error: KeyError: 'lost'; run again with --debug"),
         (ValueError("two\nlines"), 1, "unexpected error: ValueError: two; run again with --debug"),
         (MemoryError(), 3, OUT_OF_MEMORY),
+        (cv2.error("OpenCV: error: (-4:Insufficient memory) Failed to allocate 9 bytes"), 3, OUT_OF_MEMORY),
         (ImportError("a.so: failed to map segment from shared object"), 3, OUT_OF_MEMORY),
         (PermissionError(13, "Denied", "a/b"), 3, "a/b: cannot be read or written (Denied)"),
         (KeyboardInterrupt(), 130, "interrupted"),

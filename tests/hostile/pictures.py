@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
+import numpy as np
 
-from .case import EITHER, HEIGHT, READ, REFUSED, WIDTH, Case, Spoil, names, sparse
+from .case import EITHER, HEIGHT, READ, REFUSED, VIEWS, WIDTH, Case, Spoil, edit_json, names, sparse
 
 Change = Callable[[bytes], bytes]
 
@@ -89,6 +92,40 @@ def with_tags(order: str) -> bytes:
     return (head + b"".join(struct.pack(f"{order}HHII", *tag) for tag in tags)).ljust(size, b"\0")
 
 
+def with_tile(side: int, order: str = "<", *more: tuple[int, int]) -> bytes:
+    """A TIFF of one tile of a few deflated zeros, by far larger than the image, and more tags."""
+    packed = zlib.compress(b"\0")
+    tags = [(256, WIDTH), (257, HEIGHT), (258, 8), (259, 8), (262, 1), (277, 1), (322, side), (323, side)]
+    tags += [(324, 8 + 2 + 12 * (len(tags) + 2 + len(more)) + 4), (325, len(packed)), *more]
+    head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
+    return head + b"".join(struct.pack(f"{order}HHII", tag, 4, 1, value) for tag, value in tags) + bytes(4) + packed
+
+
+def as_masks(data: bytes) -> Spoil:
+    """The bytes as the mask of every view."""
+
+    def spoil(folder: Path) -> None:
+        (folder / "masks").mkdir()
+        for name in names():
+            (folder / "masks" / f"{name}.tiff").write_bytes(data)
+
+    return spoil
+
+
+def one_photo(folder: Path) -> None:
+    """300 frames that name the same photo of 4 million pixels of one colour, which has 0.2 kB."""
+    shutil.rmtree(folder / "images")
+    cv2.imwrite(str(folder / "p.webp"), np.zeros((2000, 2000, 3), np.uint8))
+
+    def change(data: dict[str, Any]) -> None:
+        frames = data["frames"] * (300 // VIEWS)
+        data["frames"] = [{**frame, "file_path": "p.webp"} for frame in frames]
+        for key in ("w", "h"):
+            del data[key]
+
+    edit_json("transforms.json", change)(folder)
+
+
 def jpeg_size(width: int, height: int) -> Change:
     def change(data: bytes) -> bytes:
         at = data.index(b"\xff\xc0") + 5
@@ -113,6 +150,7 @@ def _cases() -> dict[str, Case]:
         ),
         "three bombs": Case(every(bomb)),
         "solid of 8190 x 8190": Case(every(lambda _: black(8190, 8190))),
+        "300 frames of one photo": Case(one_photo, says=("300 of 2000 x 2000",)),
         "60 texts of 1 MB": Case(every(with_texts), READ),
         "a million chunks without data": Case(every(with_empty_chunks), EITHER),
         "script": Case(first(lambda data: b"#!/bin/sh\ntouch executed\n")),
@@ -127,6 +165,10 @@ def _cases() -> dict[str, Case]:
     for order in "<>":
         tags = recoded(".tiff", lambda _, order=order: with_tags(order))
         cases[f".tiff whose tags are all of it, {order}"] = Case(tags)
+        masks = as_masks(with_tile(26_000, order))
+        cases[f".tiff masks of a tile of 26000 x 26000, {order}"] = Case(masks, says=("view_000.tiff", "26000 x 26000"))
+    cases[".tiff of a tile of 8192 x 8192"] = Case(recoded(".tiff", lambda _: with_tile(8192)))
+    cases[".tiff of a tile of two sizes"] = Case(recoded(".tiff", lambda _: with_tile(8192, "<", (322, 16), (323, 16))))
     for suffix, lie in {
         ".jpg": jpeg_size(60_000, 60_000), ".bmp": at(18, "<ii", 60_000, 60_000), ".webp": at(26, "<HH", 16383, 16383),
         ".ppm": lambda data: data.replace(b"24 16", b"60000 60000", 1),

@@ -265,3 +265,45 @@ def test_photos_have_as_many_scans_as_their_bytes_allow(tmp_path: Path) -> None:
     path.write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * 5000 + data[-2:])
     with refuses(SceneError, path, "5,006 scans"):
         decode_image(path, size)
+
+
+def test_a_file_that_several_views_name_is_decoded_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [tmp_path / f"{name}.png" for name in "ab"]
+    for level, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((3, 4, 3), level, np.uint8))
+    decoded: list[Path] = []
+    monkeypatch.setattr(photos, "decode_image", lambda path, size: decoded.append(path) or decode_image(path, size))
+    actual = photos.decode_images([paths[i] for i in (1, 0, 1, 1)])
+    assert sorted(decoded) == paths
+    assert [photo.max() for photo in actual] == [1, 0, 1, 1]
+
+
+def test_photos_together_take_what_their_files_allow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each view counts, and the bytes of each file once."""
+    path = tmp_path / "a.png"
+    path.write_bytes(DATA)
+    monkeypatch.setattr(photos, "_PHOTOS_PER_BYTE", 0)
+    monkeypatch.setattr(photos, "_FREE_PHOTOS", 3 * PICTURE.nbytes)
+    assert len(photos.decode_images([path] * 3)) == 3
+    with refuses(SceneError, tmp_path, "4 of 30 x 20", f"{len(DATA):,} bytes"):
+        photos.decode_images([path] * 4)
+
+
+def test_running_out_of_memory_is_said_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV returns nothing then, as for a damaged file."""
+    path = tmp_path / "a.png"
+    path.write_bytes(DATA)
+
+    def fail(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(photos.cv2, "imdecode", lambda *_: None)
+        with refuses(SceneError, path, "decoded"):
+            decode_image(path, (30, 20))
+        patch.setattr(photos.np, "empty", fail)
+        with pytest.raises(MemoryError):
+            decode_image(path, (30, 20))
+    monkeypatch.setattr(photos.Image, "open", fail)
+    with pytest.raises(MemoryError):
+        photos.decode_mask(path)
