@@ -87,14 +87,15 @@ def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
     return sums
 
 
-def wrong_checksums(file: GsmFile) -> list[str] | None:
-    """List the arrays, or the header, whose checksum is wrong; None for a file without checksums."""
-    stored = file.header.get("checksums")
-    if not isinstance(stored, dict):
-        return None
-    checksums = _checksums(file.header, file.arrays)
-    missing = [name for name in stored if name not in checksums and name.startswith(PREFIXES)]
-    return [name for name, value in checksums.items() if stored.get(name) != value] + missing
+def _check_checksums(file: GsmFile) -> None:
+    """Raise SceneError if the header or an array is not what was written; some older files have no checksums."""
+    if not file.has_checksums:
+        return
+    stored, found = file.header["checksums"], _checksums(file.header, file.arrays)
+    wrong = [name for name, value in found.items() if stored.get(name) != value]
+    wrong += [name for name in stored if name not in found and name.startswith(PREFIXES)]
+    if wrong:
+        raise file.error(f"{', '.join(wrong[:4])}: not what was written, by the checksums")
 
 
 def float32(values: Array) -> np.ndarray:
@@ -116,6 +117,11 @@ class GsmFile:
     def error(self, problem: str) -> SceneError:
         """Make the SceneError for a damaged file."""
         return SceneError(self.path, problem, REMEDY)
+
+    @property
+    def has_checksums(self) -> bool:
+        """Whether its arrays were compared with checksums, which some files of 0.1 lack."""
+        return isinstance(self.header.get("checksums"), dict)
 
     def has(self, *prefixes: str) -> bool:
         """Return whether the name of any array begins with one of the prefixes."""
@@ -219,7 +225,7 @@ class GsmFile:
 
 
 def read_gsm(path: str | PathLike[str]) -> GsmFile:
-    """Read a ``.gsm`` file; SceneError for other files."""
+    """Read a ``.gsm`` file, and compare its checksums; SceneError for other files, and where one is wrong."""
     path = Path(path)
     budget = read_budget(path)
     try:
@@ -233,7 +239,9 @@ def read_gsm(path: str | PathLike[str]) -> GsmFile:
     text = metadata.get(STATE, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    return GsmFile(path, STATE not in metadata, _read_header(text, budget), arrays)
+    gsm = GsmFile(path, STATE not in metadata, _read_header(text, budget), arrays)
+    _check_checksums(gsm)
+    return gsm
 
 
 def _read_header(text: str, budget: ReadBudget) -> dict[str, Any]:

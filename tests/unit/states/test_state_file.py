@@ -14,6 +14,7 @@ from hostile.gsm_files import (
     WILD_NUMBERS,
     Spoil,
     assert_refused_in_one_line,
+    damaged,
     filled,
     of_arrays,
     with_about,
@@ -118,3 +119,10 @@ def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
     assert_refused_in_one_line(load_state, path)
+
+
+@pytest.mark.parametrize("name", ["children.sh0", "features.means"])
+def test_what_is_not_what_was_written_is_refused(name: str, path: Path) -> None:
+    """As finite as the numbers are: only the checksum tells."""
+    damaged(name)(path)
+    assert "checksums" in assert_refused_in_one_line(load_state, path).partition(name)[2]
