@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge import __version__
@@ -26,6 +25,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
+from gsmerge.io.tensor_file import read_tensors
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.stages import MAX_CHILDREN, MIXED
@@ -228,14 +228,8 @@ def read_gsm(path: str | PathLike[str]) -> GsmFile:
     """Read a ``.gsm`` file, and compare its checksums; SceneError for other files, and where one is wrong."""
     path = Path(path)
     budget = read_budget(path)
-    try:
-        with safe_open(path, "np") as file:
-            names = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
-            metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
-        reason = str(error).splitlines()[0]
-        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge extend"
-        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({reason})", remedy) from error
+    remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge extend"
+    metadata, arrays = read_tensors(path, f"a {SUFFIX} file", remedy, lambda name: name.startswith(PREFIXES))
     text = metadata.get(STATE, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
