@@ -91,13 +91,6 @@ def read_errors(path: StrPath) -> Iterator[None]:
         raise SceneError(path, OUT_OF_MEMORY) from error
 
 
-def check_safetensors(path: Path) -> None:
-    """Raise ValueError, before a file of any size is mapped, unless it begins as a safetensors file."""
-    with read_errors(path), path.open("rb") as file:
-        if file.read(9)[8:] != b"{":
-            raise ValueError("no header")
-
-
 def check_file(path: Path) -> int:
     """Return the size of a file in bytes; SceneError if it is missing, a folder, a pipe or a device."""
     try:

@@ -14,6 +14,7 @@ from gsmerge.types import StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
+_NAME_FOLDER = "name the folder of the photos with --images, or with --target-images those of held-out views"
 ImageSource = StrPath | Sequence[StrPath]
 
 
@@ -94,8 +95,16 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     return [(0, len(digits), digits) if p[0] in "0123456789" else (1, 0, p) for p, digits in parts]
 
 
-def find_image(folder: Path, name: str) -> Path | None:
-    """Find the image that a camera file in the folder names, with or without extension; None if there is none."""
-    path = os.path.join(folder, name)
+def find_image(folder: Path, name: str, remedy: str = _NAME_FOLDER) -> Path | None:
+    """Find the image that a camera file in the folder names, with or without extension; None if there is none.
+
+    SceneError, with the remedy, for an image that is not below the folder: a stranger's camera file could name any
+    picture of this machine. Links below it are followed.
+    """
+    path = os.path.normpath(os.path.join(folder, name))
     candidates = [path, *(path + suffix for suffix in sorted(IMAGE_SUFFIXES))]
-    return next((Path(c) for c in candidates if os.path.isfile(c)), None)
+    found = next((Path(c) for c in candidates if os.path.isfile(c)), None)
+    forms = (Path.absolute, Path.resolve)
+    if found is not None and not any(form(found).is_relative_to(form(folder)) for form in forms):
+        raise SceneError(folder, f"expected photos in this folder, found that its cameras name {found}", remedy)
+    return found

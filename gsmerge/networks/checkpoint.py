@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import ReadBudget, check_safetensors, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
+from gsmerge.io.tensor_file import read_tensors
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
@@ -65,14 +65,7 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     if not path.is_file():
         raise SceneError(path, "expected a checkpoint, found no such file", REMEDY)
     budget = read_budget(path)
-    try:
-        check_safetensors(path)
-        with read_errors(path), safe_open(path, "np") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
-        reason = str(error).splitlines()[0]
-        raise SceneError(path, f"expected a safetensors file, could not read it ({reason})", REMEDY) from error
+    header, tensors = read_tensors(path, "a safetensors file", REMEDY)
     options, training, version = _header(header, budget)
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 

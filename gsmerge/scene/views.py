@@ -50,6 +50,7 @@ from gsmerge.types import Cameras, LargePhotos
 
 _READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
 _SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw
+_MODEL_FOLDERS = ("0", "sparse", "colmap")  # of COLMAP, in a scene's folder; a model may also lie in that itself
 _SHOWS_BETTER = 0.8  # of the colours' distance from other photos
 _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the Gaussians belong to pixels
 _FLOAT_PIXEL = 12  # bytes
@@ -174,7 +175,8 @@ def _turn_photos(photos: Photos, turns: int) -> Photos:
 def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path]:
     """Find the photo file of every camera; empty where there are none, or they are inside another file."""
     if files.images is None:
-        folder = Path(camera_file.path).parent
+        place = Path(camera_file.path)
+        folder = place if place.is_dir() and place.name not in _MODEL_FOLDERS else place.parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
         if (
             not paths

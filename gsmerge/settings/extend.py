@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
+from gsmerge.settings.setting import Settings, flat_settings, setting
 from gsmerge.settings.stages import MAX_CHILDREN
 
 SUFFIX = ".gsm"  # of the file of a state
@@ -28,12 +28,29 @@ class ExtendOptions(Settings):
         "mean square, sRGB in [0, 1], holes counted) below this, or no larger than `margin` times that of the new "
         "views' own Gaussians.",
         "0: nothing is left out.", least=0, most=1)  # fmt: skip
-    margin: float = setting(1.0, "See `tolerance`.", least=0)
+    margin: float = setting(1.0, "See `tolerance`.", least=0, most=1000)
     replay: int = setting(96, "Most photos that are stored, spread evenly over all views, for a full fit when "
         "decoding.",
         "Colours are fitted batch by batch and need none.", least=0)  # fmt: skip
     fit_colors: bool = setting(True, "Fit the base colours to the photos of each batch; not of groups that keep their "
         "latents, whose colours are those of the heads.")  # fmt: skip
+
+
+def own_settings(stored: Mapping[str, Any], *, has_networks: bool) -> dict[str, Any]:
+    """Return the settings of a state's file that may decide something, each of its type and within its range.
+
+    Left out are unknown ones, the threads, and the path of a checkpoint, which stays as a name alone where the state
+    has the networks itself. Raises ValueError for others that are not allowed.
+    """
+    declared = flat_settings(CompactOptions) | flat_settings(ExtendOptions)
+    own = {name: value for name, value in stored.items() if name in declared and name != "threads"}
+    for name, value in own.items():
+        if not declared[name].fits(value):
+            raise ValueError(f"{name}: expected {declared[name].expected(value)}, got {value!r:.40}")
+    if not has_networks and own.get("checkpoint", "none") not in CHECKPOINTS:
+        del own["checkpoint"]
+    merge_settings({}, own)
+    return own
 
 
 def merge_settings(

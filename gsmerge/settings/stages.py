@@ -56,7 +56,7 @@ class SegmentOptions(Settings):
     rectangles: float | None = setting(None, "Of `rdseg`: rectangles per superpixel that it begins with.",
         "By default 2, and by effort.", least=1, unit="per superpixel")  # fmt: skip
     early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",
-        "By default 0, and by effort.")  # fmt: skip
+        "By default 0, and by effort.", least=0, most=1000)  # fmt: skip
     compactness: float = setting(1e-5, "Of `rdseg` and the clean-up of `slic`: weight of squared pixels against "
         "squared colours in [0, 1].",
         "At 0 superpixels become snakes that no Gaussian fits.", least=0, most=1)  # fmt: skip
@@ -106,9 +106,9 @@ class MatchOptions(Settings):
     neighbors: int | None = setting(None, "Nearest neighbours of other views in 3D that are compared (k, which the "
         "paper leaves open).",
         "By default 16 with `overlap`, 1 with `aabb`, which leaves holes with more.",
-        least=1)  # fmt: skip
+        least=1, most=1000)  # fmt: skip
     cluster_size: int | None = setting(None, "Most Feature Gaussians in a star cluster.",
-        "By default as many as there are views.", least=1)  # fmt: skip
+        "By default as many as there are views.", least=1, most=1_000_000)  # fmt: skip
 
     @property
     def num_neighbors(self) -> int:

@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import UsageError
 from gsmerge.facts.views import concat_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, decode_with_group_features, find_neighbors
@@ -20,7 +20,7 @@ from gsmerge.networks.tokens import GroupFeatures
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.plan import Plan
 from gsmerge.pooling import Members, feature_to_gaussians
-from gsmerge.runtime.record import note, stage
+from gsmerge.runtime.record import stage
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.assign import assign
@@ -92,7 +92,8 @@ def keeps_latents(plan: Plan) -> bool:
 def own_checkpoint(state: State, options: CompactOptions) -> Checkpoint | None:
     """Return the networks of a state as a checkpoint; None for a state without networks.
 
-    Raises UsageError if the options name other networks, SceneError if they name a file that cannot be read.
+    The path that the state names may be a stranger's, and is never opened. Raises UsageError if the options name other
+    networks, SceneError if they name a file that cannot be read.
     """
     if state.networks is None:
         return None
@@ -102,17 +103,9 @@ def own_checkpoint(state: State, options: CompactOptions) -> Checkpoint | None:
     remedy = "leave the checkpoint out, or begin a new state"
     if name in ("auto", "none"):
         raise UsageError(f"{expected}; {remedy}")
-    try:
-        same = _same(load_checkpoint(path).networks, state.networks.weights)
-    except SceneError:
-        if name != stored:
-            raise
-        same = True  # the state has its own
-    if not same and name != stored:
+    if name != stored and not _same(load_checkpoint(path).networks, state.networks.weights):
         raise UsageError(f"{expected}, found others; {remedy}")
-    if not same:
-        note(f"checkpoint {name}: not the networks that made the state any more; the state's own go on")
-    return Checkpoint(state.networks.weights, Path(path), state.about["gsmerge"], {})
+    return Checkpoint(state.networks.weights, Path(path), str(state.about.get("gsmerge")), {})
 
 
 def _same(networks: NetworkWeights, other: NetworkWeights) -> bool:

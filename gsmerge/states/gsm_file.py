@@ -16,16 +16,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.facts.prepare import Frame
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.bounds import ReadBudget, check_pixels, check_safetensors, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, check_pixels, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import MAX_NUMBER as MAX_LENGTH
 from gsmerge.io.cameras.camera_file import check_camera, check_size
+from gsmerge.io.tensor_file import read_tensors
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.stages import MAX_CHILDREN, MIXED
@@ -87,14 +87,15 @@ def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> d
     return sums
 
 
-def wrong_checksums(file: GsmFile) -> list[str] | None:
-    """List the arrays, or the header, whose checksum is wrong; None for a file without checksums."""
-    stored = file.header.get("checksums")
-    if not isinstance(stored, dict):
-        return None
-    checksums = _checksums(file.header, file.arrays)
-    missing = [name for name in stored if name not in checksums and name.startswith(PREFIXES)]
-    return [name for name, value in checksums.items() if stored.get(name) != value] + missing
+def _check_checksums(file: GsmFile) -> None:
+    """Raise SceneError if the header or an array is not what was written; some older files have no checksums."""
+    if not file.has_checksums:
+        return
+    stored, found = file.header["checksums"], _checksums(file.header, file.arrays)
+    wrong = [name for name, value in found.items() if stored.get(name) != value]
+    wrong += [name for name in stored if name not in found and name.startswith(PREFIXES)]
+    if wrong:
+        raise file.error(f"{', '.join(wrong[:4])}: not what was written, by the checksums")
 
 
 def float32(values: Array) -> np.ndarray:
@@ -116,6 +117,11 @@ class GsmFile:
     def error(self, problem: str) -> SceneError:
         """Make the SceneError for a damaged file."""
         return SceneError(self.path, problem, REMEDY)
+
+    @property
+    def has_checksums(self) -> bool:
+        """Whether its arrays were compared with checksums, which some files of 0.1 lack."""
+        return isinstance(self.header.get("checksums"), dict)
 
     def has(self, *prefixes: str) -> bool:
         """Return whether the name of any array begins with one of the prefixes."""
@@ -219,22 +225,17 @@ class GsmFile:
 
 
 def read_gsm(path: str | PathLike[str]) -> GsmFile:
-    """Read a ``.gsm`` file; SceneError for other files."""
+    """Read a ``.gsm`` file, and compare its checksums; SceneError for other files, and where one is wrong."""
     path = Path(path)
     budget = read_budget(path)
-    try:
-        check_safetensors(path)
-        with read_errors(path), safe_open(path, "np") as file:
-            names = [name for name in file.keys() if name.startswith(PREFIXES)]  # noqa: SIM118 - no mapping
-            metadata, arrays = file.metadata() or {}, {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError, ValueError, TypeError, AttributeError) as error:  # the last two: types of torch
-        reason = str(error).splitlines()[0]
-        remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge extend"
-        raise SceneError(path, f"expected a {SUFFIX} file, could not read it ({reason})", remedy) from error
+    remedy = REMEDY if path.suffix == SUFFIX else "name a file of gsmerge extend"
+    metadata, arrays = read_tensors(path, f"a {SUFFIX} file", remedy, lambda name: name.startswith(PREFIXES))
     text = metadata.get(STATE, metadata.get(ENCODED))
     if text is None:
         raise SceneError(path, "expected Feature Gaussians of gsmerge, found another safetensors file", "name the .gsm")
-    return GsmFile(path, STATE not in metadata, _read_header(text, budget), arrays)
+    gsm = GsmFile(path, STATE not in metadata, _read_header(text, budget), arrays)
+    _check_checksums(gsm)
+    return gsm
 
 
 def _read_header(text: str, budget: ReadBudget) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.networks.options import CORRECTED, GROUP
-from gsmerge.settings.extend import merge_settings
+from gsmerge.settings.extend import own_settings
 from gsmerge.settings.stages import MAX_CHILDREN
 from gsmerge.states.division import Division
 from gsmerge.states.groups import with_child_rows, without_members
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 HEAD_COUNTS = ("views", "num_members")
 LATENTS = ("refined.", "samples.", "heads.num_members")  # what later batches go on with, by the start of keys
 COLORS = ("features.fitted_sh0", "features.color_precision")
-OF_ANOTHER_RUN = ("fit", "device")  # options of 0.1's `encode` that batches cannot have
 
 
 def save_state(path: str | PathLike[str], state: State, *, overwrite: bool = False) -> None:
@@ -115,17 +114,19 @@ def load_state(path: str | PathLike[str]) -> State:
         groups=groups,
         replay=_read_replay(file, cameras) if file.has("replay.") else no_photos(cameras),
         settings=settings,
-        about=_read_about(file, len(groups), len(cameras), settings.num_input),
+        about=_read_about(file, len(groups), len(cameras), settings.num_input, has_networks=networks is not None),
         networks=networks,
         **common,
     )
 
 
-def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) -> Mapping[str, Any]:
-    """Return options, batches and source; options are converted to those of this version."""
+def _read_about(
+    file: GsmFile, num_groups: int, num_views: int, num_input: int, *, has_networks: bool
+) -> Mapping[str, Any]:
+    """Return options, batches and source; options are those of this version that a file may set."""
     about = dict(file.header["about"])
     if file.is_encoded:  # an encoded scene is a batch
-        options = {name: value for name, value in about.get("options", {}).items() if name not in OF_ANOTHER_RUN}
+        options = {name: value for name, value in about.get("options", {}).items() if name != "fit"}  # of another run
         batch = {"num_views": num_views, "num_input": num_input, "num_new": num_groups}
         batch |= {"num_covered": 0, "num_joined": 0, "num_hidden": 0, "num_groups": num_groups}
         source = {"source": about["source"]} if "source" in about else {}
@@ -133,7 +134,7 @@ def _read_about(file: GsmFile, num_groups: int, num_views: int, num_input: int) 
     if not about.keys() >= {"options", "batches"}:
         raise file.error("about: expected options and batches in the header, found none")
     try:
-        merge_settings({}, about["options"])
+        about["options"] = own_settings(about["options"], has_networks=has_networks)
     except ValueError as error:
         raise file.error(f"about: expected options of gsmerge, found others ({error})") from error
     return about

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hostile.gsm_files import with_about
+from hostile.gsm_files import Spoil, damaged, with_about
 from network_fixtures import SMALL as TINY
 from network_fixtures import noisy, written
 from sweeps import sweep
@@ -191,3 +191,25 @@ def test_no_normals(state: Path, tmp_path: Path, run: Run) -> None:
     assert sizes[0].bytes_by_attribute["normals"] == 12 * sizes[0].count
     assert "normals" not in sizes[1].bytes_by_attribute
     assert sizes[1].count == sizes[0].count
+
+
+@pytest.mark.parametrize(
+    ("spoil", "found"),
+    [(damaged("features.sh0"), "features.sh0"), (with_about(options={"neighbors": 10**9}), "neighbors")],
+    ids=["damaged", "a setting without end"],
+)
+def test_what_nobody_wrote_is_refused_by_all(
+    spoil: Spoil, found: str, state: Path, made_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    path = Path(shutil.copy(state, tmp_path / "scene.gsm"))
+    spoil(path)
+    before = path.read_bytes()
+    for command in (
+        ("compact", path, "-o", tmp_path / "out.ply"),
+        ("convert", path, tmp_path / "out.npz"),
+        ("extend", path, made_scene),
+        ("inspect", path),
+    ):
+        assert found in run(*command, code=3).err
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["scene.gsm"]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 from gsmerge.errors import SceneError
@@ -18,10 +19,13 @@ Spoil = Callable[[Path], Any]
 
 
 def entry(path: Path) -> tuple[str, dict[str, Any]]:
-    """The one entry of a file's metadata: its name, which says the format, and the header in it."""
+    """The one entry of a file's metadata: its name, which says the format, and the header in it, without checksums.
+
+    Whoever makes a hostile file makes no checksums, or right ones.
+    """
     size = int.from_bytes(path.read_bytes()[:8], "little")
     ((form, text),) = json.loads(path.read_bytes()[8 : 8 + size])["__metadata__"].items()
-    return form, dict(json.loads(text))
+    return form, {name: value for name, value in json.loads(text).items() if name != "checksums"}
 
 
 def header(path: Path) -> dict[str, Any]:
@@ -66,6 +70,17 @@ def with_array(name: str, change: Callable[[np.ndarray], np.ndarray] | None) -> 
         if change is not None:
             arrays[name] = np.ascontiguousarray(change(array))  # as safetensors takes it to be
         save_file(arrays, path, {form: json.dumps(said)})
+
+    return spoil
+
+
+def damaged(name: str) -> Spoil:
+    """The signs of an array changed behind the back of its checksum."""
+
+    def spoil(path: Path) -> None:
+        arrays = load_file(path)
+        with safe_open(path, "np") as file:
+            save_file(arrays | {name: -arrays[name]}, path, file.metadata())
 
     return spoil
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import mmap
+import os
 import re
 import struct
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -30,6 +30,7 @@ _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
+_NAME_PART = 64  # of them at a time
 
 _MAX_WORDS = 4 + max(_NUM_PARAMS.values())  # of a camera's line
 _MAX_DIGITS = 18  # of a whole number
@@ -45,10 +46,10 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if suffix == ".bin":
-            with _mapped(camera_path) as data:
-                cameras = _binary_cameras(camera_path, data)
-            with _mapped(image_path) as data:
-                images = _binary_images(image_path, data)
+            with _opened(camera_path) as file:
+                cameras = _binary_cameras(camera_path, file)
+            with _opened(image_path) as file:
+                images = _binary_images(image_path, file)
         else:
             cameras = _text_cameras(camera_path, read_lines(camera_path))
             images = _text_images(image_path, read_lines(image_path, MAX_MODEL_BYTES), cameras)
@@ -62,12 +63,28 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     return StoredCameras([cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images])
 
 
-@contextmanager
-def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """Map a file into memory, so that only bytes in use are read; an empty file raises ValueError."""
+def _opened(path: Path) -> BinaryIO:
+    """Open a file, of which points are skipped; it is not mapped, as one that becomes shorter would end the process."""
     check_file(path)
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        yield data
+    return path.open("rb")
+
+
+def _numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
+    """Read the next numbers of a file; struct.error at its end."""
+    return struct.unpack(form, file.read(struct.calcsize(form)))
+
+
+def _name(file: BinaryIO) -> str:
+    """Read text up to its zero byte."""
+    name = b""
+    while b"\0" not in name:
+        part = file.read(_NAME_PART)
+        if not part or len(name) > MAX_NAME:
+            raise ValueError("a name without an end")
+        name += part
+    text, _, rest = name.partition(b"\0")
+    file.seek(-len(rest), os.SEEK_CUR)
+    return text.decode("utf-8")
 
 
 def _pose(numbers: list[float]) -> np.ndarray:
@@ -91,35 +108,29 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
     return View("", np.eye(4), K, size, lens)
 
 
-def _binary_cameras(path: Path, data: mmap.mmap) -> dict[int, View]:
-    (count,) = struct.unpack_from("<Q", data)
+def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, View]:
+    (count,) = _numbers(file, "<Q")
     check_count(path, count)
-    position, cameras = 8, {}
+    cameras = {}
     for _ in range(count):
-        camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, position)
-        position += 24
+        camera_id, model_id, width, height = _numbers(file, "<iiQQ")
         model = _NAMES.get(model_id, f"model {model_id}")
-        params = list(struct.unpack_from(f"<{_NUM_PARAMS.get(model, 0)}d", data, position))
-        position += 8 * len(params)
+        params = list(_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
         cameras[camera_id] = _camera(path, camera_id, model, (width, height), params)
     return cameras
 
 
-def _binary_images(path: Path, data: mmap.mmap) -> list[_Image]:
-    (count,) = struct.unpack_from("<Q", data)
+def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
+    (count,) = _numbers(file, "<Q")
     check_count(path, count)
-    position, images = 8, []
+    images = []
     for _ in range(count):
-        _, *numbers, camera = struct.unpack_from("<i7di", data, position)
-        position += 64
-        end = data.find(b"\0", position, position + MAX_NAME)
-        if end < 0:
-            raise ValueError("a name without an end")
-        name = data[position:end].decode("utf-8")
-        (num_points,) = struct.unpack_from("<Q", data, end + 1)
-        position = end + 9 + 24 * num_points
-        if position > len(data):
+        _, *numbers, camera = _numbers(file, "<i7di")
+        name = _name(file)
+        (num_points,) = _numbers(file, "<Q")
+        if file.tell() + 24 * num_points > os.fstat(file.fileno()).st_size:
             raise ValueError("early end of file")
+        file.seek(24 * num_points, os.SEEK_CUR)
         images.append((name, camera, _pose(numbers)))
     return images
 

@@ -138,7 +138,7 @@ def _intrinsics(
         raise SceneError(path, problem, "add them in pixels, for all frames or for each")
     width, height = values.get("w", 0.0), values.get("h", 0.0)
     if not (width and height) and not {"fl_x", "cx", "cy"} <= values.keys():
-        image = find_image(path.parent, name)
+        image = find_image(path.parent, name, "add 'w' and 'h' to the camera file")
         if image is None:
             raise SceneError(path, f"view {name}: expected 'w' and 'h', found neither them nor the image itself")
         width, height = size_of(image)

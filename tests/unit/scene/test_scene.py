@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from tiny_scene import (
     Tiny,
     edited_json,
     frames_of,
+    write_colmap_binary,
     write_images,
     write_npz,
     write_transforms,
@@ -30,6 +32,13 @@ from gsmerge.scene.views import stored_photos
 def rewrite(path: Path, change: Callable[[dict], None]) -> None:
     with edited_json(path) as data:
         change(data)
+
+
+def name_photos(folder: Path, names: list[str]) -> None:
+    """Change the places of photos in a camera file."""
+    with edited_json(folder / "transforms.json") as data:
+        for frame, name in zip(data["frames"], names, strict=True):
+            frame["file_path"] = name
 
 
 def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
@@ -77,6 +86,42 @@ def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
     files = find_scene_files(tmp_path)
     assert files.images is None
     assert len(stored_photos(files, read_cameras(files.cameras)))
+
+
+@pytest.mark.parametrize("name", ["../other/{}", "{root}/other/{}", "images/../../other/{}"])
+def test_photos_of_others_are_refused(name: str, tmp_path: Path, tiny: Tiny) -> None:
+    """Whatever a stranger's camera file names; --images may name them."""
+    folder = tiny.save(tmp_path / "scene", images=False)
+    write_images(tmp_path / "other", tiny)
+    places = [name.format(n, root=tmp_path) for n in tiny.names]
+    name_photos(folder, places)
+    with refuses(SceneError, folder, tmp_path / "other" / tiny.names[0], "--images"):
+        read_scene(folder)
+    assert np.array_equal((read_scene(folder, images=tmp_path / "other").images * 255).round(), tiny.images)
+    shutil.rmtree(tmp_path / "other")
+    assert read_scene(folder).images is None  # as on every machine but the one that trained it
+
+
+def test_photos_beside_a_colmap_scene_are_not_its_own(tmp_path: Path, tiny: Tiny) -> None:
+    """Whose model lies in the scene's own folder."""
+    folder = tiny.save(tmp_path / "scene", images=False)
+    (folder / "transforms.json").unlink()
+    write_colmap_binary(folder, tiny)
+    write_images(tmp_path, tiny)
+    assert read_scene(folder).images is None
+    write_images(folder, tiny)
+    assert np.array_equal((read_scene(folder).images * 255).round(), tiny.images)
+
+
+def test_photos_inside_by_other_names(tmp_path: Path, tiny: Tiny) -> None:
+    """With their whole paths, through a link to the folder, and with .. that comes back."""
+    tiny.save(tmp_path / "scene", images=False)
+    write_images(tmp_path / "scene" / "train", tiny)
+    (tmp_path / "link").symlink_to("scene")
+    for root in (tmp_path / "scene", tmp_path / "link"):
+        for place in (root, tmp_path / "scene", "x/.."):
+            name_photos(root, [f"{place}/train/{name}" for name in tiny.names])
+            assert np.array_equal((read_scene(root).images * 255).round(), tiny.images)
 
 
 def test_rows_with_nan_keep_the_order(tmp_path: Path, tiny: Tiny) -> None:

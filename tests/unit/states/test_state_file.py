@@ -14,6 +14,7 @@ from hostile.gsm_files import (
     WILD_NUMBERS,
     Spoil,
     assert_refused_in_one_line,
+    damaged,
     filled,
     of_arrays,
     with_about,
@@ -62,6 +63,14 @@ DAMAGED: dict[str, Spoil] = {
     "batches by number": with_header(about={"options": {}, "batches": {"0": 1}}),
     "options of words": with_about(options={"k": "many"}),
     "a crop by number": with_about(options={"crop": 5}),
+    "a checkpoint in a list": with_about(options={"checkpoint": ["x"]}),
+    "neighbours without end": with_about(options={"neighbors": 10**9}),
+    "sweeps without end": with_about(options={"early_sweeps": 10**20}),
+    "clusters without end": with_about(options={"cluster_size": 10**30}),
+    "a margin without end": with_about(options={"margin": 1e308}),
+    "a seed of words": with_about(options={"seed": "5"}),
+    "a budget in an object": with_about(options={"budget": {}}),
+    "an effort in a list": with_about(options={"effort": ["best"]}),
     "latents without networks": with_array("features.latents", lambda a: np.zeros((len(a), 4), np.float32)),
     "most of fewer than there are": with_settings(max_k=1),
     "a negative number": with_settings(num_input=-1),
@@ -118,3 +127,22 @@ def test_what_no_view_sees_comes_back(tmp_path: Path) -> None:
 def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     DAMAGED[damage](path)
     assert_refused_in_one_line(load_state, path)
+
+
+@pytest.mark.parametrize("name", ["children.sh0", "features.means"])
+def test_what_is_not_what_was_written_is_refused(name: str, path: Path) -> None:
+    """As finite as the numbers are: only the checksum tells."""
+    damaged(name)(path)
+    assert "checksums" in assert_refused_in_one_line(load_state, path).partition(name)[2]
+
+
+def test_a_file_decides_nothing_of_the_machine(path: Path, tmp_path: Path) -> None:
+    said = {
+        "threads": 3000,
+        "device": "cuda",
+        "checkpoint": str(tmp_path / "x.safetensors"),
+        "seed": 4,
+        "of later": [1],
+    }
+    with_about(options=said)(path)
+    assert load_state(path).about["options"] == {"seed": 4}

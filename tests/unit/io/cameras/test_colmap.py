@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from messages import refuses
 from tiny_scene import (
@@ -16,6 +19,7 @@ from tiny_scene import (
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
+from gsmerge.io.cameras import colmap
 
 
 @pytest.mark.parametrize("write", [write_colmap_text, write_colmap_binary])
@@ -64,6 +68,23 @@ def test_truncated_colmap_files_are_named(tmp_path: Path, tiny: Tiny, name: str)
         (tmp_path / name).write_bytes(data[:length])
         with refuses(SceneError, tmp_path, "damaged", "images.bin"):
             read_cameras(tmp_path)
+
+
+def test_a_model_that_shrinks_while_it_is_read(tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, not the signal that reading mapped pages beyond the end would be."""
+    write_colmap_binary(tmp_path, tiny)
+    path, make_pose = tmp_path / "images.bin", colmap._pose
+    data = path.read_bytes()
+    end = data.index(b"\0", 72) + 1  # of the first image's name; points follow it
+    path.write_bytes(data[:end] + struct.pack("<Q", 50_000) + bytes(24 * 50_000) + data[end + 8 :])
+
+    def pose_then_cut(numbers: list[float]) -> np.ndarray:
+        os.truncate(path, 4096)
+        return make_pose(numbers)
+
+    monkeypatch.setattr(colmap, "_pose", pose_then_cut)
+    with refuses(SceneError, tmp_path, "damaged", "images.bin"):
+        read_cameras(tmp_path)
 
 
 @pytest.mark.parametrize("kept", ["none", "all but empty ones", "the empty ones"])

@@ -1,0 +1,50 @@
+"""Safetensors files, read into memory: a mapped file that becomes shorter would end the process without a word."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, deserialize
+
+from gsmerge.errors import SceneError
+from gsmerge.io.bounds import parse_json, read_budget
+
+_HEADER_SIZE = 8  # bytes of the number that says how many the header has
+_ARRAY_MEMORY, _COPIES = 1800, 3  # bytes of an array's description, and of the file, while it is read
+_TYPES = {
+    "F64": np.float64, "F32": np.float32, "F16": np.float16, "I64": np.int64, "I32": np.int32, "I16": np.int16,
+    "I8": np.int8, "U64": np.uint64, "U32": np.uint32, "U16": np.uint16, "U8": np.uint8, "BOOL": np.bool_,
+}  # fmt: skip
+
+
+def read_tensors(
+    path: Path, what: str, remedy: str, wanted: Callable[[str], bool] = lambda _: True
+) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Read the metadata of a safetensors file, and its arrays of ``wanted`` names.
+
+    Raises SceneError, which says that ``what`` was expected, for a file that is none, or becomes shorter meanwhile.
+    """
+    budget = read_budget(path)
+    try:
+        with path.open("rb") as file:
+            size = file.read(_HEADER_SIZE)
+            num_bytes = int.from_bytes(size, "little")
+            if not 0 < num_bytes <= budget.file_bytes:
+                raise ValueError("no header of a safetensors file")
+            head = file.read(num_bytes)
+            budget.check_memory(_ARRAY_MEMORY * head.count(b"{") + _COPIES * budget.file_bytes, "arrays")
+            header = parse_json(head.decode("utf-8"), budget)
+            metadata = header.get("__metadata__") if isinstance(header, dict) else None
+            del header
+            arrays = {
+                name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
+                for name, tensor in deserialize(size + head + file.read())
+                if wanted(name)
+            }
+    except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
+        reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
+        reason = next(iter(reason.splitlines()), "out of memory")
+        raise SceneError(path, f"expected {what}, could not read it ({reason})", remedy) from error
+    return metadata or {}, arrays

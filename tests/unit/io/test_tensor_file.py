@@ -1,0 +1,79 @@
+"""Safetensors files: the same arrays as its own reader gives, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from messages import refuses
+from safetensors.numpy import load_file, save_file
+
+from gsmerge.errors import SceneError
+from gsmerge.io import tensor_file
+from gsmerge.io.tensor_file import read_tensors
+
+REMEDY = "name another"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    types = (np.float64, np.float32, np.float16, np.int64, np.int32, np.int16, np.int8, np.uint64, np.uint8, np.bool_)
+    arrays = {f"a.{np.dtype(kind)}": rng.uniform(0, 99, (50, 400)).astype(kind) for kind in types}
+    path = tmp_path / "a.gsm"
+    save_file(arrays | {"a.none": np.zeros((3, 0), np.float32), "b": np.ones(2)}, path, {"of": "a test"})
+    return path
+
+
+def test_what_is_read(path: Path) -> None:
+    metadata, arrays = read_tensors(path, "a file", REMEDY, lambda name: name.startswith("a."))
+    expected = load_file(path)
+    del expected["b"]
+    assert metadata == {"of": "a test"}
+    assert arrays.keys() == expected.keys()
+    for name, array in arrays.items():
+        assert (array.dtype, array.shape) == (expected[name].dtype, expected[name].shape), name
+        np.testing.assert_array_equal(array, expected[name], name)
+
+
+def test_a_file_that_shrinks_while_it_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, not the signal that reading mapped pages beyond the end would be."""
+    parse = tensor_file.parse_json
+
+    def parse_then_cut(*arguments: Any) -> Any:
+        os.truncate(path, path.stat().st_size // 2)
+        return parse(*arguments)
+
+    monkeypatch.setattr(tensor_file, "parse_json", parse_then_cut)
+    with refuses(SceneError, path, "a file", REMEDY):
+        read_tensors(path, "a file", REMEDY)
+
+
+def test_types_that_numpy_lacks(tmp_path: Path) -> None:
+    path = tmp_path / "a.gsm"
+    head = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
+    path.write_bytes(len(head).to_bytes(8, "little") + head + bytes(2))
+    with refuses(SceneError, path, "BF16"):
+        read_tensors(path, "a file", REMEDY)
+    assert read_tensors(path, "a file", REMEDY, lambda name: name != "a") == ({}, {})
+
+
+def test_a_sparse_file_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.gsm"
+    path.touch()
+    os.truncate(path, 1 << 40)
+    with refuses(SceneError, path, "header"):
+        read_tensors(path, "a file", REMEDY)
+
+
+def test_more_arrays_than_a_file_may_have(tmp_path: Path) -> None:
+    """Each of 55 bytes, of which the reader would make 1.7 kB."""
+    path = tmp_path / "a.gsm"
+    head = json.dumps({f"{i}": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}).encode()
+    path.write_bytes(len(head).to_bytes(8, "little") + head)
+    with refuses(SceneError, path, "arrays"):
+        read_tensors(path, "a file", REMEDY)
