@@ -33,7 +33,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Make sure that stdout and stderr exist and accept any character, since file names may have any."""
+    """Make sure that stdout and stderr exist and accept any character, since file names may have any.
+
+    A descriptor from 0 to 2 that the caller closed becomes the null device: the next file would take its place, and a
+    process of a batch writes to it.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest that is free
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
