@@ -148,9 +148,9 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             seconds = task.time_remaining
             return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
 
-    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}") for name in ("count", "detail"))
+    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}", markup=False) for name in ("count", "detail"))
     place = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
-    name = rich.TextColumn("{task.description:>12}", table_column=place)
+    name = rich.TextColumn("{task.description:>12}", markup=False, table_column=place)
     columns: tuple[rich.ProgressColumn, ...] = (name, _bar(console), count)
     if console.width >= NARROW:
         columns = *columns[:2], rich.TimeElapsedColumn(), count, TimeLeft(), detail
@@ -216,7 +216,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, s
 
     columns = (
         _bar(console), rich.MofNCompleteColumn(), *[rich.TimeElapsedColumn()] * (console.width >= NARROW),
-        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
     )  # fmt: skip
     bars, last = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
     with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):

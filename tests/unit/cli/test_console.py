@@ -90,3 +90,12 @@ def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str
         progress("room failed", 1, "no photos")
         progress("garden done, 1 failed", 2, "")
     assert capsys.readouterr().err == "1/2 room failed: no photos\n2/2 garden done, 1 failed\n"
+
+
+def test_brackets_in_names_are_no_markup_in_bars() -> None:
+    with redirect_stderr(Terminal()) as terminal, total_progress(2, quiet=False) as progress:
+        progress("z[/b] done", 2, "")
+    assert "z[/b] done" in terminal.getvalue()
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as move:
+        move("[/b]: z[/b]", 1, 2)
+    assert terminal.getvalue().count("[/b]") > 1
