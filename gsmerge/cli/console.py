@@ -167,7 +167,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             running.clear()
 
         def move(stage: str, done: int, total: int) -> None:
-            name, _, detail = stage.partition(": ")
+            name, _, detail = one_line(stage).partition(": ")
             if running != [name]:
                 finish()
                 if name == "done":

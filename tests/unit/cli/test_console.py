@@ -99,3 +99,10 @@ def test_brackets_in_names_are_no_markup_in_bars() -> None:
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as move:
         move("[/b]: z[/b]", 1, 2)
     assert terminal.getvalue().count("[/b]") > 1
+
+
+def test_bars_of_stages_escape_what_terminals_obey() -> None:
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
+        progress("inspect: a\x1b]0;title\x07.ply", 1, 2)
+    assert "\x1b]" not in terminal.getvalue()
+    assert r"a\x1b]0;title\x07.ply" in terminal.getvalue()
