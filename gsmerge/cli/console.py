@@ -97,10 +97,16 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print warnings in the block as one line each, without file and line number."""
+    """Print warnings in the block as one line each, without file and line number; those of numpy as one note."""
+    numbers: list[str] = []
 
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        say(f"gsmerge: warning: {message}")
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        if not issubclass(category, RuntimeWarning):
+            say(f"gsmerge: warning: {message}")
+            return
+        if not numbers:
+            say(f"note: some numbers are too large, or undefined ({message})")
+        numbers.append(str(message))
 
     with warnings.catch_warnings():
         warnings.showwarning = show

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from contextlib import redirect_stderr
 
 import pytest
 
-from gsmerge.cli.console import OPENING, opening_line, print_document, say, stage_progress, total_progress
+from gsmerge.cli.console import (
+    OPENING,
+    opening_line,
+    plain_warnings,
+    print_document,
+    say,
+    stage_progress,
+    total_progress,
+)
 
 
 class Terminal(io.StringIO):
@@ -106,3 +115,14 @@ def test_bars_of_stages_escape_what_terminals_obey() -> None:
         progress("inspect: a\x1b]0;title\x07.ply", 1, 2)
     assert "\x1b]" not in terminal.getvalue()
     assert r"a\x1b]0;title\x07.ply" in terminal.getvalue()
+
+
+def test_warnings_of_numbers_are_one_note(capsys: pytest.CaptureFixture[str]) -> None:
+    with plain_warnings():
+        warnings.simplefilter("always")
+        for text in ("Mean of empty slice", "invalid value encountered in divide"):
+            warnings.warn(text, RuntimeWarning, stacklevel=1)
+        warnings.warn("old", UserWarning, stacklevel=1)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "note: some numbers are too large, or undefined (Mean of empty slice)"
+    assert second == "gsmerge: warning: old"
