@@ -88,7 +88,7 @@ def check_cameras(
             photo = photo_colors(images, np.full(len(x), view), y, x)
             errors.append(np.abs(colors[inside] - photo).mean(1))
             shuffled_errors.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
-    share, ratio = float(visible.mean()), np.nan
+    share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan
     if errors and (other := float(np.concatenate(shuffled_errors).mean())) > _SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
     return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import NoReturn
 
+INTERRUPTED = 130  # exit code
 GC_THRESHOLDS = 200_000, 10, 10  # a command imports 115,000 objects: looking for cycles in them takes 30 ms each time
 
 
@@ -33,7 +35,16 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """Make sure that stdout and stderr exist and accept any character, since file names may have any."""
+    """Make sure that stdout and stderr exist and accept any character, since file names may have any.
+
+    A descriptor from 0 to 2 that the caller closed becomes the null device: the next file would take its place, and a
+    process of a batch writes to it.
+    """
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest that is free
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
@@ -42,12 +53,21 @@ def _open_streams() -> None:
             reconfigure(errors="backslashreplace")
 
 
+def stop_at_once(*_: object) -> NoReturn:
+    """End the process with a line, as the handler of SIGINT while there is nothing to clean up, such as in imports."""
+    with suppress(OSError):
+        os.write(2, b"gsmerge: error: interrupted\n")
+    os._exit(INTERRUPTED)
+
+
 def program() -> NoReturn:
     """Run :func:`main` as the installed program, and end the process.
 
     Exit handlers run and output is flushed. The interpreter is not shut down, which would take time with gigabytes of
     arrays.
     """
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, stop_at_once)
     code = main()
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):

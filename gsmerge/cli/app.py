@@ -17,6 +17,7 @@ import typer
 from typer.core import TyperCommand
 
 from gsmerge import __version__
+from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import plain_warnings, say
 from gsmerge.cli.parameters import SEED, listed_settings
 from gsmerge.errors import (
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 PROGRAM = "gsmerge"
-INTERRUPTED = 130
 DEBUG = "--debug"
 
 # What other programs call a command, and the number of Gaussians
@@ -276,7 +276,8 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     usual |= {getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
     if threading.current_thread() is not threading.main_thread():
         usual = {}
-    ours = {number: handler for number, handler in usual.items() if signal.getsignal(number) == handler}
+    ours = {number: signal.getsignal(number) for number in usual}
+    ours = {number: handler for number, handler in ours.items() if handler in (usual[number], stop_at_once)}
     for number in ours:
         signal.signal(number, stop)
     print_it, sys.unraisablehook = sys.unraisablehook, try_again

@@ -97,10 +97,16 @@ def print_document(
 
 @contextmanager
 def plain_warnings() -> Iterator[None]:
-    """Print warnings in the block as one line each, without file and line number."""
+    """Print warnings in the block as one line each, without file and line number; those of numpy as one note."""
+    numbers: list[str] = []
 
-    def show(message: Warning | str, *_: Any, **__: Any) -> None:
-        say(f"gsmerge: warning: {message}")
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        if not issubclass(category, RuntimeWarning):
+            say(f"gsmerge: warning: {message}")
+            return
+        if not numbers:
+            say(f"note: some numbers are too large, or undefined ({message})")
+        numbers.append(str(message))
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -148,9 +154,9 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             seconds = task.time_remaining
             return "" if task.finished or not seconds or seconds < SHORT else f"{duration(seconds)} left"
 
-    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}") for name in ("count", "detail"))
+    count, detail = (rich.TextColumn(f"{{task.fields[{name}]}}", markup=False) for name in ("count", "detail"))
     place = Column(max_width=max(18, console.width // 3), no_wrap=True, overflow="ellipsis")
-    name = rich.TextColumn("{task.description:>12}", table_column=place)
+    name = rich.TextColumn("{task.description:>12}", markup=False, table_column=place)
     columns: tuple[rich.ProgressColumn, ...] = (name, _bar(console), count)
     if console.width >= NARROW:
         columns = *columns[:2], rich.TimeElapsedColumn(), count, TimeLeft(), detail
@@ -167,7 +173,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             running.clear()
 
         def move(stage: str, done: int, total: int) -> None:
-            name, _, detail = stage.partition(": ")
+            name, _, detail = one_line(stage).partition(": ")
             if running != [name]:
                 finish()
                 if name == "done":
@@ -216,7 +222,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, s
 
     columns = (
         _bar(console), rich.MofNCompleteColumn(), *[rich.TimeElapsedColumn()] * (console.width >= NARROW),
-        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}"),
+        rich.TextColumn("left"), rich.TimeRemainingColumn(), rich.TextColumn("{task.description}", markup=False),
     )  # fmt: skip
     bars, last = rich.Progress(*columns), Text(no_wrap=True, overflow="ellipsis")
     with Live(Group(bars, last), console=console, transient=True, refresh_per_second=5):

@@ -62,7 +62,8 @@ def render(args: opt.Args) -> None:
     if args.path is not None and parse_path(args.path) is None:  # of a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
-        check_outputs((args.output,), inputs, overwrite=args.overwrite)
+        read = [path for path in inputs if path not in args.scenes or not path.is_dir()]  # photos in it may not be
+        check_outputs((args.output,), (*read, files.images), overwrite=args.overwrite)
     else:
         check_folder(args.output, inputs, overwrite=args.overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()

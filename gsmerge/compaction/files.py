@@ -8,6 +8,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.placement import add_colmap, add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
@@ -21,16 +23,21 @@ from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.runtime.memory import release_memory
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_part
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
+from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Cameras, Scene
 
 if TYPE_CHECKING:
     from gsmerge.compaction.streamed_parts import StreamedParts
+
+# Opacity times area of a scene's Gaussians together, of each view, as a share of its box's squared diagonal: all of it
+# that is left once they are merged is at most a tenth of this where each result is too transparent to be kept
+COVERED, SAMPLES = 0.006, 200_000
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,7 @@ def compact_files(
         read = perf_counter()
         result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
-            problem = "expected Gaussians that show something, found none that is left once they are merged"
-            raise SceneError(files.ply, problem, "look at its scales and opacities with gsmerge inspect")
+            raise nothing_left(files.ply)
         result = _padded(result) if outputs.full_columns else result
         parts = None
         if ending == INDEX:
@@ -104,6 +110,28 @@ def compact_files(
     if parts is not None:
         parts.remove_unused(out)
     return document
+
+
+def nothing_left(path: Path) -> SceneError:
+    """Return the error of a scene whose Gaussians are all too small or too transparent to show anything."""
+    problem = "expected Gaussians that show something, found none that is left once they are merged"
+    return SceneError(path, problem, "look at its scales and opacities")
+
+
+def shows_nothing(scene: Scene) -> bool:
+    """Return whether a run would end with :func:`nothing_left`; a scene that covers little is merged to find out."""
+    gaussians = scene.finite_gaussians
+    sample = gaussians[:: max(1, len(gaussians) // SAMPLES)]
+    if len(sample) == 0:
+        return False
+    low, high = np.percentile(sample.means.astype(np.float64), BOX_QUANTILES, axis=0)
+    areas = np.sort(sample.scales.astype(np.float64), axis=1)[:, 1:].prod(1)
+    covered, num_views = len(gaussians) * float((sample.opacities * areas).mean()), len(scene) if scene.aligned else 1
+    if covered > COVERED * num_views * float(np.square(high - low).sum()):
+        return False
+    settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})
+    with record_part(silent=True):
+        return len(compact(scene, settings).gaussians) == 0
 
 
 def _write_results(

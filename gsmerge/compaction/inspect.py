@@ -10,6 +10,7 @@ import numpy as np
 
 from gsmerge.alignment import check_cameras
 from gsmerge.compaction.estimate import estimate, estimate_lines
+from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.prepare import canonicalise, missing_notes
@@ -158,6 +159,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"auto": _describe_auto(scene)}
     if not is_result:
         facts["exporter"] = exporter_names(load.exporters)
+    if shows_nothing(scene):
+        return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {

@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
-from itertools import groupby
+from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Protocol
 
@@ -130,16 +130,15 @@ def link_file(source: Path, target: Path) -> None:
 
 def _make_folder(folder: Path) -> Iterator[Path]:
     """Make a folder and its parents, and yield each that was missing."""
-    if os.path.lexists(folder):
-        return
-    yield from _make_folder(folder.parent)
-    try:
-        os.mkdir(folder)
-        yield folder
-    except FileExistsError:  # somebody else was quicker
-        pass
-    except OSError as error:
-        raise SceneError(folder, f"cannot be made ({error.strerror})", "choose another folder") from error
+    missing = list(takewhile(lambda path: not os.path.lexists(path), (folder, *folder.parents)))
+    for path in reversed(missing):
+        try:
+            os.mkdir(path)
+            yield path
+        except FileExistsError:  # somebody else was quicker
+            pass
+        except OSError as error:
+            raise SceneError(path, f"cannot be made ({error.strerror})", "choose another folder") from error
 
 
 def _rename_all(files: Sequence[tuple[str, Path]]) -> None:

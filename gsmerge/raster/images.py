@@ -19,7 +19,7 @@ from gsmerge.raster.composite import (
     view_colors,
 )
 from gsmerge.raster.photos import NEAR
-from gsmerge.raster.tiled_view import TiledView, prepare, tile_view
+from gsmerge.raster.tiled_view import FAR, TiledView, prepare, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, Scene, like
 
@@ -41,7 +41,7 @@ def render(
     *,
     antialiased: bool = False,
     near: float = 0.01,
-    far: float = 1e10,
+    far: float = FAR,
     with_depths: bool = False,
 ) -> Rendering:
     """Render Gaussians into every camera.

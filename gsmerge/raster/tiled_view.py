@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -21,7 +22,7 @@ Array = NDArray[Any]
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
 MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-NEAR, FAR = 0.01, 1e10  # depths, world units
+NEAR, FAR = 0.01, math.inf  # depths, world units
 
 
 @dataclass(frozen=True, eq=False)

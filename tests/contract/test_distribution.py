@@ -125,6 +125,7 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
     steps = (root / "Dockerfile").read_text()
     assert steps.count("\nFROM python:3.11-slim") == 1
     assert "pip install --no-cache-dir -c constraints.txt ." in steps
+    assert re.findall(r"PIP_(?:BUILD_)?CONSTRAINT=(\S+)", steps) == ["/opt/gsmerge/constraints.txt"] * 2  # of the build
     copied = {word for line in re.findall(r"^COPY (.+) \S+$", steps, re.MULTILINE) for word in line.split()}
     assert copied >= {*SOURCES, "constraints.txt"}
     assert [name for name in copied if not (root / name).exists()] == []
@@ -135,3 +136,5 @@ def test_what_the_image_runs(root: Path, project: dict[str, Any]) -> None:
     steps = (root / "Dockerfile").read_text()
     (entry,) = re.findall(r'^ENTRYPOINT \["(.+)"\]$', steps, re.MULTILINE)
     assert entry in project["scripts"]
+    (user,) = re.findall(r"^USER (.+)$", steps, re.MULTILINE)
+    assert user not in ("0", "root")

@@ -330,3 +330,11 @@ def test_generator_names_every_range_style_and_path(root: Path) -> None:
     text = (root / "docs" / "internals" / "lab.md").read_text()
     names = [f.name for f in fields(NoiseOptions)] + [*STYLES, *PATHS]
     assert [name for name in names if f"`{name}`" not in text] == []
+
+
+def test_security_names_the_programs_that_commands_start() -> None:
+    sources = "".join(path.read_text("utf-8") for path in (ROOT / "gsmerge").rglob("*.py"))
+    said = (ROOT / "SECURITY.md").read_text("utf-8")
+    programs = re.findall(r'shutil\.which\("(\w+)"\)', sources)
+    assert programs
+    assert [program for program in programs if f"`{program}`" not in said] == []

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from messages import ERROR
 from sweeps import sweep
 
 HEAVY = ("torch", "cv2", "numpy", "plyfile", "skimage", "matplotlib", "jinja2")
@@ -82,3 +84,22 @@ def test_a_damaged_opencv_names_the_remedy(tmp_path: Path, made_scene: Path) -> 
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "--force-reinstall opencv-contrib-python-headless" in done.stderr
+
+
+@pytest.mark.usefixtures("foreground")
+def test_ctrl_c_while_a_command_is_imported_is_one_line() -> None:
+    code = """
+import signal, sys
+from gsmerge.cli import program
+
+class Finder:
+    @staticmethod
+    def find_spec(name, *_):
+        if name == "typer":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder)
+program()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", f"{ERROR}interrupted\n")

@@ -128,3 +128,11 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(rooms: Path, tmp_path: Path
     assert errors.count("\n") == 1
     assert finish(*said) == 0
     assert results(tmp_path) == undisturbed
+
+
+def test_descriptors_that_the_caller_closed(smallest_scene: Path, tmp_path: Path) -> None:
+    """The pipe to a process does not take the place of one of them."""
+    words = (sys.executable, "-m", "gsmerge", "batch", smallest_scene, "--output", tmp_path / "out", *FAST)
+    done = subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *map(str, words)], check=False)
+    assert done.returncode == 0
+    assert len(results(tmp_path / "out")) == 1

@@ -163,6 +163,14 @@ def test_panel(scene_copy: Path, run: Run) -> None:
     assert 2 * WIDTH <= cv2.imread(str(alone)).shape[1] < sheet.shape[1]
 
 
+def test_a_panel_beside_the_scene_is_replaced_and_photos_are_not(small_copy: Path, run: Run) -> None:
+    call = ("render", small_copy, "--views", 1, "--overwrite")
+    for _ in range(2):
+        run(*call, "-o", small_copy / "p.png", code=0)
+    run(*call, "-o", small_copy / "images" / "view_000.png", code=2)
+    run(*call, "--images", small_copy, "-o", small_copy / "p.png", code=2)
+
+
 def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(scene_copy: Path, run: Run) -> None:
     out, call = scene_copy / "wide.jpg", ("render", scene_copy, "--views", 1, "--size", "480x160")
     run(*call, "-o", out, code=0)

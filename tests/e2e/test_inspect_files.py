@@ -171,3 +171,23 @@ def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) ->
     with_text(json.dumps(header(path)))(path)
     done = run("inspect", path, code=0)
     assert says(done.err, f"note: {path}", "checksums")
+
+
+# What no result is left of, and beside it what is merged to find that out, and is sound
+@pytest.mark.parametrize(
+    ("name", "value", "code"),
+    [("opacities", 0, 3), ("opacities", 1e-13, 3), ("opacities", 1e-5, 3), ("opacities", 1e-4, 0),
+     ("scales", np.exp(-30), 3), ("scales", 0.01, 0), ("means", 1e6, 3)],
+)  # fmt: skip
+def test_a_scene_that_shows_nothing_is_refused_as_compact_refuses_it(
+    name: str, value: float, code: int, smallest_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    scene = Path(shutil.copytree(smallest_scene, tmp_path / "room"))
+    gaussians = gsmerge.read_ply(scene / "scene.ply").gaussians
+    array = getattr(gaussians, name)
+    array[:] = array * value if name == "means" else value
+    gsmerge.write_ply(scene / "scene.ply", gaussians, overwrite=True)
+    refused = run("compact", scene, "-o", tmp_path / "out.ply", "-q", code=code).err
+    assert run("inspect", scene, "-q", code=code).err == refused
+    problem = refused.removeprefix(ERROR).strip()
+    assert problem in run("inspect", scene, smallest_scene, code=code).out

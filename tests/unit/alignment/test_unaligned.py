@@ -131,3 +131,13 @@ def test_photos_that_the_model_saw_where_others_do_not_show_the_scene(tmp_path: 
     assert np.abs(loaded.scene.images - SMOOTH.images / 255).mean() < 0.01
     assert noted(loaded.notes, "images_resized") == (shows == "images_resized")
     assert loaded.files.images.name == shows
+
+
+def test_rows_that_are_all_padding_are_refused(tmp_path: Path) -> None:
+    """Also where the first camera stands among them; nothing is divided by their number, which is 0."""
+    rows = np.repeat(voxels()[:1], 100)
+    for name in "xyz":
+        rows[name] = 0
+    folder = save_export(tmp_path, SMOOTH, rows)
+    with refuses(SceneError, "scene.ply", "the cameras see 0 % of the Gaussians"):
+        load_scene(folder)

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from contextlib import redirect_stderr
 
 import pytest
 
-from gsmerge.cli.console import OPENING, opening_line, print_document, say, stage_progress, total_progress
+from gsmerge.cli.console import (
+    OPENING,
+    opening_line,
+    plain_warnings,
+    print_document,
+    say,
+    stage_progress,
+    total_progress,
+)
 
 
 class Terminal(io.StringIO):
@@ -90,3 +99,30 @@ def test_without_a_terminal_each_run_is_a_line(capsys: pytest.CaptureFixture[str
         progress("room failed", 1, "no photos")
         progress("garden done, 1 failed", 2, "")
     assert capsys.readouterr().err == "1/2 room failed: no photos\n2/2 garden done, 1 failed\n"
+
+
+def test_brackets_in_names_are_no_markup_in_bars() -> None:
+    with redirect_stderr(Terminal()) as terminal, total_progress(2, quiet=False) as progress:
+        progress("z[/b] done", 2, "")
+    assert "z[/b] done" in terminal.getvalue()
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as move:
+        move("[/b]: z[/b]", 1, 2)
+    assert terminal.getvalue().count("[/b]") > 1
+
+
+def test_bars_of_stages_escape_what_terminals_obey() -> None:
+    with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
+        progress("inspect: a\x1b]0;title\x07.ply", 1, 2)
+    assert "\x1b]" not in terminal.getvalue()
+    assert r"a\x1b]0;title\x07.ply" in terminal.getvalue()
+
+
+def test_warnings_of_numbers_are_one_note(capsys: pytest.CaptureFixture[str]) -> None:
+    with plain_warnings():
+        warnings.simplefilter("always")
+        for text in ("Mean of empty slice", "invalid value encountered in divide"):
+            warnings.warn(text, RuntimeWarning, stacklevel=1)
+        warnings.warn("old", UserWarning, stacklevel=1)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "note: some numbers are too large, or undefined (Mean of empty slice)"
+    assert second == "gsmerge: warning: old"

@@ -80,6 +80,10 @@ def test_missing_folders_are_made_and_removed_where_the_block_fails(tmp_path: Pa
     with pytest.raises(ZeroDivisionError), atomic_output(tmp_path / "a" / "c" / "d" / "out.txt"):
         raise ZeroDivisionError
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+    deep = tmp_path.joinpath("deep", *["a"] * 1700, "out.txt")  # Python calls itself 1,000 times at most
+    with pytest.raises(ZeroDivisionError), atomic_output(deep):
+        raise ZeroDivisionError
+    assert not (tmp_path / "deep").exists()
 
 
 def test_a_file_as_folder_and_a_folder_as_target_are_refused(tmp_path: Path) -> None:

@@ -53,6 +53,12 @@ def test_a_pixel_stops_before_it_is_too_dark() -> None:
     assert value(rendering.images, 10, 5) == pytest.approx(0.0999**3, rel=1e-4)
 
 
+def test_there_is_no_farthest_depth() -> None:
+    near, huge = (render(balls((0, 0, s, 0.02 * s, 0.8, 1.0)), camera(), near=0.01 * s) for s in (1, 4e13))
+    np.testing.assert_allclose(huge.images, near.images, atol=1e-6)
+    assert value(huge.images, 10, 5) > 0.7
+
+
 def test_no_gaussians_leave_the_background() -> None:
     rendering = render(balls(), camera(count=2), 0.5, with_depths=True)
     assert rendering.images.shape == (2, 11, 21, 3)
