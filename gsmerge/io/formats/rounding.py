@@ -22,7 +22,7 @@ SAMPLE = 1 << 17  # Gaussians that are enough to tell
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     """Describe how far a file's rounding moves Gaussians, and the remedy; empty where pictures do not show it."""
     chosen = output_format(path, levels=True, cameras=True)
-    if chosen is COLMAP:  # which keeps float64
+    if len(gaussians) == 0 or chosen is COLMAP:  # which keeps float64
         return []
     columns, step = gaussians.numpy(), len(gaussians) // SAMPLE + 1
     ends = columns.means.argmin(axis=0), columns.means.argmax(axis=0)  # which formats scale by
