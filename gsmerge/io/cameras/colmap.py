@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
-from gsmerge.io.bounds import MAX_MODEL_BYTES, check_file, read_lines
+from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
 from gsmerge.io.cameras.camera_file import View, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
@@ -46,9 +46,9 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
         if suffix == ".bin":
-            with _opened(camera_path) as file:
+            with camera_path.open("rb") as file:  # mapped, a file that becomes shorter would end the process
                 cameras = _binary_cameras(camera_path, file)
-            with _opened(image_path) as file:
+            with image_path.open("rb") as file:
                 images = _binary_images(image_path, file)
         else:
             cameras = _text_cameras(camera_path, read_lines(camera_path))
@@ -61,12 +61,6 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     except OSError as error:
         raise SceneError(folder, f"cannot be read ({error.strerror})") from error
     return StoredCameras([cameras[camera]._replace(name=name, pose=pose) for name, camera, pose in images])
-
-
-def _opened(path: Path) -> BinaryIO:
-    """Open a file, of which points are skipped; it is not mapped, as one that becomes shorter would end the process."""
-    check_file(path)
-    return path.open("rb")
 
 
 def _numbers(file: BinaryIO, form: str) -> tuple[Any, ...]:
