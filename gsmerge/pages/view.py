@@ -19,7 +19,7 @@ from gsmerge.pages.data import collect
 from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
-from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import as_scene
 from gsmerge.types import Gaussians, Scene, StrPath, Views
 
@@ -94,7 +94,7 @@ def view(
     }
     is_light = len(read.gaussians) > MOST_SOLID if light is None else light
     data = collect(
-        Path(scene).stem if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
+        scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
         light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
