@@ -14,7 +14,7 @@ from gsmerge.alignment import ESTIMATED
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.embedded import SHARP
-from gsmerge.io.cameras.read import CAMERA_PLACES, CHUNK, read_cameras, read_sharp_camera
+from gsmerge.io.cameras.read import CHUNK, read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import (
@@ -105,17 +105,6 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
         return files, []
     note = f"photos are those of {_SEEN_PLACE}: their colours are those of the Gaussians, those of {usual.name} are not"
     return (replace(files, images=seen), [note]) if better else (files, [])
-
-
-def photos_without_cameras(files: SceneFiles) -> SceneError:
-    """Make the error for photos without known cameras."""
-    places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-    problem = f"the photos in {files.images} are there, but no cameras that fit them (looked for {places})"
-    remedy = "name the cameras with --cameras, or do without cameras and photos by --hint order=none"
-    if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
-        formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
-        remedy = f"export the cameras as well, by {formats}, {remedy}"
-    return SceneError(files.ply, problem, remedy)
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
