@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -247,6 +248,15 @@ class GridFit:
         return self.rank in (1, 2)
 
 
+def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
+    """Return the cameras with the photos' size if theirs is a pixel off, as where it is twice a principal point."""
+    stored = sizes_of(camera_file)
+    if size is None or len(stored) != 1 or max(abs(a - b) for a, b in zip(stored[0], size, strict=True)) > 1:
+        return camera_file
+    widths, heights = (np.full_like(camera_file.widths, side) for side in size)
+    return replace(camera_file, widths=widths, heights=heights)
+
+
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     """Assume a grid of the photos' size, or of the cameras' size without photos; SceneError if the two disagree."""
     if size is None:
@@ -308,7 +318,8 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     what = "photos and cameras" if size is not None else "cameras"
     ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
-        ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
+        usual = (*patch_grids(base), *(resize_to(base, half) for half in _half_sizes(base)))
+        ranked += [(3, t) for t in usual if ply.count < len(camera_file) * t.width * t.height]
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
         yield GridFit(camera_file, transform.cameras(cameras), transform, (note,), rank)
@@ -346,7 +357,15 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
                 is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
                 if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
                     crops.append(resize_and_crop(size, to))
+    for width, height in _half_sizes(size):
+        if views * da3_box(width, height).pixels(width, height).size == count:
+            yield resize_to(size, (width, height))
     yield from (crop for crop in crops if crop.crops)
+
+
+def _half_sizes(size: Size) -> Iterator[Size]:
+    """Yield the sizes at which Lyra 2 writes Gaussians: half the photos', or half of these as multiples of 14."""
+    yield from product(*({side // 2, PATCH * round(side / PATCH) // 2} for side in size))
 
 
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:

@@ -25,6 +25,7 @@ from gsmerge.alignment.layouts import (
     square_grids,
     subsample,
     view_orders,
+    with_photo_size,
 )
 from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
 from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
@@ -150,6 +151,7 @@ def align(
         SceneError: If sizes do not agree, several conventions fit, the Gaussians are not those of the cameras' views,
             or other cameras would make pixels of the rows.
     """
+    camera_file = with_photo_size(camera_file, photo_size(photos))
     source = _Source(ply, camera_file, photos, order, scale, depths)
     try:
         grid = photo_grid(camera_file, photo_size(photos))

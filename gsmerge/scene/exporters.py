@@ -118,7 +118,8 @@ _EXPORTERS = (
             ),
             Model(
                 "Lyra 2", "nv-tlabs/lyra 67392d9",
-                "`reconstructed_scene.ply`, every pixel of half the size; `cameras.npz`", "read right with its frames",
+                "`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
+                "read right with its frames",
             ),
         ),
         "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,

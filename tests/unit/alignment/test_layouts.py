@@ -205,6 +205,9 @@ def test_sizes_that_the_number_of_rows_allows() -> None:
     assert (64, 48) in actual
     assert list(grids_of_count(2 * 97 * 89, 2, (640, 480))) == []
     assert (256, 256) in [(m.width, m.height) for m in grids_of_count(3 * 256 * 256, 3, (640, 360))]
+    for height in (160, 161):  # half of 320, and of 322, the next multiple of 14
+        bordered = 7 * (224 - 2 * 7) * (height - 2 * 5)
+        assert (224, height) in [(m.width, m.height) for m in grids_of_count(bordered, 7, (448, 320))]
 
 
 def test_sizes_of_patches() -> None:
@@ -215,6 +218,15 @@ def test_sizes_of_patches() -> None:
     crop = next(m for m in patch_grids((1920, 1080)) if m.top)
     assert (crop.width, crop.height, crop.top) == (504, 280, 2)
     assert list(patch_grids((400, 300))) == []
+
+
+def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> None:
+    """They may be a pixel off; intrinsics stay those of the photos."""
+    folder = tiny.save(tmp_path / "scene")
+    write_cameras(folder, tiny, tiny.K, (tiny.width + 1, tiny.height))
+    loaded = load_scene(folder)
+    assert np.allclose(loaded.pixel_scene().cameras.Ks, tiny.K)
+    assert not noted(loaded.notes, "scaled")
 
 
 def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
