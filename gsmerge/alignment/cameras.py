@@ -31,6 +31,7 @@ _SAME = 1e-6  # of the cameras' distances: no difference
 MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
 NEAR_PX = 0.5  # cameras that are nearer stay where they are
 AS_GOOD, AS_GOOD_PX = 1.3, 0.25  # times and pixels more than moved cameras leave, up to which other intrinsics fit
+SAME_FOCAL = 0.01  # by which focal lengths of other intrinsics may differ, relative, where they count as the same
 _LINE_ROUNDS = 4  # of reweighted least squares
 
 
@@ -75,11 +76,14 @@ class MovedCameras:
 
     cameras: Cameras
     worst_px: float  # the largest median distance of a view's Gaussians from their pixels before
-    moves: list[dict[str, Any]]  # of every view, see list_moves
+    moves: list[dict[str, Any]]  # of every view, see list_moves; empty where the principal points alone were wrong
 
     @property
     def note(self) -> str:
         """Sentence for the user about the move."""
+        if not self.moves:
+            x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
+            return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
         return (
             f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
             f" lie in their pixels, {describe_moves(self.moves)}"
@@ -96,7 +100,8 @@ def move_cameras(
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    Raises SceneError, which names ``source``, where the intrinsics rather than the poses are wrong.
+    Where the intrinsics rather than the poses are wrong, principal points in the middle, which are likely no more than
+    assumed, are moved; other intrinsics raise SceneError, which names ``source``.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
@@ -112,7 +117,10 @@ def move_cameras(
     after = check_pairs(pairs, moved)
     if not after.ok:
         return None
-    _check_intrinsics(pairs, cameras, before.worst_px, after.worst_px, source)
+    other = _fit_intrinsics(pairs, cameras, after.worst_px)
+    if other is not None:
+        _check_assumed(cameras, other, before.worst_px, source)
+        return MovedCameras(other, before.worst_px, [])
     depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
 
@@ -135,10 +143,10 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return slopes[:, 0], heights[:, 0], errors
 
 
-def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
-    """Raise SceneError if one change of all intrinsics fits the Gaussians as well as moved poses do."""
+def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
+    """Change all intrinsics in one way that fits the Gaussians as well as moved poses do; None if none does."""
     if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
-        return
+        return None
     with np.errstate(all="ignore"):
         places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     good = (depth[:, 0] > 0) & np.isfinite(places[:, 0]).all(1)
@@ -147,10 +155,18 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
     factors, shifts = np.array(axes)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
-    other = check_pairs(pairs, replace(cameras, Ks=Ks))
-    if not (other.ok and other.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX)):
+    other = replace(cameras, Ks=Ks)
+    check = check_pairs(pairs, other)
+    return other if check.ok and check.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX) else None
+
+
+def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
+    """Raise SceneError if intrinsics that fit differ in more than principal points that were in the middle."""
+    factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
+    middle = cameras.width / 2, cameras.height / 2
+    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():
         return
-    x, y = (Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+    x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
     raise SceneError(
         source,
         f"expected intrinsics that fit the Gaussians, found others, under which they lie {before_px:.1f} px off their"

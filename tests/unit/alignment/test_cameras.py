@@ -17,7 +17,7 @@ from gsmerge import compact_tensors
 from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
-from gsmerge.geometry import pose_changes
+from gsmerge.geometry import pose_changes, project_points
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -73,6 +73,20 @@ def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: flo
     Ks[:, 0, 2] += shift
     with refuses(SceneError, "Ks", found):
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
+
+
+def test_principal_points_in_the_middle_are_assumed(large: Tiny) -> None:
+    """Formats such as INRIA's store none."""
+    Ks = cameras_of(large).Ks
+    Ks[:, :2, 2] = large.width / 2, large.height / 2
+    true = Ks + np.array([[0, 0, 4], [0, 0, -2], [0, 0, 0]])
+    points = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
+    pixels = [project_points(point[None], large.w2c[view], true[view])[0][0]
+              for point, view in zip(points.points, points.views, strict=True)]  # fmt: skip
+    moved = move_cameras(replace(points, pixels=np.array(pixels)), replace(cameras_of(large), Ks=Ks), NAMES)
+    assert np.allclose(moved.cameras.Ks, true, atol=0.05)
+    assert "(4.0, -2.0) px from the middle" in moved.note
+    np.testing.assert_array_equal(moved.cameras.viewmats, large.w2c)
 
 
 def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tmp_path: Path) -> None:
