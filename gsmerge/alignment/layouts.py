@@ -27,6 +27,7 @@ SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or 
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_NEAR_SIZE = 0.05  # of the longer side, by which cameras' sizes may differ that are no more than assumed
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
 
@@ -248,10 +249,13 @@ class GridFit:
         return self.rank in (1, 2)
 
 
-def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
-    """Return the cameras with the photos' size if theirs is a pixel off, as where it is twice a principal point."""
+def with_photo_size(camera_file: CameraFile, size: Size | None, most: float = 1) -> CameraFile:
+    """Return the cameras with the photos' size if theirs is up to ``most`` pixels off, as twice a principal point is.
+
+    The same cameras where it is not.
+    """
     stored = sizes_of(camera_file)
-    if size is None or len(stored) != 1 or max(abs(a - b) for a, b in zip(stored[0], size, strict=True)) > 1:
+    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= most:
         return camera_file
     widths, heights = (np.full_like(camera_file.widths, side) for side in size)
     return replace(camera_file, widths=widths, heights=heights)
@@ -314,7 +318,8 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     base = size or camera_size
     if base is None or any(not same_shape(s, base) for s in sizes):
         return
-    cameras = to_cameras(camera_file, base)
+    near = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
+    files = [camera_file] + [near] * (near is not camera_file)
     what = "photos and cameras" if size is not None else "cameras"
     ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
@@ -322,7 +327,8 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
         ranked += [(3, t) for t in usual if ply.count < len(camera_file) * t.width * t.height]
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
-        yield GridFit(camera_file, transform.cameras(cameras), transform, (note,), rank)
+        for file in files:
+            yield GridFit(file, transform.cameras(to_cameras(file, base)), transform, (note,), rank)
         if not sizes and transform.crops:
             whole = to_cameras(camera_file, (transform.width, transform.height))
             yield GridFit(camera_file, whole, transform, (f"{note}; the intrinsics are those of the result",), rank)

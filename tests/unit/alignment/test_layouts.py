@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exports import Smooth, export_rows, save_export, smooth_scene, turned
+from exports import Smooth, export_rows, save_export, smooth_scene, turned, with_intrinsics
 from messages import names, noted, refuses
 from sweeps import sweep
-from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
+from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_images, write_npz
 
 from gsmerge.alignment.layouts import grids_of_count, patch_grids
 from gsmerge.errors import SceneError
@@ -227,6 +227,19 @@ def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> N
     loaded = load_scene(folder)
     assert np.allclose(loaded.pixel_scene().cameras.Ks, tiny.K)
     assert not noted(loaded.notes, "scaled")
+
+
+def test_sizes_that_are_twice_a_principal_point_out_of_the_middle(tmp_path: Path) -> None:
+    """Those of Lyra 2, whose Gaussians are of half the photos' size, show that intrinsics are those of the photos."""
+    K = np.array([[110, 0, 49], [0, 110, 36], [0, 0, 1.0]])
+    scene = with_intrinsics(smooth_scene(96, 72), K)
+    save_export(tmp_path, scene, export_rows(scene), cameras=False)
+    larger = replace(scene, K=K * [[2], [2], [1]], width=192, height=144, images=scene.images.repeat(2, 1).repeat(2, 2))
+    write_cameras(tmp_path, larger, larger.K, (196, 144))
+    write_images(tmp_path / "images", larger)
+    loaded = load_scene(tmp_path)
+    assert np.allclose(loaded.pixel_scene().cameras.Ks, K)
+    assert noted(loaded.notes, "192 x 144", "96 x 72")
 
 
 def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
