@@ -7,9 +7,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gsmerge.geometry import morton_codes, multiply_quats, sh0_to_rgb
+from gsmerge.geometry import apply_turn, harmonics_turn, morton_codes, multiply_quats, rotmat_to_quat, sh0_to_rgb
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Array, Gaussians, as_array
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
@@ -148,6 +149,7 @@ class StoredRows:
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
     bytes_beside: int = 0  # of other files that the rows are in
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each, without a full stop
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
@@ -220,6 +222,21 @@ def turn_half(columns: Columns) -> Columns:
         means=columns.means * (-1.0, -1.0, 1.0),
         quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
         harmonics=columns.harmonics * signs[:, None],
+    )
+
+
+def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
+    """Return a function that turns Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
+    if np.array_equal(rotation, np.eye(3)):
+        return lambda columns: columns
+    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # a mirrored ellipsoid is a turned one
+    quat = rotmat_to_quat(sign * rotation[None])[0]
+    turn = harmonics_turn(num_higher, rotation) if num_higher else None
+    return lambda columns: replace(
+        columns,
+        means=matmul(columns.means, rotation.T),
+        quats=multiply_quats(quat, columns.quats),
+        harmonics=columns.harmonics if turn is None else apply_turn(columns.harmonics, turn),
     )
 
 

@@ -61,6 +61,7 @@ class FileInfo:
     num_zero_quats: int  # Gaussians without a rotation, read as the identity
     # why the scales are likely wrong, one sentence without a full stop; empty where they are not
     odd_scales: str = ""
+    adapted: tuple[str, ...] = ()  # what was adapted to read the file, one sentence each without a full stop
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
     raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
     notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     odd = (info.odd_scales,) if info.odd_scales else ()
-    return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
+    return (*info.adapted, *notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
@@ -206,6 +207,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
+        adapted=stored.notes,
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
