@@ -44,6 +44,7 @@ AXES = (
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 )  # fmt: skip
 PLY_AXES = "RDF"
+_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # whose y and z Niantic's library writes and reads against their names
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _MAX_EXTENSIONS = 1 << 20  # bytes of all records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which versions 1 to 3, and 4 begin with
@@ -122,7 +123,8 @@ def _stored_axes(path: Path, extensions: bytes) -> str:
 
 def _axes_turn(axes: str) -> np.ndarray:
     """Return the matrix ``[3,3]`` from axes to those of a ``.ply``: a rotation, mirrored where handedness differs."""
-    return np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
+    turn = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
+    return turn * (1, -1, -1) if axes in _REVERSED else turn
 
 
 def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
