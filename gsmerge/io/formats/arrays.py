@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
-RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files of plain colours
+PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of the former, in nerfstudio's files and 4DGT's
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
@@ -43,9 +43,10 @@ def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
 
 
-def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the column names of the base colour: ``f_dc_*``, or red, green, blue where a file has no ``f_dc_*``."""
-    return SH0 if names is None or SH0[0] in names else RGB
+def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
+    """Return the column names of the base colour: ``f_dc_*``, or those of plain colours where a file has none."""
+    plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
+    return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def _to_table(columns: Columns) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them; ``rows`` has the columns of a PLY file, at least ``REQUIRED``."""
+    """Gaussians as a file stores them; ``rows``, once adapted, has the columns of a PLY file, at least ``REQUIRED``."""
 
     rows: np.ndarray | PackedRows
     layout: str  # for people
@@ -150,6 +151,7 @@ class StoredRows:
     extra_elements: tuple[str, ...] = ()
     bytes_beside: int = 0  # of other files that the rows are in
     notes: tuple[str, ...] = ()  # what was adapted, one sentence each, without a full stop
+    adapt: Callable[[np.ndarray], np.ndarray] | None = None  # gives a block of rows the scales that it should have
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:

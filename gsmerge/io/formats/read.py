@@ -108,7 +108,8 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
 
-    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+    Colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]) where the harmonics of degree 0 are
+    missing. Of two scales, as 2D Gaussians have, the third is a thousandth of the smaller one.
 
     Args:
         path: The file.
@@ -219,7 +220,8 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
 
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + size, n))
-            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
+            rows = read(block) if stored.adapt is None else stored.adapt(read(block))
+            counts = _convert(rows, {name: column[block] for name, column in out.items()})
             if start % FREED_ROWS < size:
                 free_pages(out.values())
             return counts
@@ -280,7 +282,7 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
 
         for j, name in enumerate(arrays.color_columns(rows.dtype.names)):
             column = take_harmonic(name)
-            if name in arrays.RGB:
+            if name not in arrays.SH0:
                 column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]
