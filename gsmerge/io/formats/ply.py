@@ -32,6 +32,7 @@ MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infi
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
 MAX_HEADER_BYTES = 1 << 20
+_TENSORS_START = 1 << 10  # bytes of a file of torch.save in which its first member is named
 MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
 _LIST_BYTES = 140  # of memory for each of these values
@@ -166,6 +167,9 @@ def open_ply(path: Path) -> PlyData:
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
+        if b"/data.pkl" in start[:_TENSORS_START] and start.startswith(b"PK"):
+            remedy = "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig"
+            raise SceneError(path, "expected a PLY file, found tensors of torch.save, as Lyra 1 names .ply", remedy)
         if start[:4] not in (b"ply\n", b"ply\r"):
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")
