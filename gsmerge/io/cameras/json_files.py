@@ -1,4 +1,4 @@
-"""Cameras in JSON: nerfstudio's ``transforms.json``, INRIA's ``cameras.json``, WorldMirror's, Long-LRM's."""
+"""Cameras in JSON: nerfstudio's ``transforms.json``, INRIA's ``cameras.json``, WorldMirror's, Long-LRM's, ffgs's."""
 
 from __future__ import annotations
 
@@ -199,6 +199,30 @@ def read_inria(source: CameraSource) -> StoredCameras:
         K = make_pinhole(fx, fy, cx, cy)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
     return StoredCameras(views)
+
+
+def read_ffgs(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``cameras.json`` as ffgs's example writes it.
+
+    ``views`` have ``c2w`` with OpenCV axes and ``k_normalized``, divided by the size ``image_shape`` of the model's
+    input. SceneError if a value is missing or not a number.
+    """
+    views, path = [], source.path
+    check_count(path, len(source.json["views"]))
+    with _number_errors(path, "expected 'image_shape' of two numbers"):
+        height, width = (round(_number(side)) for side in source.json["image_shape"])
+    for i, view in enumerate(source.json["views"]):
+        name = str(view.get("file") or f"view {i}")
+        with _number_errors(path, f"view {name}: expected numbers in 'c2w' and 'k_normalized'"):
+            pose, K = _array(view["c2w"]).reshape(4, 4), _array(view["k_normalized"]).reshape(3, 3)
+        views.append(View(name, pose, K * np.array([[width], [height], [1]]), (width, height)))
+    return StoredCameras(views)
+
+
+def is_ffgs(source: CameraSource) -> bool:
+    """Return whether a JSON file has ``views`` with ``c2w``, as ffgs writes them."""
+    views = source.object.get("views")
+    return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any("c2w" in v for v in views)
 
 
 def read_world_mirror(source: CameraSource) -> StoredCameras:
