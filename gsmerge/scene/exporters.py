@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.alignment import MAY_BE_UNALIGNED, WITH_PHOTOS, Layout
 from gsmerge.geometry import Similarity
+from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.settings.reading import QuatChoice, ReadHints
 
 if TYPE_CHECKING:
@@ -390,7 +391,7 @@ _EXPORTERS = (
                 "`gaussians.ply` of voxels or tokens; `cameras.json` at the size of the model's input", _NO_PIXELS,
             ),
         ),
-        "logit", "none", degrees=(0, 1, 2, 3, 4), cameras=("ffgs cameras.json",),
+        "logit", "none", degrees=(0, 1, 2, 3, 4), cameras=(FFGS,),
     ),
     Exporter(
         "gsplat",

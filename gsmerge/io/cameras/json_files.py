@@ -43,6 +43,7 @@ _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover their size, and cropped
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size

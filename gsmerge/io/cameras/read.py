@@ -18,6 +18,7 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
 from gsmerge.io.cameras.json_files import (
+    FFGS,
     VIEWER_CAMERAS,
     is_ffgs,
     is_long_lrm,
@@ -166,7 +167,7 @@ CAMERA_FORMATS = (
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria,
                  C2W_OPENCV, "pixels; principal point in the middle, or `cx`, `cy`",
                  lambda file: "position" in file.first or "rotation" in file.first),
-    CameraFormat("ffgs cameras.json", "`cameras.json` of ffgs", ".json", read_ffgs, C2W_OPENCV,
+    CameraFormat(FFGS, "`cameras.json` of ffgs", ".json", read_ffgs, C2W_OPENCV,
                  "divided by the size of the model's input", is_ffgs),
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),

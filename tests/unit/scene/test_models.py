@@ -47,6 +47,7 @@ UNALIGNED = {
     "VolSplat": ("volsplat",),
     "Long-LRM, sorted": ("longlrm-sorted",),
     "WorldMirror 2": ("worldmirror",),
+    "ffgs": ("ffgs",),
     "INRIA 3DGS": ("inria",),
     "InstantSplat": ("inria",),
     "nerfstudio": ("nerfstudio",),
