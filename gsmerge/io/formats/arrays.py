@@ -27,6 +27,7 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+_EXACT = 1e-5  # by which a number that turns harmonics may differ from a whole one that it is
 _UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
 
@@ -215,16 +216,8 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def turn_half(columns: Columns) -> Columns:
-    """Turn Gaussians by half a turn about z, from y down to y up: harmonics of odd order change their signs."""
-    degrees = range(1, sh_degree(columns.harmonics.shape[1]) + 1)
-    orders = [order for degree in degrees for order in range(-degree, degree + 1)]
-    signs = np.array([-1.0 if order % 2 else 1.0 for order in orders])
-    return replace(
-        columns,
-        means=columns.means * (-1.0, -1.0, 1.0),
-        quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
-        harmonics=columns.harmonics * signs[:, None],
-    )
+    """Turn Gaussians by half a turn about z, from y down to y up."""
+    return turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])(columns)
 
 
 def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
@@ -233,12 +226,14 @@ def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns
         return lambda columns: columns
     sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # a mirrored ellipsoid is a turned one
     quat = rotmat_to_quat(sign * rotation[None])[0]
-    turn = harmonics_turn(num_higher, rotation) if num_higher else None
+    turn = harmonics_turn(num_higher, rotation) if num_higher else np.zeros((0, 0))
+    turn = np.where(np.abs(turn - np.round(turn)) < _EXACT, np.round(turn), turn)
+    signs = np.diagonal(turn)[:, None] if np.array_equal(turn, np.diag(np.diagonal(turn))) else None  # of half turns
     return lambda columns: replace(
         columns,
         means=matmul(columns.means, rotation.T),
         quats=multiply_quats(quat, columns.quats),
-        harmonics=columns.harmonics if turn is None else apply_turn(columns.harmonics, turn),
+        harmonics=apply_turn(columns.harmonics, turn) if signs is None else columns.harmonics * signs,
     )
 
 

@@ -304,10 +304,6 @@ def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
 
 def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     """Return a function that moves Gaussians by the matrix ``[4,4]`` of their node, which must be a similarity."""
-    if np.array_equal(place, np.eye(4)):
-        return lambda columns: columns
-    if np.array_equal(place, _HALF_TURN):
-        return turn_half
     scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()

@@ -147,8 +147,8 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray], b
     try:
         header = _read_header(path, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        more = bool(header.flags & EXTENSIONS_FLAG and stream.unconsumed_tail)
-        extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if more else b""
+        extended = header.flags & EXTENSIONS_FLAG
+        extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
     except zlib.error as error:
         raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file") from error
     ends = np.cumsum([0, *header.widths]) * header.count
