@@ -118,7 +118,8 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     Raises:
         SceneError: If a field is missing, or it holds several scenes.
     """
-    gaussians, cameras = _field("output", output, "gaussians"), output.cameras if cameras is None else cameras
+    gaussians = _field("output", output, "gaussians")
+    cameras = getattr(output, "cameras", None) if cameras is None else cameras
     opacities = _one("opacities", _field("gaussians", gaussians, "opacities"), 1)
     kept = opacities != 0  # others fill a batch up
     rows = {name: _one(name, _field("gaussians", gaussians, name), 2)[kept] for name in ("means", "scales", "quats")}
