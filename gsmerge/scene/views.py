@@ -107,15 +107,12 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
     return (replace(files, images=seen), [note]) if better else (files, [])
 
 
-def photos_without_cameras(files: SceneFiles) -> SceneError:
-    """Make the error for photos without known cameras."""
+def photos_without_cameras(files: SceneFiles, option: str) -> SceneError:
+    """Make the error for photos without known cameras; ``option`` says what brings them, if that is known."""
     places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
     problem = f"the photos in {files.images} are there, but no cameras that fit them (looked for {places})"
     remedy = "name the cameras with --cameras, or do without cameras and photos by --hint order=none"
-    if files.ply.parent.name == "gs_ply" or files.ply.name == "0000.ply":
-        formats = 'export_format="npz-gs_ply" or "mini_npz-gs_ply" in Depth Anything 3'
-        remedy = f"export the cameras as well, by {formats}, {remedy}"
-    return SceneError(files.ply, problem, remedy)
+    return SceneError(files.ply, problem, f"{option}; {remedy}" if option else remedy)
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
