@@ -104,6 +104,40 @@ def depthsplat(output: Any, context: Mapping[str, Array], *, sh_degree: int = 0)
     }
 
 
+def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_degree: int = 4) -> dict[str, Any]:
+    """Convert a ``GSOutput`` of the library ffgs: Gaussians without pixels, and the cameras that the model predicted.
+
+    Args:
+        output: Has ``gaussians`` (``means``, ``scales``, ``quats`` wxyz, ``opacities``, and ``colors``: harmonics
+            ``[1,n,k,3]``, or RGB ``[1,n,3]`` where ``sh_degree`` is None) and ``cameras``, or None for these.
+        images: ``[1,V,3,H,W]`` of the cameras' views, in [0, 1], at the model's input size; None: no photos.
+        cameras: The library's ``Cameras`` in the frame of the output, such as ``views.cameras`` for
+            ``output.to_world()``; None: those of the output, if it has any.
+        sh_degree: Harmonics above this degree are left out.
+
+    Raises:
+        SceneError: If a field is missing, or it holds several scenes.
+    """
+    gaussians = _field("output", output, "gaussians")
+    cameras = getattr(output, "cameras", None) if cameras is None else cameras
+    opacities = _one("opacities", _field("gaussians", gaussians, "opacities"), 1)
+    kept = opacities != 0  # others fill a batch up
+    rows = {name: _one(name, _field("gaussians", gaussians, name), 2)[kept] for name in ("means", "scales", "quats")}
+    if gaussians.sh_degree is None:
+        colors = {"colors": _one("colors", gaussians.colors, 2)[kept]}
+    else:
+        harmonics = _one("colors", gaussians.colors, 3)[kept]
+        colors = {"sh0": harmonics[:, :1], "shN": harmonics[:, 1 : (sh_degree + 1) ** 2]}
+    arguments = {**rows, **colors, "opacities": opacities[kept], "order": "none"}
+    if cameras is None:
+        return arguments
+    c2w = as_array(_one("c2w", cameras.c2w, 3)).astype(np.float64)
+    arguments |= {"viewmats": invert(c2w), "Ks": as_array(_one("pixel_k", cameras.pixel_k, 3)).astype(np.float64)}
+    if images is None:
+        return arguments | {"shape": (len(c2w), *cameras.image_shape)}
+    return arguments | {"images": _as_floats(as_array(_one("images", images, 4)).transpose(0, 2, 3, 1))}
+
+
 def _field(owner: str, value: Any, name: str) -> Any:
     content = getattr(value, name, None)
     if content is None:

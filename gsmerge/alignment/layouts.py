@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
@@ -270,6 +271,8 @@ def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
     width, height = size
     for w, h in sizes_of(camera_file):
         if not same_shape((w, h), size) and not _are_stretched(camera_file, size):
+            if camera_file.source == FFGS:
+                return _mapped_grid(camera_file, size, size, resize_and_crop(size, (w, h)))
             problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {w} x {h}"
             swapped = (w, h) == (height, width)
             remedy = "width and height are swapped" if swapped else "crop cameras and images alike"

@@ -30,8 +30,8 @@ ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 
 
 NO_VIEWS = (
-    "no cameras: views are placed around and inside the scene; with cameras and photos the result is fitted to them"
-    ' (--cameras, --images; export_format="npz-gs_ply" in Depth Anything 3)'
+    "no cameras: views are placed around and inside the scene, and the result cannot be better than its input;"
+    " with cameras and photos it is fitted to them (--cameras, --images)"
 )
 
 

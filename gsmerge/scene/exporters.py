@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from gsmerge.alignment import MAY_BE_UNALIGNED, WITH_PHOTOS, Layout
 from gsmerge.geometry import Similarity
+from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.settings.reading import QuatChoice, ReadHints
 
 if TYPE_CHECKING:
@@ -46,6 +48,8 @@ class Model:
     source: str  # repository and commit; two commits: the second is that of a file that was read again later
     leaves: str  # what it writes, but for what its exporter says
     result: str = "read right"  # what becomes of that, and what the user adds
+    place: str = ""  # pattern of its files' paths, where no other model with such columns calls its own so
+    brings: str = ""  # what brings its cameras where they are missing, a clause
 
 
 @dataclass(frozen=True)
@@ -71,14 +75,7 @@ class Exporter:
 
     def may_have_written(self, info: FileInfo, layout: Layout | None, frame: Similarity | None, cameras: str) -> bool:
         """Return whether a file looks as if this exporter had written it; see :func:`choose_exporters`."""
-        header = (
-            info.sh_degree in self.degrees
-            and self.normals == ("nx" in info.columns)
-            and info.byte_columns == self.byte_columns
-            and set(self.elements) <= set(info.extra_elements)
-            and any(self.comment in comment for comment in info.comments or ("",))
-        )
-        if not header or info.opacity_encoding != self.opacity or (self.cameras and cameras not in self.cameras):
+        if not self.writes_columns(info) or (self.cameras and cameras not in self.cameras):
             return False
         if layout is None or frame is None:
             return self.order in MAY_BE_UNALIGNED
@@ -90,6 +87,22 @@ class Exporter:
             and frame.kind in self.frames
         )
 
+    def writes_columns(self, info: FileInfo) -> bool:
+        """Return whether the header and the opacities of a file are as this exporter writes them."""
+        return (
+            info.sh_degree in self.degrees
+            and self.normals == ("nx" in info.columns)
+            and info.byte_columns == self.byte_columns
+            and set(self.elements) <= set(info.extra_elements)
+            and any(self.comment in comment for comment in info.comments or ("",))
+            and info.opacity_encoding == self.opacity
+        )
+
+    @property
+    def is_marked(self) -> bool:
+        """Whether its files have what no other exporter writes."""
+        return bool(self.elements or self.byte_columns or self.comment)
+
 
 _UPRIGHT: tuple[FrameKind, ...] = ("upright",)
 _ANY: tuple[FrameKind, ...] = ("same", "scaled", "shifted", "other")
@@ -98,6 +111,8 @@ _NORMALS = ("nx", "ny", "nz")
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "unaligned: without pixels"
 _WITH_CAMERAS = "unaligned; photos are used where cameras are named"
+# Place of a trained scene, and what brings its cameras
+_TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: give its folder, or name it"
 
 _EXPORTERS = (
     # Its own renderer uses its rotations as they are stored, so they are never read in another way.
@@ -110,6 +125,7 @@ _EXPORTERS = (
                 " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
                 'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
                 ' where its photos show the cameras; of `"npz"` alone the depth maps',
+                "0000.ply", 'export_format="npz-gs_ply" writes its cameras beside the file',
             ),
             Model(
                 "DA3-Streaming", "ByteDance-Seed/Depth-Anything-3 2c21ea8, `da3_streaming/`",
@@ -120,6 +136,7 @@ _EXPORTERS = (
                 "Lyra 2", "nv-tlabs/lyra 67392d9",
                 "`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
                 "read right with its frames",
+                "reconstructed_scene.ply", "its cameras.npz has the cameras: keep it beside the file",
             ),
         ),
         "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
@@ -324,6 +341,7 @@ _EXPORTERS = (
                 "Long-LRM", "arthurhero/Long-LRM d92dd51; `data/dataset.py` 1fccf47, `main.py` 3c35270",
                 "`gaussians_001.ply`; `input_frame_idx.txt`; in some versions `pos_avg_inv.txt` and `scene_scale.txt`",
                 "read right with the data set's file of cameras",
+                brings="the data set's .json file has the cameras: name it with --cameras",
             ),
         ),
         "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS,
@@ -340,9 +358,12 @@ _EXPORTERS = (
             Model(
                 "INRIA 3DGS", "ten copies of graphdeco-inria/gaussian-splatting",
                 "`point_cloud/iteration_N/point_cloud.ply`, `cameras.json`",
-                f"{_NO_PIXELS}; name the photos",
+                f"{_NO_PIXELS}; name the photos", *_TRAINED,
             ),
-            Model("InstantSplat", "NVlabs/InstantSplat 3c29c20", "as INRIA 3DGS", f"{_NO_PIXELS}; name the photos"),
+            Model(
+                "InstantSplat", "NVlabs/InstantSplat 3c29c20", "as INRIA 3DGS", f"{_NO_PIXELS}; name the photos",
+                *_TRAINED,
+            ),
             Model("ZipSplat", "cvg/ZipSplat 69fd35b", "`scene.ply` of tokens and a film; no cameras", _WITH_CAMERAS),
             Model(
                 "SAM 3D Objects", "facebookresearch/sam-3d-objects; `gaussian_model.py` aa18aba",
@@ -357,15 +378,29 @@ _EXPORTERS = (
             Model(
                 "nerfstudio", "nerfstudio-project/nerfstudio 50e0e3c",
                 "`splat.ply` in its own frame; `dataparser_transforms.json` with the map into that", _WITH_CAMERAS,
+                brings="the transforms.json that it was trained on has the cameras: name it with --cameras, and keep"
+                " dataparser_transforms.json beside the file",
             ),
         ),
         "logit", "none", degrees=(0, 1, 2, 3), comment="Nerstudio",
     ),
     Exporter(
+        "ffgs",
+        (
+            Model(
+                "ffgs", "PyPI, ffgs 0.1.0.dev1; `examples/infer_pose_free.py`",
+                "`gaussians.ply` of voxels or tokens; `cameras.json` at the size of the model's input", _NO_PIXELS,
+            ),
+        ),
+        "logit", "none", degrees=(0, 1, 2, 3, 4), cameras=(FFGS,),
+    ),
+    Exporter(
         "gsplat",
         (
             Model(
-                "gsplat", "nerfstudio-project/gsplat 90d7b4b", "`ply/point_cloud_STEP.ply`; no cameras", _WITH_CAMERAS
+                "gsplat", "nerfstudio-project/gsplat 90d7b4b", "`ply/point_cloud_STEP.ply`; no cameras", _WITH_CAMERAS,
+                "ply/point_cloud_*.ply", "the COLMAP model that it was trained on has the cameras: name it with"
+                " --cameras",
             ),
         ),
         "logit", "none", degrees=(0, 1, 2, 3), normals=False,
@@ -393,8 +428,16 @@ def choose_exporters(
     if exporter is not None:
         return (exporter,)
     possible = [e for e in EXPORTERS.values() if e.may_have_written(info, layout, frame, cameras)]
-    marked = [e for e in possible if e.elements or e.byte_columns or e.comment]
-    return tuple(marked or possible)
+    return tuple([e for e in possible if e.is_marked] or possible)
+
+
+def find_cameras_of_model(info: FileInfo) -> str:
+    """Say what brings the cameras of a file, by the model that wrote it; empty where that is not known."""
+    path, exporters = Path(info.path).absolute(), [e for e in EXPORTERS.values() if e.writes_columns(info)]
+    models = [(model, exporter.is_marked) for exporter in exporters for model in exporter.models if model.brings]
+    known = [model for model, is_marked in models if (path.match(model.place) if model.place else is_marked)]
+    says = {model.brings for model in known}
+    return f"{' or '.join(model.title for model in known)}: {says.pop()}" if len(says) == 1 else ""
 
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:

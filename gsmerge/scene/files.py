@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import re
 from collections.abc import Sequence
@@ -63,6 +64,7 @@ class SceneFiles:
     masks: Path | None = None  # a folder
     more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
+    num_copies: int = 0  # other files of the same bytes in the folder
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -79,6 +81,8 @@ class SceneFiles:
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes that several files are read as one scene."""
+        if self.num_copies:
+            return (f"{self.num_copies + 1} files have the same bytes: {self.ply.name} is read",)
         if not self.parts:
             return ()
         return (f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}",)
@@ -108,7 +112,7 @@ def find_scene_files(
     """
     path = Path(path)
     plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
-    ply = plys[0]
+    ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
         problem = "expected the folder of all frames of DA3-Streaming, found one frame"
         raise SceneError(path, problem, f"name {path.parent}")
@@ -143,7 +147,8 @@ def find_scene_files(
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
-    return SceneFiles(ply, camera_path, image_path, mask_path, parts=tuple(plys) if len(plys) > 1 else ())
+    parts = tuple(plys) if len(plys) > 1 else ()
+    return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies)
 
 
 def _depths_cameras(path: Path) -> Path:
@@ -174,7 +179,10 @@ def _named(path: StrPath | None) -> Path | None:
 
 
 def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
-    """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order."""
+    """Find the files of a folder's only scene, as :func:`find_scene_files`; several files are its parts, in order.
+
+    Of files of the same bytes it is the first.
+    """
     plys = list_plys(folder)
     if len(plys) == 1:
         return plys
@@ -183,13 +191,38 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     places = {path.parent for path in plys}
     if is_frame(plys[0]):
         return plys
+    if _are_copies(plys):
+        return plys[:1]
     parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if len(places) == 1 else None
     if parts is None:
-        start = places.pop() if len(places) == 1 else folder
-        names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4])
-        problem = f"expected one .ply file in the folder, found {len(plys)} ({names})"
-        raise SceneError(folder, problem, "name one, or give the folder to gsmerge batch")
+        raise _several_scenes(folder, plys)
     return parts
+
+
+def _are_copies(plys: Sequence[Path]) -> bool:
+    """Return whether numbered files have the same bytes, as Flash3D writes one for each view that it renders."""
+    with suppress(OSError):
+        return _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:])
+    return False
+
+
+def _are_numbered(plys: Sequence[Path]) -> bool:
+    """Return whether files of one folder have numbers for names."""
+    return len({path.parent for path in plys}) == 1 and all(_NUMBERED.fullmatch(path.name) for path in plys)
+
+
+def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
+    """Make the error of a folder with several files that may be scenes, moments of one, or its parts."""
+    places = {path.parent for path in plys}
+    start = places.pop() if len(places) == 1 else folder
+    problem = f"expected one .ply file in the folder, found {len(plys)}"
+    names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4])
+    if not _are_numbered(plys):
+        return SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
+    counts = {header_counts(path)[0] for path in plys[:_MAX_HEADERS]}
+    what = f"moments of {counts.pop():,} Gaussians each" if len(counts) == 1 else "moments or parts"
+    calls = f"gsmerge batch {start} takes each moment, gsmerge convert {start}/*.ply one.ply joins parts of one scene"
+    return SceneError(folder, f"{problem} ({names}), numbered as {what}", f"name one; {calls}")
 
 
 def list_plys(folder: Path) -> list[Path]:

@@ -32,7 +32,16 @@ from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import AUTO, TURNED, Exporter, ReadHints, choose_exporters, find_exporter, make_hints
+from gsmerge.scene.exporters import (
+    AUTO,
+    TURNED,
+    Exporter,
+    ReadHints,
+    choose_exporters,
+    find_cameras_of_model,
+    find_exporter,
+    make_hints,
+)
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.views import (
     check_masks,
@@ -259,10 +268,11 @@ def align_scene(
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
     """Make a scene without views, which are placed later; photos are not used, with a note."""
-    notes = []
+    option = find_cameras_of_model(ply.info)
+    notes = [option] if option else []
     if files.images is not None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        notes = [f"the photos in {files.images} are not used: no cameras that fit them (looked for {places})"]
+        notes += [f"the photos in {files.images} are not used: no cameras that fit them (looked for {places})"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 

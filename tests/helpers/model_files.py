@@ -228,6 +228,20 @@ def any_splat(folder: Path) -> Export:
     return export
 
 
+def ffgs(folder: Path) -> Export:
+    """Write ffgs's example: voxels, and cameras at the size to which it crops the photos, which the user names."""
+    scene = made()
+    export = save_unordered(Saver("gaussians.ply"), scene, merge_voxels(scene, 0.06), folder)
+    K = (scene.K / [[scene.width], [scene.height], [1]]).tolist()
+    views = [
+        {"index": i, "file": name, "c2w": pose.tolist(), "k_normalized": K}
+        for i, (name, pose) in enumerate(zip(scene.names, scene.c2w, strict=True))
+    ]
+    document = {"frame": "model", "image_shape": [scene.height, scene.width], "views": views}
+    save_json(folder / "cameras.json", document)
+    return replace(export, options=data_set(folder, as_photos(scene, 2, border=8), "images"))
+
+
 def world_mirror(version: int, folder: Path) -> Export:
     """Write WorldMirror's: voxels with cameras; the first version's ``images`` are squeezed where it cropped."""
     scene = replace(made(), names=tuple(f"image_{i:04d}.png" for i in (1, 2, 3)))
@@ -393,6 +407,7 @@ MODELS: dict[str, Callable[[Path], Export]] = {
     "Flash3D without cameras": partial(flash_3d, cameras=False),
     "SHARP": sharp,
     "AnySplat": any_splat,
+    "ffgs": ffgs,
     "WorldMirror 1": partial(world_mirror, 1),
     "WorldMirror 2": partial(world_mirror, 2),
     "ZipSplat": zip_splat,

@@ -12,7 +12,7 @@ from messages import noted, refuses
 from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
-from gsmerge.geometry import covariances, multiply_quats, rotmat_to_quat
+from gsmerge.geometry import covariances, multiply_quats, rgb_to_sh0, rotmat_to_quat, sh0_to_rgb
 from gsmerge.types import as_array
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
@@ -147,3 +147,43 @@ def test_depthsplat(scene: Scene, wrapped: bool) -> None:
     given = integrations.depthsplat(output, context)
     assert_holds(given, scene)
     np.testing.assert_allclose(torch.linalg.norm(given["quats"], dim=-1), 1, atol=1e-5)
+
+
+def ffgs_cameras(scene: Scene) -> SimpleNamespace:
+    c2w = np.linalg.inv(scene.cameras.viewmats)
+    return SimpleNamespace(c2w=batch(c2w), pixel_k=batch(scene.cameras.Ks), image_shape=(36, 48))
+
+
+def ffgs_output(scene: Scene, degree: int | None, cameras: Any) -> SimpleNamespace:
+    """What ffgs returns: harmonics basis-major or colours, and rows of opacity 0 that fill a batch up."""
+    g = scene.gaussians
+    colors = sh0_to_rgb(g.sh0)[:, 0]
+    if degree is not None:
+        colors = np.concatenate([g.sh0, np.full((len(g), (degree + 1) ** 2 - 1, 3), 0.01)], 1)
+    columns = {"means": g.means, "scales": g.scales, "quats": g.quats, "opacities": g.opacities, "colors": colors}
+    padded = {name: batch(np.concatenate([column, 0 * column[:7]])) for name, column in columns.items()}
+    return SimpleNamespace(gaussians=SimpleNamespace(**padded, sh_degree=degree), frame=None, cameras=cameras)
+
+
+@pytest.mark.parametrize("degree", [None, 0, 1])
+@pytest.mark.parametrize("given", [False, True])
+def test_ffgs(scene: Scene, degree: int | None, given: bool) -> None:
+    cameras = ffgs_cameras(scene)
+    images = batch(photos_of(scene).transpose(0, 3, 1, 2))
+    output = ffgs_output(scene, degree, None if given else cameras)
+    arguments = integrations.ffgs(output, images, cameras if given else None)
+    if degree is None:
+        arguments["sh0"] = rgb_to_sh0(arguments.pop("colors"))
+    else:
+        assert arguments["shN"].shape[1] == 3 * degree
+    assert_holds(arguments, scene)
+    assert arguments["order"] == "none"
+
+
+def test_ffgs_without_photos_or_cameras(scene: Scene) -> None:
+    arguments = integrations.ffgs(ffgs_output(scene, 0, ffgs_cameras(scene)))
+    assert (arguments["shape"], "images" in arguments) == ((3, 36, 48), False)
+    assert 0 < len(compact_tensors(**arguments, **FAST).gaussians) < 0.3 * len(scene.gaussians)
+    assert "viewmats" not in integrations.ffgs(ffgs_output(scene, 0, None))
+    with refuses(SceneError, "output", "gaussians"):
+        integrations.ffgs(SimpleNamespace(gaussians=None, cameras=None))

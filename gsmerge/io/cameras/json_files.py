@@ -1,4 +1,4 @@
-"""Cameras in JSON: nerfstudio's ``transforms.json``, INRIA's ``cameras.json``, WorldMirror's, Long-LRM's."""
+"""Cameras in JSON: nerfstudio's ``transforms.json``, INRIA's ``cameras.json``, WorldMirror's, Long-LRM's, ffgs's."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ _MAX_NAME = 255  # bytes of a file's name
 _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 # Next to the dataset file of Long-LRM: which frames it took, and how it moved the world.
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
+FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover their size, and cropped
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
@@ -199,6 +200,30 @@ def read_inria(source: CameraSource) -> StoredCameras:
         K = make_pinhole(fx, fy, cx, cy)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
     return StoredCameras(views)
+
+
+def read_ffgs(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``cameras.json`` as ffgs's example writes it.
+
+    ``views`` have ``c2w`` with OpenCV axes and ``k_normalized``, divided by the size ``image_shape`` of the model's
+    input. SceneError if a value is missing or not a number.
+    """
+    views, path = [], source.path
+    check_count(path, len(source.json["views"]))
+    with _number_errors(path, "expected 'image_shape' of two numbers"):
+        height, width = (round(_number(side)) for side in source.json["image_shape"])
+    for i, view in enumerate(source.json["views"]):
+        name = str(view.get("file") or f"view {i}")
+        with _number_errors(path, f"view {name}: expected numbers in 'c2w' and 'k_normalized'"):
+            pose, K = _array(view["c2w"]).reshape(4, 4), _array(view["k_normalized"]).reshape(3, 3)
+        views.append(View(name, pose, K * np.array([[width], [height], [1]]), (width, height)))
+    return StoredCameras(views)
+
+
+def is_ffgs(source: CameraSource) -> bool:
+    """Return whether a JSON file has ``views`` with ``c2w``, as ffgs writes them."""
+    views = source.object.get("views")
+    return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any("c2w" in v for v in views)
 
 
 def read_world_mirror(source: CameraSource) -> StoredCameras:

@@ -18,8 +18,11 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
 from gsmerge.io.cameras.json_files import (
+    FFGS,
     VIEWER_CAMERAS,
+    is_ffgs,
     is_long_lrm,
+    read_ffgs,
     read_inria,
     read_long_lrm,
     read_transforms,
@@ -164,6 +167,8 @@ CAMERA_FORMATS = (
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA", ".json", read_inria,
                  C2W_OPENCV, "pixels; principal point in the middle, or `cx`, `cy`",
                  lambda file: "position" in file.first or "rotation" in file.first),
+    CameraFormat(FFGS, "`cameras.json` of ffgs", ".json", read_ffgs, C2W_OPENCV,
+                 "divided by the size of the model's input", is_ffgs),
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
     CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz",

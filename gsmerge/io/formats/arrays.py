@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from gsmerge.geometry import morton_codes, multiply_quats, sh0_to_rgb
+from gsmerge.geometry import apply_turn, harmonics_turn, morton_codes, multiply_quats, rotmat_to_quat, sh0_to_rgb
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Array, Gaussians, as_array
 
 MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal float32 numbers
@@ -21,11 +22,12 @@ MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
 MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
-RGB = ("red", "green", "blue")  # instead of the former, in nerfstudio's files of plain colours
+PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of the former, in nerfstudio's files and 4DGT's
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
+_EXACT = 1e-5  # by which a number that turns harmonics may differ from a whole one that it is
 _UNPACKING = 16_000_000  # bytes of the blocks that are unpacked at a time
 GAUSSIAN_BYTES = 4 * len(REQUIRED) + 1  # in memory, without higher harmonics, and whether it is finite
 
@@ -42,9 +44,10 @@ def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
 
 
-def color_columns(names: tuple[str, ...] | None) -> tuple[str, ...]:
-    """Return the column names of the base colour: ``f_dc_*``, or red, green, blue where a file has no ``f_dc_*``."""
-    return SH0 if names is None or SH0[0] in names else RGB
+def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
+    """Return the column names of the base colour: ``f_dc_*``, or those of plain colours where a file has none."""
+    plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))
+    return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,7 @@ def _to_table(columns: Columns) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StoredRows:
-    """Gaussians as a file stores them; ``rows`` has the columns of a PLY file, at least ``REQUIRED``."""
+    """Gaussians as a file stores them; ``rows``, once adapted, has the columns of a PLY file, at least ``REQUIRED``."""
 
     rows: np.ndarray | PackedRows
     layout: str  # for people
@@ -148,6 +151,8 @@ class StoredRows:
     comments: tuple[str, ...] = ()
     extra_elements: tuple[str, ...] = ()
     bytes_beside: int = 0  # of other files that the rows are in
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each, without a full stop
+    adapt: Callable[[np.ndarray], np.ndarray] | None = None  # gives a block of rows the scales that it should have
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:
@@ -211,15 +216,24 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
 
 
 def turn_half(columns: Columns) -> Columns:
-    """Turn Gaussians by half a turn about z, from y down to y up: harmonics of odd order change their signs."""
-    degrees = range(1, sh_degree(columns.harmonics.shape[1]) + 1)
-    orders = [order for degree in degrees for order in range(-degree, degree + 1)]
-    signs = np.array([-1.0 if order % 2 else 1.0 for order in orders])
-    return replace(
+    """Turn Gaussians by half a turn about z, from y down to y up."""
+    return turner(np.diag([-1.0, -1.0, 1.0]), columns.harmonics.shape[1])(columns)
+
+
+def turner(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
+    """Return a function that turns Gaussians by an orthogonal matrix ``[3,3]``, which may mirror them."""
+    if np.array_equal(rotation, np.eye(3)):
+        return lambda columns: columns
+    sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # a mirrored ellipsoid is a turned one
+    quat = rotmat_to_quat(sign * rotation[None])[0]
+    turn = harmonics_turn(num_higher, rotation) if num_higher else np.zeros((0, 0))
+    turn = np.where(np.abs(turn - np.round(turn)) < _EXACT, np.round(turn), turn)
+    signs = np.diagonal(turn)[:, None] if np.array_equal(turn, np.diag(np.diagonal(turn))) else None  # of half turns
+    return lambda columns: replace(
         columns,
-        means=columns.means * (-1.0, -1.0, 1.0),
-        quats=multiply_quats(np.array([0.0, 0.0, 0.0, 1.0]), columns.quats),
-        harmonics=columns.harmonics * signs[:, None],
+        means=matmul(columns.means, rotation.T),
+        quats=multiply_quats(quat, columns.quats),
+        harmonics=apply_turn(columns.harmonics, turn) if signs is None else columns.harmonics * signs,
     )
 
 

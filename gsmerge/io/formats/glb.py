@@ -18,9 +18,9 @@ from typing import IO, Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import apply_turn, harmonics_turn, multiply_quats, quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
+from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
-from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored, turn_half
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored, turn_half, turner
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
@@ -304,21 +304,15 @@ def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
 
 def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:
     """Return a function that moves Gaussians by the matrix ``[4,4]`` of their node, which must be a similarity."""
-    if np.array_equal(place, np.eye(4)):
-        return lambda columns: columns
-    if np.array_equal(place, _HALF_TURN):
-        return turn_half
     scale = np.sqrt((place[:3, :3] ** 2).sum(0)).mean()
     rotation = place[:3, :3] / scale
     oblique = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     mirrored = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
     if mirrored or not (np.isfinite(place).all() and oblique < _EVEN):
         raise _ForeignError("one with a node that stretches or mirrors its Gaussians")
-    quat, turn = rotmat_to_quat(rotation[None])[0], harmonics_turn(num_higher, rotation) if num_higher else None
+    turn = turner(rotation, num_higher)
     return lambda columns: replace(
-        columns,
-        means=scale * matmul(columns.means, rotation.T) + place[:3, 3],
-        quats=multiply_quats(quat, columns.quats),
+        turned := turn(columns),
+        means=scale * turned.means + place[:3, 3],
         log_scales=columns.log_scales + float(log(scale)),
-        harmonics=columns.harmonics if turn is None else apply_turn(columns.harmonics, turn),
     )

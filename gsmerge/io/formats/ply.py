@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import BufferedReader, FileIO, TextIOWrapper
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -26,10 +27,12 @@ from gsmerge.types import Gaussians
 _PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
 MAX_DEGREE = 3  # of the harmonics that results have: splat-transform 3.7 and gsply refuse a .ply with more
 MAX_READ_DEGREE = 4
+THIN = 1e-3  # of the smaller scale: the third of a 2D Gaussian
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
 MAX_HEADER_BYTES = 1 << 20
+_TENSORS_START = 1 << 10  # bytes of a file of torch.save in which its first member is named
 MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
 _LIST_BYTES = 140  # of memory for each of these values
@@ -49,6 +52,11 @@ def read_rows(path: Path) -> arrays.StoredRows:
     rows = _PACKED_ROWS(path, data) if compressed else _vertex(path, data).data
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
+    linear, notes = arrays.color_columns(names) == arrays.PLAIN_COLORS[1] and not _has_log_scales(path, rows), []
+    if linear:
+        notes += ["colours are r, g and b, and no scale is negative: scales are taken as activated, not as logarithms"]
+    if arrays.SCALES[2] not in names:
+        notes += [f"2D Gaussians of two scales: the third is {THIN:g} of the smaller one"]
     return arrays.StoredRows(
         rows=rows,
         layout=_layout_name(names, _num_rest(path, names), compressed=compressed),
@@ -57,7 +65,30 @@ def read_rows(path: Path) -> arrays.StoredRows:
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
         extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
+        notes=tuple(notes),
+        adapt=partial(_with_log_scales, linear=linear) if notes else None,
     )
+
+
+def _has_log_scales(path: Path, rows: np.ndarray) -> bool:
+    """Return whether a scale is negative, as logarithms of most are."""
+    size = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+    with open_rows(path, rows) as read:
+        return any((read(slice(i, i + size))[arrays.SCALES[0]] < 0).any() for i in range(0, len(rows), size))
+
+
+def _with_log_scales(rows: np.ndarray, *, linear: bool) -> np.ndarray:
+    """Return a block of rows with logarithms of ``linear`` scales, and with a thin third scale where there are two."""
+    columns = {name: rows[name] for name in rows.dtype.names or ()}
+    scales = [columns[name].astype(np.float64) for name in arrays.SCALES if name in columns]
+    with np.errstate(all="ignore"):  # a scale of 0
+        scales = [log(scale) for scale in scales] if linear else scales
+        scales = scales if len(scales) == 3 else [*scales, np.minimum(*scales) + float(log(THIN))]
+        columns |= {name: scale.astype(np.float32) for name, scale in zip(arrays.SCALES, scales, strict=True)}
+    out = np.empty(len(rows), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        out[name] = column
+    return out
 
 
 def is_from_gsmerge(comments: Sequence[str]) -> bool:
@@ -71,15 +102,12 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
         raise SceneError(path, f"expected an element 'vertex', found {names}")
     vertex = data["vertex"]
     columns = {p.name for p in vertex.properties}
-    missing = [name for name in arrays.REQUIRED if name not in columns]
-    if columns.issuperset(arrays.RGB):
-        missing = [name for name in missing if name not in arrays.SH0]
+    optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
+    missing = [name for name in arrays.REQUIRED if name not in columns | optional]
     if missing:
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed, but lacks its element 'chunk'"
-        elif missing == ["scale_2"]:
-            remedy = "flat 2D Gaussians need a scale_2 column of their own"
         elif len(missing) < len(arrays.REQUIRED) // 2:
             remedy = "export it again with them"
         raise SceneError(path, f"missing column{'s' * (len(missing) > 1)} {', '.join(missing)}", remedy)
@@ -139,6 +167,9 @@ def open_ply(path: Path) -> PlyData:
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
+        if b"/data.pkl" in start[:_TENSORS_START] and start.startswith(b"PK"):
+            remedy = "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig"
+            raise SceneError(path, "expected a PLY file, found tensors of torch.save, as Lyra 1 names .ply", remedy)
         if start[:4] not in (b"ply\n", b"ply\r"):
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")

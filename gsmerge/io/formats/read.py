@@ -61,6 +61,7 @@ class FileInfo:
     num_zero_quats: int  # Gaussians without a rotation, read as the identity
     # why the scales are likely wrong, one sentence without a full stop; empty where they are not
     odd_scales: str = ""
+    adapted: tuple[str, ...] = ()  # what was adapted to read the file, one sentence each without a full stop
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
     raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
     notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     odd = (info.odd_scales,) if info.odd_scales else ()
-    return (*notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
+    return (*info.adapted, *notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
@@ -107,7 +108,8 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
     """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
 
-    Colours may be red, green and blue (bytes, or floats in [0, 1]) where the harmonics of degree 0 are missing.
+    Colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]) where the harmonics of degree 0 are
+    missing. Of two scales, as 2D Gaussians have, the third is a thousandth of the smaller one.
 
     Args:
         path: The file.
@@ -206,6 +208,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
+        adapted=stored.notes,
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -217,7 +220,8 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
 
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + size, n))
-            counts = _convert(read(block), {name: column[block] for name, column in out.items()})
+            rows = read(block) if stored.adapt is None else stored.adapt(read(block))
+            counts = _convert(rows, {name: column[block] for name, column in out.items()})
             if start % FREED_ROWS < size:
                 free_pages(out.values())
             return counts
@@ -278,7 +282,7 @@ def _convert_columns(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int,
 
         for j, name in enumerate(arrays.color_columns(rows.dtype.names)):
             column = take_harmonic(name)
-            if name in arrays.RGB:
+            if name not in arrays.SH0:
                 column = rgb_to_sh0(column / (255 if rows.dtype[name].kind == "u" else 1))
             out["sh0"][:, 0, j] = column
         num_higher = out["shN"].shape[1]

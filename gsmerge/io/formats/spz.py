@@ -6,7 +6,8 @@ used. Version 3 is one gzip stream, with harmonics up to degree 3; version 4 has
 compressed and uncompressed sizes, and one Zstandard stream for each column.
 
 The README says that axes are right, up and back. The converters that come with it, splat-transform and SuperSplat all
-keep those of the ``.ply`` instead, and so does this: the file shows what the ``.ply`` shows.
+keep those of the ``.ply`` instead, and so does this: the file shows what the ``.ply`` shows. A file whose extension
+``SPZ_ADOBE_coordinate_system`` names its axes is turned into those of a ``.ply``: right, down and front.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -35,6 +36,17 @@ HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
 TABLE_ROW = struct.Struct("<QQ")  # bytes of a stream: compressed, uncompressed
 MIP_FLAG = 1  # the Gaussians want to be rendered with a filter of their own
+EXTENSIONS_FLAG = 2  # records lie before the table of version 4, or after the columns of the others
+RECORD = struct.Struct("<II")  # kind of an extension, and its bytes
+AXES_KIND = 0xADBE0003  # of SPZ_ADOBE_coordinate_system: a number from 1 on, in this order; 0 says nothing
+AXES = (
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
+)  # fmt: skip
+PLY_AXES = "RDF"
+_REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # whose y and z Niantic's library writes and reads against their names
+_OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
+_MAX_EXTENSIONS = 1 << 20  # bytes of all records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which versions 1 to 3, and 4 begin with
 SYSTEM, UNIX = 9, b"\3"  # place of the system in the header of gzip, and the one that is written for all
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
@@ -78,10 +90,41 @@ def read_rows(path: Path) -> arrays.StoredRows:
             file.seek(0)
             packed = file.read()
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts = read(path, packed)
+    header, parts, extensions = read(path, packed)
+    axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
+    turn = arrays.turner(_axes_turn(axes), header.num_higher)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-    rows = arrays.Packed(header.count, header.num_higher, lambda at: _unpack([part[at] for part in parts], header))
-    return arrays.to_stored([rows], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
+
+    def unpack(block: slice) -> arrays.Columns:
+        return turn(_unpack([part[block] for part in parts], header))
+
+    rows = arrays.Packed(header.count, header.num_higher, unpack)
+    stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
+    notes = (f"the file says that its axes are {axes}: turned to {PLY_AXES}, those of a .ply",)
+    return stored if axes == PLY_AXES else replace(stored, notes=notes)
+
+
+def _stored_axes(path: Path, extensions: bytes) -> str:
+    """Return the axes that extensions name, or those of a ``.ply``; SceneError if they are unknown."""
+    at = 0
+    while at + RECORD.size <= len(extensions):
+        kind, size = RECORD.unpack_from(extensions, at)
+        at += RECORD.size + size
+        if kind == AXES_KIND:
+            content = extensions[at - size : at]
+            number = int.from_bytes(content, "little") if len(content) == size == 4 else -1
+            if not 0 <= number <= len(AXES):
+                found = f"number {number}" if number > 0 else "a damaged record"
+                problem = f"expected axes 0 to {len(AXES)} in SPZ_ADOBE_coordinate_system, found {found}"
+                raise SceneError(path, problem, "export it again without this extension")
+            return AXES[number - 1] if number else PLY_AXES
+    return PLY_AXES
+
+
+def _axes_turn(axes: str) -> np.ndarray:
+    """Return the matrix ``[3,3]`` from axes to those of a ``.ply``: a rotation, mirrored where handedness differs."""
+    turn = np.array([[float(a == target) - float(_OPPOSITE[a] == target) for a in axes] for target in PLY_AXES])
+    return turn * (1, -1, -1) if axes in _REVERSED else turn
 
 
 def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
@@ -99,11 +142,13 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
     return header
 
 
-def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
+def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray], bytes]:
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _read_header(path, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
+        extended = header.flags & EXTENSIONS_FLAG
+        extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
     except zlib.error as error:
         raise SceneError(path, "expected a gzip stream of .spz, found another or damaged file") from error
     ends = np.cumsum([0, *header.widths]) * header.count
@@ -111,7 +156,7 @@ def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(data)}"
         raise SceneError(path, problem, AGAIN)
     parts = [np.frombuffer(data, np.uint8, end - at, at).reshape(header.count, -1) for at, end in pairwise(ends)]
-    return header, parts
+    return header, parts, extensions
 
 
 def problem_at_end(path: Path) -> str | None:
@@ -135,8 +180,8 @@ def problem_at_end(path: Path) -> str | None:
     return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
 
 
-def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray]]:
-    """Read header and parts of version 4; extensions, which do not describe the Gaussians, are skipped."""
+def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray], bytes]:
+    """Read header, parts and extensions of version 4."""
     header = _read_header(path, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     try:
@@ -163,7 +208,9 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
     if [len(column) for column in columns] != sizes:
         raise SceneError(path, "truncated or damaged: a column of .spz version 4 is of another size", AGAIN)
     columns += [b""] * (len(header.widths) - len(columns))
-    return header, [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
+    parts = [np.frombuffer(column, np.uint8).reshape(header.count, -1) for column in columns]
+    start = HEADER.size + TABLE_START.size
+    return header, parts, packed[start : min(at, start + _MAX_EXTENSIONS)]
 
 
 def _unpack(parts: list[np.ndarray], header: _Header) -> arrays.Columns:

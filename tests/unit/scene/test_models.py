@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import noted
 from model_files import MODELS
 from model_rows import check_cameras, check_pixels
 from sweeps import sweep
 
-from gsmerge.scene.exporters import EXPORTERS
+from gsmerge.io import read_ply
+from gsmerge.scene.exporters import EXPORTERS, find_cameras_of_model
 from gsmerge.scene.read import load_scene
 
 DA3 = "Depth Anything 3"
@@ -44,6 +47,7 @@ UNALIGNED = {
     "VolSplat": ("volsplat",),
     "Long-LRM, sorted": ("longlrm-sorted",),
     "WorldMirror 2": ("worldmirror",),
+    "ffgs": ("ffgs",),
     "INRIA 3DGS": ("inria",),
     "InstantSplat": ("inria",),
     "nerfstudio": ("nerfstudio",),
@@ -83,3 +87,30 @@ def test_made_files_are_of_models_in_the_table() -> None:
     titles = tuple(model.title for exporter in EXPORTERS.values() for model in exporter.models)
     assert len(set(titles)) == len(titles)
     assert {name for name in MODELS if not name.startswith(titles)} == {"MapAnything", "VGGT"}  # of points
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (f"{DA3}, gs_ply", (f"{DA3}:", 'export_format="npz-gs_ply"')),
+        ("Lyra 2", ("Lyra 2:", "cameras.npz")),
+        ("INRIA 3DGS", ("INRIA 3DGS or InstantSplat:", "cameras.json")),
+        ("nerfstudio", ("nerfstudio:", "transforms.json")),
+        ("gsplat's trainer", ("gsplat:", "COLMAP")),
+        ("Long-LRM", ("Long-LRM:", "data set's .json")),
+        *((name, ()) for name in ("AnySplat", "pixelSplat", "LGM", "ZipSplat", "WorldMirror 2", "Splatt3R")),
+    ],
+)
+def test_what_brings_cameras_is_said_by_the_model(tmp_path: Path, name: str, said: tuple[str, ...]) -> None:
+    """And of no model where the file may be that of several."""
+    MODELS[name](tmp_path / "out")
+    (path,) = (tmp_path / "out").rglob("*.ply")
+    option = find_cameras_of_model(read_ply(path).info)
+    assert all(part in option for part in said)
+    assert bool(option) == bool(said)
+
+
+def test_a_scene_without_cameras_says_what_brings_them(tmp_path: Path) -> None:
+    MODELS["nerfstudio"](tmp_path / "out")
+    shutil.copy(tmp_path / "out/splat.ply", tmp_path / "splat.ply")
+    assert noted(load_scene(tmp_path / "splat.ply").notes, "nerfstudio:", "transforms.json", "--cameras")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,6 +81,32 @@ def test_files_of_different_sizes_are_different_scenes(tmp_path: Path, tiny: Tin
     folder = split(tmp_path, tiny, names, [100, 560])
     with refuses(SceneError, folder, 3):
         find_scene_files(folder)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_files_of_the_same_bytes_are_one_scene(tmp_path: Path, tiny: Tiny, named: bool) -> None:
+    """As Flash3D writes one for each view that it renders, of which there may be as many as cameras."""
+    whole = read_scene(tiny.save(tmp_path / "whole"))
+    folder = split(tmp_path / "copies", tiny, ["0.ply"], [])
+    for i in (1, 2):
+        shutil.copy(folder / "0.ply", folder / f"{i}.ply")
+    load = load_scene(folder, cameras=folder / "transforms.json" if named else None)
+    assert load.notes[0] == "3 files have the same bytes: 0.ply is read"
+    np.testing.assert_array_equal(load.scene.gaussians.means, whole.gaussians.means)
+    write_ply(folder / "2.ply", tiny.gaussians[::-1], overwrite=True)
+    assert len(find_scene_files(folder).plys) == 3
+
+
+@pytest.mark.parametrize("cuts", [[280, 560], [100, 300]])
+def test_moments_name_both_calls(tmp_path: Path, tiny: Tiny, cuts: list[int]) -> None:
+    folder = split(tmp_path, tiny, ["0000.ply", "0001.ply", "0002.ply"], cuts)
+    (folder / "transforms.json").unlink()
+    calls = f"gsmerge batch {folder}", f"gsmerge convert {folder}/*.ply one.ply"
+    with refuses(SceneError, folder, "3 (0000.ply", "moments", "280 Gaussians" if cuts[0] == 280 else "parts", *calls):
+        find_scene_files(folder)
+    out = tmp_path / "one.ply"
+    assert main(["convert", *map(str, sorted(folder.glob("*.ply"))), str(out), "-q"]) == 0
+    assert gsmerge.read_ply(out).info.count == len(tiny.gaussians)
 
 
 def test_a_large_gap_in_the_numbers(tmp_path: Path, tiny: Tiny) -> None:

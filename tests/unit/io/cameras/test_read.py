@@ -36,6 +36,15 @@ def write_long_lrm(folder: Path) -> Path:
     return save_json(folder / "scene.json", long_lrm(C2W, K))
 
 
+def write_ffgs(folder: Path) -> Path:
+    """As its example for photos without poses writes them."""
+    views = [
+        {"index": i, "file": f"{i}.png", "c2w": pose.tolist(), "k_normalized": (K / [[WIDTH], [HEIGHT], [1]]).tolist()}
+        for i, pose in enumerate(C2W)
+    ]
+    return save_json(folder / "cameras.json", {"frame": "model", "image_shape": [HEIGHT, WIDTH], "views": views})
+
+
 def write_trajectory(folder: Path, columns: int = 16) -> Path:
     path = folder / "camera_poses.txt"
     path.write_text("".join(" ".join(map(repr, m.reshape(-1)[:columns].tolist())) + "\n" for m in C2W))
@@ -54,7 +63,14 @@ def write_trajectory_with_mark(folder: Path) -> Path:
     return path
 
 
-WRITERS = [write_world_mirror, write_long_lrm, write_trajectory, write_trajectory_of_12, write_trajectory_with_mark]
+WRITERS = (
+    write_world_mirror,
+    write_long_lrm,
+    write_ffgs,
+    write_trajectory,
+    write_trajectory_of_12,
+    write_trajectory_with_mark,
+)
 
 
 @pytest.mark.parametrize("write", WRITERS)
@@ -144,6 +160,8 @@ def replace_text(old: str, new: str) -> Callable[[Path], object]:
         (write_long_lrm, replace_text('"fx"', '"f"'), ("scene.json: view view_000", "'fx'")),
         (write_world_mirror, set_key("extrinsics", None), ("camera_params.json", "'extrinsics'", "list")),
         (write_world_mirror, deep_matrix, ("camera_params.json: extrinsics of view_000", "4x4")),
+        (write_ffgs, replace_text('"c2w"', '"w2c"'), ("cameras.json: view 0.png", "'c2w'")),
+        (write_ffgs, set_key("image_shape", [36]), ("cameras.json", "'image_shape'")),
         *((write_long_lrm, beside(name, text), (name, *found)) for name, text, *found in BESIDE_LONG_LRM),
         (write_trajectory, beside("intrinsic.txt", ""), ("intrinsic.txt", "3 views", 0)),
         (write_trajectory, beside("intrinsic.txt", "a b c d"), ("intrinsic.txt: line 1", "'a'")),

@@ -126,3 +126,10 @@ def test_what_a_header_promises(tmp_path: Path) -> None:
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe.ply")  # which nobody writes to
         assert header_counts(tmp_path / "pipe.ply") == (0, 0)
+
+
+def test_tensors_of_lyra_1_are_named(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    torch.save(torch.zeros(1, 5, 14), tmp_path / "gaussians_0.ply")
+    with refuses(SceneError, "gaussians_0.ply", "torch.save", "Lyra 1", "save_gaussians_orig: true"):
+        read_ply(tmp_path / "gaussians_0.ply")

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import scenes
 from messages import refuses
+from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 from slow_readers import drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.runtime.threads import use_threads
@@ -260,12 +262,48 @@ def test_missing_columns_are_each_named(tmp_path: Path) -> None:
     names = tuple(n for n in NAMES if n not in ("opacity", "rot_2"))
     with refuses(SceneError, "a.ply", "columns opacity, rot_2"):
         read_ply(save(tmp_path / "a.ply", columns(names=names)))
-    with refuses(SceneError, "b.ply", "column scale_2", "2D"):
-        read_ply(save(tmp_path / "b.ply", columns(names=tuple(n for n in NAMES if n != "scale_2"))))
+    with refuses(SceneError, "b.ply", "column scale_1"):
+        read_ply(save(tmp_path / "b.ply", columns(names=tuple(n for n in NAMES if n not in ("scale_1", "scale_2")))))
     with refuses(SceneError, "c.ply", "f_dc_0, f_dc_1, f_dc_2, opacity", "splat"):
         read_ply(save(tmp_path / "c.ply", columns(names=("x", "y", "z", "nx"))))
     with pytest.raises(SceneError, match="compressed"):
         read_ply(save(tmp_path / "d.ply", columns(names=("packed_position", "packed_scale"))))
+
+
+@pytest.mark.parametrize("text", [True, False])
+def test_2d_gaussians_get_a_thin_third_scale(tmp_path: Path, text: bool) -> None:
+    rows = columns(20_000 if not text else 20, 9)
+    rows["scale_0"][7] = -np.inf
+    flat = repack_fields(rows[[name for name in rows.dtype.names if name != "scale_2"]])
+    ply = read_ply(save(tmp_path / "a.ply", flat, text=text))
+    expected = read_ply(save(tmp_path / "b.ply", rows, text=text)).gaussians
+    for name in ("means", "quats", "opacities", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(ply.gaussians, name), getattr(expected, name))
+    scales, two = ply.gaussians.scales, expected.scales[:, :2]
+    np.testing.assert_allclose(scales, np.column_stack([two, np.maximum(1e-3 * two.min(1), np.exp(-30))]), rtol=1e-5)
+    assert "2D" in file_notes(ply.info)[0]
+    assert "scale_2" not in ply.info.columns
+
+
+@pytest.mark.parametrize("linear", [True, False])
+@pytest.mark.parametrize("two", [True, False])
+def test_what_4dgt_writes(tmp_path: Path, linear: bool, two: bool) -> None:
+    """Colours in [0, 1] as r, g, b, with activated opacities and scales; other programs keep logarithms."""
+    rng = np.random.default_rng(0)
+    names = ("x", "y", "z", "r", "g", "b", "opacity", "scale_0", "scale_1", "scale_2")[: 9 if two else 10]
+    rows = columns(200, names=(*names, "rot_0", "rot_1", "rot_2", "rot_3"))
+    colors, opacities, scales = rng.uniform(size=(200, 3)), rng.uniform(size=200), rng.uniform(0.01, 0.1, (200, 3))
+    for i, name in enumerate("rgb"):
+        rows[name] = colors[:, i]
+    rows["opacity"] = opacities
+    for i, name in enumerate(names[7:]):
+        rows[name] = scales[:, i] if linear else np.log(scales[:, i])
+    ply = read_ply(save(tmp_path / "a.ply", rows))
+    np.testing.assert_allclose(sh0_to_rgb(ply.gaussians.sh0)[:, 0], colors, atol=1e-6)
+    np.testing.assert_allclose(ply.gaussians.opacities, opacities, rtol=1e-6)
+    np.testing.assert_allclose(ply.gaussians.scales[:, : 3 - two], scales[:, : 3 - two], rtol=1e-5)
+    assert ply.info.extra_columns == ()
+    assert any("logarithms" in note for note in file_notes(ply.info)) == linear
 
 
 @pytest.mark.parametrize("num_rest", [1, 8, 10, 46])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import struct
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,10 @@ from slow_readers import assert_damage_is_one_line, corners
 from gsmerge import Gaussians
 from gsmerge.cli import main
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry import covariances, turn_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
-from gsmerge.io.formats.spz import gzip_bytes, spz_bytes
+from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.spz import AXES, gzip_bytes, spz_bytes
 
 zstandard = pytest.importorskip("zstandard")
 
@@ -92,14 +95,61 @@ def test_harmonics_of_degree_4(tmp_path: Path) -> None:
     assert read_gaussians(tmp_path / "b.spz").info.layout == ".spz version 3, SH degree 3"
 
 
-def test_extensions_are_passed_over(tmp_path: Path) -> None:
-    content, more = spz4_bytes(some(1)), struct.pack("<II4x", 0xADBE0003, 4)
-    moved = content[:16] + struct.pack("<I", 32 + len(more)) + content[20:32] + more + content[32:]
-    for name, data in {"plain": content, "more": moved}.items():
+def with_extensions(content: bytes, more: bytes) -> bytes:
+    """Put records into a file: before the table of version 4, or after the columns of an older one."""
+    flagged = bytearray(content if content[:4] == b"NGSP" else gzip.decompress(content))
+    flagged[14] |= 2
+    if content[:4] != b"NGSP":
+        return gzip.compress(flagged + more)
+    return bytes(flagged[:16] + struct.pack("<I", 32 + len(more)) + flagged[20:32] + more + flagged[32:])
+
+
+def axes_record(number: int, size: int = 4) -> bytes:
+    return struct.pack("<2I", 0xADBE0003, size) + struct.pack("<I", number)[:size]
+
+
+@pytest.mark.parametrize("more", [b"", struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2), axes_record(0), axes_record(6)])
+@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
+def test_extensions_that_change_nothing(tmp_path: Path, write: Callable[[Gaussians], bytes], more: bytes) -> None:
+    """Limits of an orbit, and axes that say nothing or are those of a ``.ply``."""
+    for name, data in {"plain": write(some(1)), "more": with_extensions(write(some(1)), more)}.items():
         (tmp_path / f"{name}.spz").write_bytes(data)
-    plain, extended = (read_gaussians(tmp_path / f"{name}.spz").gaussians for name in ("plain", "more"))
-    for name, array in vars(plain).items():
-        np.testing.assert_array_equal(getattr(extended, name), array)
+    plain, extended = (read_gaussians(tmp_path / f"{name}.spz") for name in ("plain", "more"))
+    assert file_notes(extended.info) == ()
+    for name, array in vars(plain.gaussians).items():
+        np.testing.assert_array_equal(getattr(extended.gaussians, name), array)
+
+
+@pytest.mark.parametrize(("number", "axes"), list(enumerate(AXES, 1)))
+@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
+def test_axes_are_turned_to_those_of_a_ply(
+    tmp_path: Path, write: Callable[[Gaussians], bytes], number: int, axes: str
+) -> None:
+    """Of both hands: world directions of positions, ellipsoids and colours stay the same."""
+    content, orbit = write(some(2)), struct.pack("<2I3f", 0xADBE0002, 12, 0, 1, 2)
+    (tmp_path / "plain.spz").write_bytes(content)
+    (tmp_path / "axes.spz").write_bytes(with_extensions(content, orbit + axes_record(number)))
+    plain, ply = read_gaussians(tmp_path / "plain.spz").gaussians, read_gaussians(tmp_path / "axes.spz")
+    world = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+    turn, turned = np.array([world[letter] for letter in axes], float).T, ply.gaussians
+    turn *= (1, -1, -1) if axes in ("LFD", "RFD", "LBU", "RBU") else 1  # as Niantic's library 0.2.3 does
+    np.testing.assert_allclose(turned.means, plain.means @ turn.T, atol=1e-6)
+    expected = turn @ covariances(plain.quats, plain.scales) @ turn.T
+    np.testing.assert_allclose(covariances(turned.quats, turned.scales), expected, atol=1e-7)
+    signs = np.array([[-1.0], [1], [-1]])  # degree 1 is a vector: -y, z and -x
+    before, after = ((g.shN[:, :3] * signs)[:, [2, 0, 1]] for g in (plain, turned))
+    np.testing.assert_allclose(after, turn @ before, atol=1e-5)
+    np.testing.assert_allclose(turned.shN, turn_harmonics(plain.shN, turn), atol=1e-5)
+    assert bool(file_notes(ply.info)) == (axes != "RDF")
+    assert all(axes in note for note in file_notes(ply.info))
+
+
+@pytest.mark.parametrize("record", [axes_record(17), axes_record(4, 2), axes_record(4)[:-1]])
+@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
+def test_unknown_axes(tmp_path: Path, write: Callable[[Gaussians], bytes], record: bytes) -> None:
+    (tmp_path / "a.spz").write_bytes(with_extensions(write(some(0)), record))
+    with refuses(SceneError, "a.spz", "SPZ_ADOBE_coordinate_system", "17" if record[8] == 17 else "damaged"):
+        read_gaussians(tmp_path / "a.spz")
 
 
 def spz_with(**changes: int) -> bytes:
