@@ -6,8 +6,8 @@ few of them in their pixels shows the lines before and after in theirs, up to wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -19,12 +19,19 @@ from gsmerge.kernels.matrices import matmul
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
-_MIN_ALIKE, _WIDTHS = 0.02, 4  # share of them that have it after one number of rows, and such numbers that are tried
+_ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
+_SIMILAR, _SLACK = 0.3, 0.08  # share that have it about as far, and by how much that may differ
+_TRIED, _SEEDS = 60, 12  # series of lines that are solved for the width, and that may tell it
+_ROUGH, _ROUNDS = 0.03, 5  # of a line: median error of rows that are spread evenly over it; rounds from there
+_SLANT, _SLANTS = 4.0, 32  # columns by which lines may slant in all, and how many slants each way are tried
+_CLOSER = 0.95  # times the distance: another round is worth it
+_COMMON = 0.25  # of the lines, that a column has
+_OUTSIDE = 1e6  # pixels
 _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
 _MIN_LINES = 6  # whole lines in a row
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 0.6  # median distance of rows from their pixels
-_NEXT_PX = 0.75  # that a step to the next pixel is off, at most
+_RISE = 0.75  # of a step to the next pixel of a line, at most, pixels
 _RUN = 3  # rows from pixel to pixel that are no chance
 _SAME_LINES = 2  # by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
@@ -41,8 +48,8 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
         return None
     points = means[rows].astype(np.float64)
     points -= np.median(points, 0)
-    for width in _find_widths(points):
-        views = _find_views(points, width)
+    for length, slack in _find_lengths(points):
+        views, width = _find_views(points, length, slack)
         if sum(len(view.x) for view in views) >= _MIN_PLACED * len(rows):
             layout = _make_layout(rows, views, width)
             calibration = calibrate(find_correspondences(means, valid, subsample(layout, 1000)), width, layout.height)
@@ -51,8 +58,11 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
     return None
 
 
-def _find_widths(points: np.ndarray) -> list[int]:
-    """Find the numbers of rows after which most often the nearest neighbour of a row follows, the likely ones first."""
+def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
+    """Find after how many rows most often the nearest neighbour of a row follows, and by how many that differs.
+
+    Those of lines that are whole come first, then those of lines that each lack some pixels.
+    """
     most = min(_MAX_WIDTH, len(points) // 4)
     starts = np.linspace(0, len(points) - most - 1, _LOOKED_AT).astype(int)
     near = points.astype(np.float32)
@@ -60,10 +70,17 @@ def _find_widths(points: np.ndarray) -> list[int]:
         _MIN_SIDE + int(np.argmin(((near[start + _MIN_SIDE : start + most] - near[start]) ** 2).sum(1)))
         for start in starts
     ]
-    counts = np.bincount(lags, minlength=most + 2)
-    peaks = np.flatnonzero((counts[1:-1] >= counts[:-2]) & (counts[1:-1] >= counts[2:])) + 1
-    peaks = peaks[counts[peaks] >= _MIN_ALIKE * len(starts)]
-    return [int(lag) for lag in peaks[np.argsort(-counts[peaks], kind="stable")][:_WIDTHS]]
+    counts = np.bincount(lags, minlength=2 * most)
+    beside = np.maximum(np.roll(counts, 1), np.roll(counts, -1))
+    peaks = np.where(counts >= beside, counts, 0)
+    exact = [int(lag) for lag in np.argsort(-peaks, kind="stable")[:_LENGTHS] if peaks[lag] >= _ALIKE * len(lags)]
+    sums = np.cumsum(counts)
+    around = np.arange(most)
+    slack = np.rint(_SLACK * around).astype(int)
+    similar = sums[around + slack] - sums[np.maximum(around - slack - 1, 0)]
+    middle = int(np.rint(np.flatnonzero(similar == similar.max()).mean()))
+    found = [(lag, 0) for lag in exact]
+    return [*found, (middle, int(slack[middle]))] if similar.max() >= _SIMILAR * len(lags) else found
 
 
 @dataclass(frozen=True)
@@ -74,48 +91,149 @@ class _View:
     x: np.ndarray
     y: np.ndarray
     camera: np.ndarray  # ``[3,4]`` projective
+    px: float = np.inf  # median distance of rows from their pixels
 
 
-def _find_views(points: np.ndarray, width: int) -> list[_View]:
+def _find_views(points: np.ndarray, length: int, slack: int) -> tuple[list[_View], int]:
+    """Find the views whose lines have ``length`` rows, up to ``slack`` more or less; also return their width."""
+    series = _find_lines(points, length, slack)
+    solved = (_solve_lines(points, starts) for starts in series[:_TRIED])
+    widths = [int(seed.x.max()) + 1 for seed in islice(filter(None, solved), _SEEDS)]
+    width = max(widths, key=lambda width: (widths.count(width), width), default=0)
     views: list[_View] = []
     free = np.ones(len(points), bool)
-    for first, lines in _whole_lines(points, width):
-        rows = np.arange(first, first + lines * width)
-        if not free[rows].all():
+    for starts in series if widths else ():
+        if not free[starts[0] : starts[-1]].all():
             continue
-        view = _grow(points, free, _View(rows, (rows - first) % width, (rows - first) // width, np.empty(0)), width)
-        if view is not None:
+        seed = _solve_lines(points, starts)
+        if seed is not None and seed.x.max() == width - 1:
+            view = _grow(points, free, seed, width)
             views.append(view)
             free[view.rows[0] : view.rows[-1] + 1] = False
-    return sorted(views, key=lambda view: int(view.rows[0]))
+    return sorted(views, key=lambda view: int(view.rows[0])), width
 
 
-def _whole_lines(points: np.ndarray, width: int) -> Iterator[tuple[int, int]]:
-    """Yield the first rows and the numbers of consecutive whole lines, the most lines first."""
-    count = len(points) // width * width
+def _find_lines(points: np.ndarray, length: int, slack: int) -> list[np.ndarray]:
+    """Find series of rows with which lines begin, one below the other and about ``length`` apart; the longest first.
+
+    Where a line begins a long step leads back near to where the line before began.
+    """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    below = np.linalg.norm(points[width:] - points[:-width], axis=1)
-    usual = np.repeat(np.median(steps[: count - width].reshape(-1, width), 1), width)
-    begins = np.zeros(count, bool)  # a line begins, and so does one ``width`` rows before
-    jump = steps[width - 1 : count - 1]
-    begins[width:] = (jump > _WRAP * usual) & (below[: count - width] < _BELOW * jump)
-    columns = np.zeros((width, count // width + 1), bool)
-    columns[:, :-1] = begins.reshape(-1, width).T
-    edges = np.flatnonzero(np.diff(columns.reshape(-1), prepend=False)).reshape(-1, 2)
-    lines = edges[:, 1] - edges[:, 0]
-    for i in np.argsort(-lines, kind="stable"):
-        if lines[i] < _MIN_LINES:
-            return
-        column, line = divmod(int(edges[i, 0]), columns.shape[1])
-        yield (line - 1) * width + column, int(lines[i])
+    count = len(steps) // length * length
+    usual = np.median(steps[:count].reshape(-1, length), 1)[
+        np.minimum(np.arange(len(steps)) // length, count // length - 1)
+    ]
+    rows = np.flatnonzero(steps > _WRAP * usual) + 1
+    jumps, near = steps[rows - 1], points[rows]
+    before, distance = np.full(len(rows), -1), _BELOW * jumps
+    for back in range(1, len(rows)):
+        apart = rows[back:] - rows[:-back]
+        if apart.min() > length + slack:
+            break
+        ids = np.flatnonzero(np.abs(apart - length) <= slack)
+        there = np.linalg.norm(near[ids + back] - near[ids], axis=1)
+        closer = there < distance[ids + back]
+        ids, there = ids[closer], there[closer]
+        before[ids + back], distance[ids + back] = ids, there
+    lines = np.zeros(len(rows), np.int64)
+    for i, previous in enumerate(before.tolist()):
+        lines[i] = lines[previous] + 1 if previous >= 0 else 0
+    series, used = [], np.zeros(len(rows), bool)
+    for last in np.argsort(-lines, kind="stable").tolist():
+        if lines[last] < _MIN_LINES:
+            break
+        chain = [last]
+        while before[chain[-1]] >= 0 and not used[chain[-1]]:
+            chain.append(int(before[chain[-1]]))
+        if not used[chain].any():
+            series.append(rows[chain[::-1]])
+        used[chain] = True
+    return series
 
 
-def _grow(points: np.ndarray, free: np.ndarray, seed: _View, width: int) -> _View | None:
-    """Grow a view from whole lines over the rows before and after them; None if these are no lines of one camera."""
-    view = _solve(points, seed)
-    if view is None:
-        return None
-    low, high = _free_range(free, seed.rows)
+def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
+    """Solve for the pixels of the lines that begin at ``starts`` and their camera; None if they are no lines."""
+    rows = np.arange(starts[0], starts[-1])
+    lengths = np.diff(starts)
+    y = np.repeat(np.arange(len(lengths)), lengths)
+    longest = int(lengths.max())
+    x = np.rint((rows - np.repeat(starts[:-1], lengths)) * (longest / np.repeat(lengths, lengths))).astype(np.int64)
+    view = _solve(points, _View(rows, x, y, np.empty(0)), _ROUGH * longest)
+    for turn in range(_ROUNDS if view is not None else 0):
+        u, _ = _project(points[rows], view.camera)
+        begins = starts[:-1] - starts[0]
+        if turn == 0:
+            u /= _column_step(u, begins, lengths)
+        else:  # gaps are known well enough now
+            begins = np.union1d(begins, np.flatnonzero(np.abs(np.diff(u) - 1) > 0.5) + 1)
+        nearer = _solve(points, replace(view, x=_whole_columns(u, y, begins)), _ROUGH * longest)
+        if nearer is None or nearer.px > _CLOSER * view.px:
+            break
+        view = nearer
+    return _common_columns(view) if view is not None and view.px <= _MAX_PX else None
+
+
+def _column_step(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> float:
+    """Return how far apart neighbouring columns lie in ``u [n]``, if most pixels have their neighbour."""
+    steps = np.diff(u)
+    usual = float(np.median(steps))
+    near = steps[np.abs(steps - usual) < abs(usual) / 2]
+    if usual <= 0 or not len(near):
+        return 1.0
+    columns, _ = _count_columns(u / near.mean(), starts)
+    across = columns - np.repeat(np.add.reduceat(columns, starts) / lengths, lengths)
+    return float((across * u).sum() / (across * across).sum()) or 1.0
+
+
+def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Round the columns ``u [n]`` of rows in lines ``y [n]``, that are known up to a shift and a slant.
+
+    Those of a piece, which begin at ``starts``, are rounded together. Columns are counted from anywhere.
+    """
+    columns, places = _count_columns(u, starts)
+    slants = np.linspace(-_SLANT, _SLANT, 2 * _SLANTS + 1) / max(1, y[-1])
+    turns = 2j * np.pi * (places - slants[:, None] * y[starts])
+    sums = (np.exp(turns) * np.diff(np.append(starts, len(u)))).sum(1)
+    best = np.abs(sums).argmax()
+    places -= slants[best] * y[starts] + np.angle(sums[best]) / (2 * np.pi)
+    return columns + np.repeat(np.rint(places).astype(np.int64), np.diff(np.append(starts, len(u))))
+
+
+def _common_columns(view: _View) -> _View:
+    """Leave out the rows of columns that few lines have, and count columns from the first one left."""
+    columns = view.x - view.x.min()
+    counts = np.bincount(columns)
+    common = np.flatnonzero(counts >= _COMMON * counts.max())
+    kept = (columns >= common[0]) & (columns <= common[-1])
+    camera = view.camera.copy()
+    camera[0] -= (common[0] + view.x.min()) * camera[2]
+    return replace(view, rows=view.rows[kept], x=columns[kept] - common[0], y=view.y[kept], camera=camera)
+
+
+def _project(points: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project points ``[n,3]``; return columns and lines, 0 at the centre of the first pixel."""
+    with np.errstate(all="ignore"):
+        places = matmul(points, camera[:, :3].T) + camera[:, 3]
+        u, v = (np.nan_to_num(places[:, i] / places[:, 2] - 0.5, nan=-_OUTSIDE) for i in (0, 1))
+    return u.clip(-_OUTSIDE, _OUTSIDE), v.clip(-_OUTSIDE, _OUTSIDE)
+
+
+def _count_columns(u: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Count the columns of rows at ``u [n]`` in pieces that begin at ``starts [p]``, by whole steps from 0.
+
+    Also returns the column ``[p]`` at which each piece begins on average.
+    """
+    lengths = np.diff(np.append(starts, len(u)))
+    steps = np.maximum(1, np.rint(np.diff(u, prepend=0)))
+    steps[starts] = 0
+    sums = np.cumsum(steps)
+    columns = (sums - np.repeat(sums[starts], lengths)).astype(np.int64)
+    return columns, np.add.reduceat(u - columns, starts) / lengths
+
+
+def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _View:
+    """Grow a view over the free rows before and after it."""
+    low, high = _free_range(free, view.rows)
     while True:
         lines = int(view.y.max() - view.y.min()) + 1
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
@@ -140,12 +258,12 @@ def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
     return int(before[-1]) + 1 if len(before) else 0, int(rows[-1] + after[0]) if len(after) else len(free)
 
 
-def _solve(points: np.ndarray, view: _View) -> _View | None:
-    """Solve for the camera of a view; None if its rows do not lie at their pixels."""
+def _solve(points: np.ndarray, view: _View, max_px: float = _MAX_PX) -> _View | None:
+    """Solve for the camera of a view; None if its rows lie farther from their pixels."""
     chosen = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
     pixels = np.stack([view.x[chosen], view.y[chosen]], 1) + 0.5
     camera, px = projective_camera(points[view.rows[chosen]], pixels)
-    return _View(view.rows, view.x, view.y, camera) if px <= _MAX_PX else None
+    return replace(view, camera=camera, px=px) if px <= max_px else None
 
 
 def _walk(
@@ -159,21 +277,21 @@ def _walk(
     points = points[: (reach + 1) * width]
     if not len(points):
         return (np.empty(0, np.int64),) * 3
-    with np.errstate(all="ignore"):
-        places = matmul(points, camera[:, :3].T) + camera[:, 3]
-        u, v = (np.nan_to_num(places[:, i] / places[:, 2] - 0.5, nan=-1e6).clip(-1e6, 1e6) for i in (0, 1))
-    gaps = (np.abs(np.diff(u) - 1) > _NEXT_PX) | (np.abs(np.diff(v)) > _NEXT_PX)
+    u, v = _project(points, camera)
+    gaps = (np.abs(np.diff(u) - 1) > 0.5) | (np.abs(np.diff(v)) > _RISE)
     starts = np.flatnonzero(np.concatenate([[True], gaps]))
     lengths = np.diff(np.append(starts, len(u)))
-    offsets = np.arange(len(u)) - np.repeat(starts, lengths)
-    x, y = (np.rint(np.add.reduceat(values, starts) / lengths).astype(np.int64) for values in (u - offsets, v))
+    x, places = _count_columns(u, starts)
+    x += np.repeat(np.rint(places), lengths).astype(np.int64)
+    y = np.rint(np.add.reduceat(v, starts) / lengths).astype(np.int64)
+    firsts, lasts = x[starts], x[starts + lengths - 1]
     after, lost, end = last[1] * width + last[0], 0, 0
     follows = np.zeros(len(starts), bool)
-    inside = (x >= 0) & (x + lengths <= width) & (y <= last[1] + reach)
-    firsts = y * width + x
-    for i, (first, length) in enumerate(zip(firsts.tolist(), lengths.tolist(), strict=True)):
+    inside = (firsts >= 0) & (lasts < width) & (y <= last[1] + reach)
+    pieces = zip((y * width + firsts).tolist(), (y * width + lasts).tolist(), lengths.tolist(), strict=True)
+    for i, (first, end_id, length) in enumerate(pieces):
         if inside[i] and first > after:
-            follows[i], after = True, first + length - 1
+            follows[i], after = True, end_id
         if follows[i] and length >= _RUN:
             lost, end = 0, i + 1
         else:
@@ -182,7 +300,7 @@ def _walk(
                 break
     follows[end:] = False
     placed = np.flatnonzero(np.repeat(follows, lengths))
-    return placed, (np.repeat(x, lengths) + offsets)[placed], np.repeat(y, lengths)[placed]
+    return placed, x[placed], np.repeat(y, lengths)[placed]
 
 
 def _make_layout(rows: np.ndarray, views: list[_View], width: int) -> Layout:
