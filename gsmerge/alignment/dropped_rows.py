@@ -6,13 +6,13 @@ few of them in their pixels shows the lines before and after in theirs, up to wh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
 from gsmerge.alignment.calibration import Calibration, calibrate
-from gsmerge.alignment.layouts import Layout, subsample
+from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences
 from gsmerge.kernels.matrices import matmul
@@ -21,11 +21,14 @@ _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
 _ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
 _SIMILAR, _SLACK = 0.3, 0.08  # share that have it about as far, and by how much that may differ
-_TRIED, _SEEDS = 60, 12  # series of lines that are solved for the width, and that may tell it
-_ROUGH, _ROUNDS = 0.03, 5  # of a line: median error of rows that are spread evenly over it; rounds from there
+_SEEDS, _TRIED, _AS_NEAR = 12, 200, 1.3  # series of lines: looked at first, solved; times their least distance: good
+_AGAIN = 3  # rounds of placing all rows of a view that lack pixels here and there
+_MARGIN = 0.2  # of the length of lines that lack pixels: columns that those of a seed may lack on both sides
+_ROUGH, _ROUNDS = 0.03, 12  # of a line: median error of rows that are spread evenly over it; rounds from there
 _SLANT, _SLANTS = 4.0, 32  # columns by which lines may slant in all, and how many slants each way are tried
-_CLOSER = 0.95  # times the distance: another round is worth it
-_COMMON = 0.25  # of the lines, that a column has
+_FULL = 0.75  # share of the lines that lack more pixels than those whose rows are spread evenly at first
+_CLOSER = 0.99  # times the distance: another round is worth it
+_COMMON, _RARE = 0.5, 0.05  # of the lines that a column has, in a few whole ones and in a view
 _OUTSIDE = 1e6  # pixels
 _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
 _MIN_LINES = 6  # whole lines in a row
@@ -33,7 +36,7 @@ _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 0.6  # median distance of rows from their pixels
 _RISE = 0.75  # of a step to the next pixel of a line, at most, pixels
 _RUN = 3  # rows from pixel to pixel that are no chance
-_SAME_LINES = 2  # by which the principal point may be off
+_SAME = 2  # pixels by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
 _MIN_PLACED = 0.9  # share of the rows that come to a pixel
 
@@ -49,10 +52,11 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
     points = means[rows].astype(np.float64)
     points -= np.median(points, 0)
     for length, slack in _find_lengths(points):
-        views, width = _find_views(points, length, slack)
+        views = _find_views(points, length, slack)
         if sum(len(view.x) for view in views) >= _MIN_PLACED * len(rows):
-            layout = _make_layout(rows, views, width)
-            calibration = calibrate(find_correspondences(means, valid, subsample(layout, 1000)), width, layout.height)
+            layout = _make_layout(rows, views)
+            pairs = find_correspondences(means, valid, subsample(layout, _SOLVED_FROM))
+            calibration = calibrate(pairs, layout.width, layout.height)
             if calibration is not None:
                 return layout, calibration
     return None
@@ -94,23 +98,25 @@ class _View:
     px: float = np.inf  # median distance of rows from their pixels
 
 
-def _find_views(points: np.ndarray, length: int, slack: int) -> tuple[list[_View], int]:
-    """Find the views whose lines have ``length`` rows, up to ``slack`` more or less; also return their width."""
+def _find_views(points: np.ndarray, length: int, slack: int) -> list[_View]:
+    """Find the views whose lines have ``length`` rows, up to ``slack`` more or less."""
     series = _find_lines(points, length, slack)
-    solved = (_solve_lines(points, starts) for starts in series[:_TRIED])
-    widths = [int(seed.x.max()) + 1 for seed in islice(filter(None, solved), _SEEDS)]
-    width = max(widths, key=lambda width: (widths.count(width), width), default=0)
-    views: list[_View] = []
+    first = [seed.px for starts in series[:_SEEDS] if (seed := _solve_lines(points, starts)) is not None]
+    far, views = _AS_NEAR * min(first, default=0.0), list[_View]()
     free = np.ones(len(points), bool)
-    for starts in series if widths else ():
+    for starts in series[:_TRIED] if first else ():
         if not free[starts[0] : starts[-1]].all():
             continue
         seed = _solve_lines(points, starts)
-        if seed is not None and seed.x.max() == width - 1:
-            view = _grow(points, free, seed, width)
-            views.append(view)
+        if seed is not None and seed.px <= far:
+            margin = int(_MARGIN * length) if slack else 0  # of columns that the seed may lack
+            width = int(seed.x.max()) + 1 + 2 * margin
+            view = _grow(points, free, _shift(seed, margin), width)
+            for _ in range(_AGAIN if slack else 0):  # columns of the seed were counted without the lines around
+                view = _grow(points, free, _place_again(points, view, width), width)
             free[view.rows[0] : view.rows[-1] + 1] = False
-    return sorted(views, key=lambda view: int(view.rows[0])), width
+            views.append(_common_columns(view, _RARE))
+    return sorted(views, key=lambda view: int(view.rows[0]))
 
 
 def _find_lines(points: np.ndarray, length: int, slack: int) -> list[np.ndarray]:
@@ -158,8 +164,13 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
     y = np.repeat(np.arange(len(lengths)), lengths)
     longest = int(lengths.max())
     x = np.rint((rows - np.repeat(starts[:-1], lengths)) * (longest / np.repeat(lengths, lengths))).astype(np.int64)
-    view = _solve(points, _View(rows, x, y, np.empty(0)), _ROUGH * longest)
-    for turn in range(_ROUNDS if view is not None else 0):
+    view = _View(rows, x, y, np.empty(0))
+    full = np.repeat(lengths >= np.quantile(lengths, _FULL), lengths)
+    rough = _solve(points, _View(rows[full], x[full], y[full], np.empty(0)), _ROUGH * longest)
+    if rough is None:
+        return None
+    view = replace(view, camera=rough.camera)
+    for turn in range(_ROUNDS):
         u, _ = _project(points[rows], view.camera)
         begins = starts[:-1] - starts[0]
         if turn == 0:
@@ -170,7 +181,7 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
         if nearer is None or nearer.px > _CLOSER * view.px:
             break
         view = nearer
-    return _common_columns(view) if view is not None and view.px <= _MAX_PX else None
+    return _common_columns(view, _COMMON) if view.px <= _MAX_PX else None
 
 
 def _column_step(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> float:
@@ -199,15 +210,20 @@ def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarr
     return columns + np.repeat(np.rint(places).astype(np.int64), np.diff(np.append(starts, len(u))))
 
 
-def _common_columns(view: _View) -> _View:
-    """Leave out the rows of columns that few lines have, and count columns from the first one left."""
-    columns = view.x - view.x.min()
-    counts = np.bincount(columns)
-    common = np.flatnonzero(counts >= _COMMON * counts.max())
-    kept = (columns >= common[0]) & (columns <= common[-1])
+def _common_columns(view: _View, share: float) -> _View:
+    """Leave out the rows of columns that less than a share of the lines have; count columns from the first one left."""
+    first = int(view.x.min())
+    counts = np.bincount(view.x - first)
+    common = first + np.flatnonzero(counts >= share * counts.max())
+    kept = (view.x >= common[0]) & (view.x <= common[-1])
+    return _shift(replace(view, rows=view.rows[kept], x=view.x[kept], y=view.y[kept]), -int(common[0]))
+
+
+def _shift(view: _View, columns: int) -> _View:
+    """Count columns from another one."""
     camera = view.camera.copy()
-    camera[0] -= (common[0] + view.x.min()) * camera[2]
-    return replace(view, rows=view.rows[kept], x=columns[kept] - common[0], y=view.y[kept], camera=camera)
+    camera[0] += columns * camera[2]
+    return replace(view, x=view.x + columns, camera=camera)
 
 
 def _project(points: np.ndarray, camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -250,6 +266,14 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         if grown is None:
             return view
         view = grown
+
+
+def _place_again(points: np.ndarray, view: _View, width: int) -> _View:
+    """Place all rows of a view by its camera."""
+    first, lines = int(view.rows[0]), int(np.ptp(view.y)) + 1
+    rows, x, y = _walk(points[first : view.rows[-1] + 1], view.camera, (-1, int(view.y[0])), width, lines)
+    again = _solve(points, _View(first + rows, x, y, view.camera)) if len(rows) else None
+    return view if again is None else again
 
 
 def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
@@ -303,31 +327,30 @@ def _walk(
     return placed, x[placed], np.repeat(y, lengths)[placed]
 
 
-def _make_layout(rows: np.ndarray, views: list[_View], width: int) -> Layout:
-    """Lay out views on one grid; where their lines begin is the same for the same principal points."""
-    lines = np.array([np.ptp(view.y) + 1 for view in views])
-    firsts = np.array([view.y.min() - _principal_y(view.camera) for view in views])
-    most = int(lines.max())
-    tops = np.rint(firsts - np.median(firsts[lines == most])).astype(int)
-    within = tops.clip(0, most - lines)
-    tops = np.where(np.abs(tops - within) <= _SAME_LINES, within, tops)
-    tops -= tops.min()
-    height = int((tops + lines).max())
-    pixels = tuple((view.y - view.y.min() + top) * width + view.x for view, top in zip(views, tops, strict=True))
-    parts = tuple(range(len(views)))
-    return Layout(
-        "pixels dropped, view-major",
-        "pruned",
-        "view-major",
-        width,
-        height,
-        parts,
-        tuple(rows[view.rows] for view in views),
-        pixels,
-    )
+def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:
+    """Lay out views on one grid, in which they have the same principal point."""
+    lefts, width = _place([(view.x, _principal(view, 0)) for view in views])
+    tops, height = _place([(view.y, _principal(view, 1)) for view in views])
+    pixels = tuple((view.y + top) * width + view.x + left for view, top, left in zip(views, tops, lefts, strict=True))
+    ids = np.full(rows[-1] + 1, -1)
+    for number, (view, own) in enumerate(zip(views, pixels, strict=True)):
+        ids[rows[view.rows]] = number * height * width + own
+    return dropped_layout(ids, len(views), width, height)
 
 
-def _principal_y(camera: np.ndarray) -> float:
-    """Return the line of the principal point of a projective camera (Hartley and Zisserman 2004, section 6.2)."""
-    axis = camera[2, :3]
-    return float(camera[1, :3] @ axis / (axis @ axis))
+def _place(views: Sequence[tuple[np.ndarray, float]]) -> tuple[list[int], int]:
+    """Choose the shifts of views along an axis, from their pixels and principal points there; also return the size."""
+    firsts, middles = np.array([pixels.min() for pixels, _ in views]), np.array([middle for _, middle in views])
+    sizes = np.array([pixels.max() for pixels, _ in views]) - firsts + 1
+    starts = firsts - middles
+    places = np.rint(starts - np.median(starts[sizes == sizes.max()])).astype(int)
+    within = places.clip(0, sizes.max() - sizes)
+    places = np.where(np.abs(places - within) <= _SAME, within, places)
+    places -= places.min()
+    return (places - firsts).tolist(), int((places + sizes).max())
+
+
+def _principal(view: _View, axis: int) -> float:
+    """Return a coordinate of the principal point of a projective camera (Hartley and Zisserman 2004, section 6.2)."""
+    forward = view.camera[2, :3]
+    return float((view.camera[axis, :3] * forward).sum() / (forward * forward).sum())

@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resiz
 from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
-ESTIMATED, WITH_PHOTOS = "estimated from the grid", "estimated from rows and photos"  # sources of estimated cameras
+ESTIMATED = "estimated from the grid"  # source of cameras
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
@@ -110,6 +110,11 @@ def da3_trim(side: int) -> int:
     return int(8 / 256 * side)
 
 
+def da3_border(side: int) -> int:
+    """Return the pixels that Depth Anything 3 cut off at both ends of what is left of a side."""
+    return next(border for border in range(side + 1) if da3_trim(side + 2 * border) == border)
+
+
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
     """List the possible orders of a file's views: the order of the cameras, and the order of the names."""
     views = range(len(names))
@@ -138,6 +143,21 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
                 continue
             chosen = next((ids for ids in every_nth(views) if len(ids) == num_used), tuple(range(num_used)))
             yield from _orders(count, box, per_pixel, chosen, width, height)
+
+
+def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -> Layout:
+    """Return the layout of rows in view-major order by their pixels ``[n]``; some rows, and some pixels, have none."""
+    used = np.flatnonzero(pixel_ids >= 0)
+    parts = np.split(used, np.searchsorted(pixel_ids[used] // (width * height), np.arange(1, views)))
+    pixels = tuple(pixel_ids[rows] % (width * height) for rows in parts)
+    order, chosen = "view-major", tuple(range(views))
+    return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, chosen, tuple(parts), pixels)
+
+
+def move_layout(layout: Layout, width: int, height: int, left: int, top: int) -> Layout:
+    """Move a layout into a grid of another size, so that its first pixel comes to (left, top)."""
+    places = (np.divmod(pixels, layout.width) for pixels in layout.pixels)
+    return replace(layout, width=width, height=height, pixels=tuple((y + top) * width + x + left for y, x in places))
 
 
 def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:

@@ -7,7 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.alignment.layouts import (
+    Layout,
+    depth_layouts,
+    every_nth,
+    exact_layouts,
+    move_layout,
+    plain_layout,
+    subsample,
+)
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     QUICK_SAMPLES,
@@ -33,6 +41,7 @@ _SIMPLER_PX = 0.02  # ... and this many pixels
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 # pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
 _SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
+_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
 _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
 
 
@@ -60,9 +69,9 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
     if not exact_frames:
-        from gsmerge.alignment.incomplete import read_incomplete  # of the few files that lack rows
-
-        yield from ([reading] for reading in read_incomplete(inputs))
+        layouts = dropped_layouts(inputs)
+        for effort in (0, 1, 2):
+            yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
 
 
 def _read_plain(inputs: AlignmentInput) -> list[Reading]:
@@ -115,6 +124,28 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
         if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
             layouts += depth_layouts(count, depths)
     return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
+
+
+def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
+    """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
+    cameras = inputs.cameras
+    lacks = len(inputs.gaussians) < len(cameras) * cameras.width * cameras.height
+    grid = inputs.dropped() if lacks and inputs.order in ("auto", "view-major") else None
+    if grid is None:
+        return []
+    layout, own = grid
+    margins = cameras.width - layout.width, cameras.height - layout.height
+    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
+    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
+        return []
+    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
+    layout = replace(layout, views=chosen)
+    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
+    lefts, tops = (
+        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
+        for margin, shift in zip(margins, shifts.tolist(), strict=True)
+    )
+    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
 
 
 def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:

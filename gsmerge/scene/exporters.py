@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.alignment import MAY_BE_UNALIGNED, WITH_PHOTOS, Layout
+from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.settings.reading import QuatChoice, ReadHints
 
@@ -122,7 +122,7 @@ _EXPORTERS = (
             ),
         ),
         "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
-        cameras=("DA3 npz", "COLMAP binary", "COLMAP text", WITH_PHOTOS),
+        cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
     # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
     # the median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.
