@@ -31,6 +31,7 @@ _CLOSER = 0.99  # times the distance: another round is worth it
 _COMMON, _RARE = 0.5, 0.05  # of the lines that a column has, in a few whole ones and in a view
 _OUTSIDE = 1e6  # pixels
 _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
+_MOST_JUMPS = 50  # in a line; more are rows in no order
 _MIN_LINES = 6  # whole lines in a row
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 0.6  # median distance of rows from their pixels
@@ -130,6 +131,8 @@ def _find_lines(points: np.ndarray, length: int, slack: int) -> list[np.ndarray]
         np.minimum(np.arange(len(steps)) // length, count // length - 1)
     ]
     rows = np.flatnonzero(steps > _WRAP * usual) + 1
+    if len(rows) * length > _MOST_JUMPS * len(points):
+        return []
     jumps, near = steps[rows - 1], points[rows]
     before, distance = np.full(len(rows), -1), _BELOW * jumps
     for back in range(1, len(rows)):

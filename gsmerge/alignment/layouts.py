@@ -110,9 +110,9 @@ def da3_trim(side: int) -> int:
     return int(8 / 256 * side)
 
 
-def da3_border(side: int) -> int:
-    """Return the pixels that Depth Anything 3 cut off at both ends of what is left of a side."""
-    return next(border for border in range(side + 1) if da3_trim(side + 2 * border) == border)
+def da3_borders(side: int) -> list[int]:
+    """List the pixels that Depth Anything 3 may have cut off at both ends of what is left of a side."""
+    return [border for border in range(side) if da3_trim(side + 2 * border) == border]
 
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:

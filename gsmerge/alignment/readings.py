@@ -134,6 +134,8 @@ def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
     if grid is None:
         return []
     layout, own = grid
+    if sum(map(len, layout.rows)) == len(layout.views) * layout.width * layout.height:
+        return []  # which no more than a border lacks
     margins = cameras.width - layout.width, cameras.height - layout.height
     focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
     if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():

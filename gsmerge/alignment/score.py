@@ -217,10 +217,10 @@ class AlignmentInput:
     labellings: Sequence[tuple[int, ...]]  # orders that the views may be in: the file's, that of the names
     # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
     depths: Callable[[], np.ndarray | None]
-    # finds the grid of rows that lack pixels, and cameras for it; None where there is none
-    dropped: Callable[[], tuple[Layout, Cameras] | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
     scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
+    # finds the grid of rows that lack pixels, and cameras for it; None where there is none
+    dropped: Callable[[], tuple[Layout, Cameras] | None] = lambda: None
 
     def pairs(self, layout: Layout) -> Correspondences:
         """Return the valid rows of a layout with their pixels and views."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -111,7 +112,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     sizes = [image_size(path) for path in paths]
     size = max(sizes, key=sizes.count)
     trims = [(trim, trim) for trim in (0, *alignment.TRIMS)]
-    trims.append((alignment.da3_border(width), alignment.da3_border(height)))
+    trims += product(alignment.da3_borders(width), alignment.da3_borders(height))
     fits = [
         (trim, transform)
         for trim in dict.fromkeys(trims)
