@@ -118,6 +118,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
         for trim in dict.fromkeys(trims)
         for transform in _transforms(size, width + 2 * trim[0], height + 2 * trim[1])
     ]
+    fits.sort(key=lambda fit: bool(fit[1].crops))  # of those that show the same, the simple one
     ratio = _SIDE / max(width, height)
     small = max(1, round(width * ratio)), max(1, round(height * ratio))
     wanted = [_grey(picture, small) for picture in pictures]
@@ -142,7 +143,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
         return None
     best = max(float(each.mean()) for each, _, _ in options)
     near = [option for option in options if option[2] == list(range(views)) and option[0].mean() > best - _CLEARLY]
-    _, number, chosen = max(near or options, key=lambda option: float(option[0].mean()))
+    _, number, chosen = max(near or options, key=lambda option: round(float(option[0].mean()), 3))
     trim, transform = fits[number]
     return PhotoMatch(chosen, size, transform, trim)
 
