@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,7 +32,7 @@ _CLOSER = 0.99  # times the distance: another round is worth it
 _COMMON, _RARE = 0.5, 0.05  # of the lines that a column has, in a few whole ones and in a view
 _OUTSIDE = 1e6  # pixels
 _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it at most, to the pixel below
-_MOST_JUMPS = 50  # in a line; more are rows in no order
+_MOST_JUMPS = 100  # in a line; more are rows in no order
 _MIN_LINES = 6  # whole lines in a row
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 0.6  # median distance of rows from their pixels
@@ -39,6 +40,7 @@ _RISE = 0.75  # of a step to the next pixel of a line, at most, pixels
 _RUN = 3  # rows from pixel to pixel that are no chance
 _SAME = 2  # pixels by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
+_MAX_MIXED = 16  # views whose rows lie side by side
 _MIN_PLACED = 0.9  # share of the rows that come to a pixel
 
 
@@ -52,8 +54,9 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
         return None
     points = means[rows].astype(np.float64)
     points -= np.median(points, 0)
-    for length, slack in _find_lengths(points):
-        views = _find_views(points, length, slack)
+    searches = (partial(_find_views, points, *length) for length in _find_lengths(points))
+    for search in (*searches, partial(_find_mixed, points)):
+        views = search()
         if sum(len(view.x) for view in views) >= _MIN_PLACED * len(rows):
             layout = _make_layout(rows, views)
             pairs = find_correspondences(means, valid, subsample(layout, _SOLVED_FROM))
@@ -257,9 +260,10 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         lines = int(view.y.max() - view.y.min()) + 1
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
         after = _walk(points[view.rows[-1] + 1 : high], view.camera, (view.x[-1], view.y[-1]), width, reach)
-        turned = np.array([[-1, 0, width], [0, -1, 0], [0, 0, 1.0]])  # the lines backwards, from the last to the first
         ahead = points[low : view.rows[0]][::-1]
-        before = _walk(ahead, matmul(turned, view.camera), (width - 1 - view.x[0], -1 - view.y[0]), width, reach)
+        before = _walk(
+            ahead, matmul(_backwards(width), view.camera), (width - 1 - view.x[0], -1 - view.y[0]), width, reach
+        )
         if not len(after[0]) + len(before[0]):
             return view
         rows = np.concatenate([view.rows[0] - 1 - before[0][::-1], view.rows, view.rows[-1] + 1 + after[0]])
@@ -269,6 +273,11 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         if grown is None:
             return view
         view = grown
+
+
+def _backwards(width: int) -> np.ndarray:
+    """Return the matrix ``[3,3]`` that turns pixels so that the last come first."""
+    return np.array([[-1, 0, width], [0, -1, 0], [0, 0, 1.0]])
 
 
 def _place_again(points: np.ndarray, view: _View, width: int) -> _View:
@@ -328,6 +337,93 @@ def _walk(
     follows[end:] = False
     placed = np.flatnonzero(np.repeat(follows, lengths))
     return placed, x[placed], np.repeat(y, lengths)[placed]
+
+
+def _find_mixed(points: np.ndarray) -> list[_View]:
+    """Find views whose rows lie side by side, pixel by pixel; none where rows have no such order."""
+    lags = np.arange(1, _MAX_MIXED + 1)
+    starts = np.linspace(0, len(points) - _MAX_MIXED - 1, _LOOKED_AT).astype(int)
+    steps = [float(np.median(np.linalg.norm(points[starts + lag] - points[starts], axis=1))) for lag in lags]
+    count = int(lags[np.argmin(steps)])
+    every = points[: len(points) // count * count : count]
+    if count == 1 or len(every) < _MIN_LINES * _MIN_SIDE:
+        return []
+    for width, slack in _find_lengths(every):
+        for begins in _find_lines(every, width, 0)[:_SEEDS] if slack == 0 else []:
+            views = _solve_mixed(points, count * begins, count, width)
+            if views:
+                return _grow_mixed(points, views, width)
+    return []
+
+
+def _solve_mixed(points: np.ndarray, begins: np.ndarray, count: int, width: int) -> list[_View]:
+    """Solve for the cameras of ``count`` views, in one of which lines begin at rows; none if these are no lines."""
+    before = begins[1:, None] + np.arange(count) - count * np.arange(3)[:, None, None]  # by one pixel, and by another
+    steps = np.linalg.norm(np.diff(points[before], axis=0), axis=-1)
+    begun = np.median(steps[1], 0) > np.median(steps[0], 0)  # views whose line began a pixel earlier
+    first = int((begins[0] + np.arange(count) - count * begun).min())
+    number = np.arange(width * (len(begins) - 1))
+    y, x = np.divmod(number, width)
+    seeds = [_solve(points, _View(first + view + count * number, x, y, np.empty(0))) for view in range(count)]
+    views = [seed for seed in seeds if seed is not None]
+    return views if first >= 0 and len(views) == count else []
+
+
+def _grow_mixed(points: np.ndarray, views: list[_View], width: int) -> list[_View]:
+    """Grow views side by side over the rows before and after them."""
+    count = len(views)
+    while True:
+        rows = np.concatenate([view.rows for view in views])
+        keys = np.concatenate([(view.y * width + view.x) * count + i for i, view in enumerate(views)])
+        order = np.argsort(rows)
+        rows, keys = rows[order], keys[order]
+        reach = max(_MIN_AHEAD * width * count, int(_AHEAD * (keys[-1] - keys[0])))
+        cameras = [view.camera for view in views]
+        after = _walk_mixed(points[rows[-1] + 1 :], cameras, int(keys[-1]), width, reach)
+        turned = [matmul(_backwards(width), camera) for camera in cameras[::-1]]
+        before = _walk_mixed(points[: rows[0]][::-1], turned, -1 - int(keys[0]), width, reach)
+        if not len(after[0]) + len(before[0]):
+            return views
+        rows = np.concatenate([rows[0] - 1 - before[0][::-1], rows, rows[-1] + 1 + after[0]])
+        keys = np.concatenate([-1 - before[1][::-1], keys, after[1]])
+        grown = []
+        for view in range(count):
+            own = keys % count == view
+            y, x = np.divmod(keys[own] // count, width)
+            grown.append(_solve(points, _View(rows[own], x, y, np.empty(0))))
+        if any(view is None for view in grown):
+            return views
+        views = grown
+
+
+def _walk_mixed(
+    points: np.ndarray, cameras: list[np.ndarray], last: int, width: int, reach: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place rows that follow one after the other, each in the view in which the next pixel is the nearest.
+
+    Pixels are counted line by line and with the views side by side; ``last`` is that of the row before, and ``reach``
+    how far on rows are placed. Returns rows ``[p]`` and their pixels.
+    """
+    points, count = points[: reach + 1], len(cameras)
+    keys = np.empty((len(points), count), np.int64)
+    for view, camera in enumerate(cameras):
+        x, y = (np.rint(values).astype(np.int64) for values in _project(points, camera))
+        keys[:, view] = np.where((x >= 0) & (x < width), (y * width + x) * count + view, np.iinfo(np.int64).min)
+    far, current, lost, end = last + reach, last, 0, 0
+    placed = []
+    for row, choices in enumerate(keys.tolist()):
+        key = min((key for key in choices if current < key <= far), default=None)
+        if key is not None and key - current <= _RUN * count:
+            lost, end = 0, len(placed) + 1
+        else:
+            lost += 1
+            if lost > width * count:
+                break
+        if key is not None:
+            placed.append((row, key))
+            current = key
+    rows, keys = np.array(placed[:end], np.int64).reshape(-1, 2).T
+    return rows, keys
 
 
 def _make_layout(rows: np.ndarray, views: list[_View]) -> Layout:

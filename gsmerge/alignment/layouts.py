@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -146,11 +147,12 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
 
 
 def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -> Layout:
-    """Return the layout of rows in view-major order by their pixels ``[n]``; some rows, and some pixels, have none."""
-    used = np.flatnonzero(pixel_ids >= 0)
-    parts = np.split(used, np.searchsorted(pixel_ids[used] // (width * height), np.arange(1, views)))
-    pixels = tuple(pixel_ids[rows] % (width * height) for rows in parts)
-    order, chosen = "view-major", tuple(range(views))
+    """Return the layout of rows by their pixels ``[n]``, -1 for none; some pixels may have no row."""
+    area = width * height
+    parts = [np.flatnonzero(pixel_ids // area == view) for view in range(views)]
+    mixed = any(len(a) and len(b) and a[-1] > b[0] for a, b in pairwise(parts))
+    pixels, order = tuple(pixel_ids[rows] % area for rows in parts), "view-fastest" if mixed else "view-major"
+    chosen = tuple(range(views))
     return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, chosen, tuple(parts), pixels)
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.layouts import (
+    MAY_BE_UNALIGNED,
     Layout,
     depth_layouts,
     every_nth,
@@ -130,10 +131,12 @@ def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
     """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
     cameras = inputs.cameras
     lacks = len(inputs.gaussians) < len(cameras) * cameras.width * cameras.height
-    grid = inputs.dropped() if lacks and inputs.order in ("auto", "view-major") else None
+    grid = inputs.dropped() if lacks and inputs.order not in MAY_BE_UNALIGNED else None
     if grid is None:
         return []
     layout, own = grid
+    if inputs.order not in ("auto", layout.order):
+        return []
     if sum(map(len, layout.rows)) == len(layout.views) * layout.width * layout.height:
         return []  # which no more than a border lacks
     margins = cameras.width - layout.width, cameras.height - layout.height
