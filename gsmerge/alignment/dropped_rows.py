@@ -17,6 +17,7 @@ from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences
 from gsmerge.kernels.matrices import matmul
+from gsmerge.types import Cameras
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
@@ -64,6 +65,30 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
             if calibration is not None:
                 return layout, calibration
     return None
+
+
+def follow_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras) -> Layout | None:
+    """Find the pixels of rows ``means [n,3]`` that lack some, in their ``cameras``; None if rows do not follow them.
+
+    ``valid [n]`` bool. Rows come view after view, or pixel after pixel with the views side by side.
+    """
+    rows, count, width, height = np.flatnonzero(valid), len(cameras), cameras.width, cameras.height
+    points = means[rows].astype(np.float64)
+    projections = list(matmul(cameras.Ks, cameras.viewmats[:, :3]))
+    ids, place = np.full(len(means), -1), 0
+    for view, camera in enumerate(projections):
+        placed, x, y = _walk(points[place:], camera, (-1, 0), width, height - 1)
+        ids[rows[place + placed]] = (view * height + y) * width + x
+        place += int(placed[-1]) + 1 if len(placed) else 0
+    few = points[: _MIN_LINES * width * count]
+    if (ids >= 0).sum() < _MIN_PLACED * len(rows) and count > 1:
+        reach = width * height * count
+        if len(_walk_mixed(few, projections, -1, width, reach)[0]) >= _MIN_PLACED * len(few):
+            ids[:] = -1
+            placed, keys = _walk_mixed(points, projections, -1, width, reach)
+            ids[rows[placed]] = keys % count * (height * width) + keys // count
+    placed_all = (ids >= 0).sum() >= _MIN_PLACED * len(rows) > 0
+    return dropped_layout(ids, count, width, height) if placed_all else None
 
 
 def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
@@ -386,12 +411,12 @@ def _grow_mixed(points: np.ndarray, views: list[_View], width: int) -> list[_Vie
             return views
         rows = np.concatenate([rows[0] - 1 - before[0][::-1], rows, rows[-1] + 1 + after[0]])
         keys = np.concatenate([-1 - before[1][::-1], keys, after[1]])
-        grown = []
+        grown: list[_View] = []
         for view in range(count):
             own = keys % count == view
             y, x = np.divmod(keys[own] // count, width)
-            grown.append(_solve(points, _View(rows[own], x, y, np.empty(0))))
-        if any(view is None for view in grown):
+            grown += filter(None, [_solve(points, _View(rows[own], x, y, np.empty(0)))])
+        if len(grown) < count:
             return views
         views = grown
 
@@ -410,7 +435,7 @@ def _walk_mixed(
         x, y = (np.rint(values).astype(np.int64) for values in _project(points, camera))
         keys[:, view] = np.where((x >= 0) & (x < width), (y * width + x) * count + view, np.iinfo(np.int64).min)
     far, current, lost, end = last + reach, last, 0, 0
-    placed = []
+    placed: list[tuple[int, int]] = []
     for row, choices in enumerate(keys.tolist()):
         key = min((key for key in choices if current < key <= far), default=None)
         if key is not None and key - current <= _RUN * count:

@@ -69,7 +69,9 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
     layouts = possible_layouts(inputs)
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
-    if not exact_frames:
+    num_pixels = len(inputs.cameras) * inputs.cameras.width * inputs.cameras.height
+    if not exact_frames and len(inputs.gaussians) < num_pixels and inputs.order not in MAY_BE_UNALIGNED:
+        yield _follow_rows(inputs)
         layouts = dropped_layouts(inputs)
         for effort in (0, 1, 2):
             yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
@@ -127,11 +129,22 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
     return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
 
 
+def _follow_rows(inputs: AlignmentInput) -> list[Reading]:
+    """Read rows that lack pixels in the frames that need no solving."""
+    from gsmerge.alignment.dropped_rows import follow_rows  # of the few files that lack rows
+
+    means, readings = inputs.gaussians.means, []
+    for frame in candidate_similarities(None, inputs.cameras, scale=inputs.scale, effort=0):
+        layout = follow_rows(means, inputs.valid, frame.move(inputs.cameras))
+        if layout is not None and inputs.order in ("auto", layout.order):
+            readings.append(score_layout(inputs, layout, frame))
+    return readings
+
+
 def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
     """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
     cameras = inputs.cameras
-    lacks = len(inputs.gaussians) < len(cameras) * cameras.width * cameras.height
-    grid = inputs.dropped() if lacks and inputs.order not in MAY_BE_UNALIGNED else None
+    grid = inputs.dropped()
     if grid is None:
         return []
     layout, own = grid
