@@ -346,15 +346,15 @@ def _walk(
     x += np.repeat(np.rint(places), lengths).astype(np.int64)
     y = np.rint(np.add.reduceat(v, starts) / lengths).astype(np.int64)
     firsts, lasts = x[starts], x[starts + lengths - 1]
-    after, lost, end = last[1] * width + last[0], 0, 0
+    after, line, lost, end = last[1] * width + last[0], last[1], 0, 0
     follows = np.zeros(len(starts), bool)
     inside = (firsts >= 0) & (lasts < width) & (y <= last[1] + reach)
-    pieces = zip((y * width + firsts).tolist(), (y * width + lasts).tolist(), lengths.tolist(), strict=True)
-    for i, (first, end_id, length) in enumerate(pieces):
-        if inside[i] and first > after:
-            follows[i], after = True, end_id
-        if follows[i] and length >= _RUN:
-            lost, end = 0, i + 1
+    pieces = zip(y.tolist(), firsts.tolist(), lasts.tolist(), lengths.tolist(), strict=True)
+    for i, (height, first_x, last_x, length) in enumerate(pieces):
+        if inside[i] and height * width + first_x > after:
+            follows[i], after = True, height * width + last_x
+        if follows[i] and (length >= _RUN or height == line):  # short pieces on other lines may be chance
+            line, lost, end = height, 0, i + 1
         else:
             lost += length
             if lost > width:
