@@ -109,7 +109,7 @@ _EXPORTERS = (
                 "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
                 " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
                 'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
-                ' where its photos show the cameras; of `"npz"` alone the depth maps',
+                ' without the farthest tenth; of `"npz"` alone the depth maps',
             ),
             Model(
                 "DA3-Streaming", "ByteDance-Seed/Depth-Anything-3 2c21ea8, `da3_streaming/`",
