@@ -7,7 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.alignment.layouts import (
+    MAY_BE_UNALIGNED,
+    Layout,
+    depth_layouts,
+    every_nth,
+    exact_layouts,
+    move_layout,
+    plain_layout,
+    subsample,
+)
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     QUICK_SAMPLES,
@@ -33,6 +42,7 @@ _SIMPLER_PX = 0.02  # ... and this many pixels
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 # pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
 _SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
+_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
 _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
 
 
@@ -59,10 +69,12 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
     layouts = possible_layouts(inputs)
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
-    if not exact_frames:
-        from gsmerge.alignment.incomplete import read_incomplete  # of the few files that lack rows
-
-        yield from ([reading] for reading in read_incomplete(inputs))
+    num_pixels = len(inputs.cameras) * inputs.cameras.width * inputs.cameras.height
+    if not exact_frames and len(inputs.gaussians) < num_pixels and inputs.order not in MAY_BE_UNALIGNED:
+        yield _follow_rows(inputs)
+        layouts = dropped_layouts(inputs)
+        for effort in (0, 1, 2):
+            yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
 
 
 def _read_plain(inputs: AlignmentInput) -> list[Reading]:
@@ -115,6 +127,43 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
         if depths is not None and depths.shape == (len(cameras), cameras.height, cameras.width):
             layouts += depth_layouts(count, depths)
     return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
+
+
+def _follow_rows(inputs: AlignmentInput) -> list[Reading]:
+    """Read rows that lack pixels in the frames that need no solving."""
+    from gsmerge.alignment.dropped_rows import follow_rows  # of the few files that lack rows
+
+    means, readings = inputs.gaussians.means, []
+    for frame in candidate_similarities(None, inputs.cameras, scale=inputs.scale, effort=0):
+        layout = follow_rows(means, inputs.valid, frame.move(inputs.cameras))
+        if layout is not None and inputs.order in ("auto", layout.order):
+            readings.append(score_layout(inputs, layout, frame))
+    return readings
+
+
+def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
+    """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
+    cameras = inputs.cameras
+    grid = inputs.dropped()
+    if grid is None:
+        return []
+    layout, own = grid
+    if inputs.order not in ("auto", layout.order):
+        return []
+    if sum(map(len, layout.rows)) == len(layout.views) * layout.width * layout.height:
+        return []  # which no more than a border lacks
+    margins = cameras.width - layout.width, cameras.height - layout.height
+    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
+    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
+        return []
+    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
+    layout = replace(layout, views=chosen)
+    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
+    lefts, tops = (
+        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
+        for margin, shift in zip(margins, shifts.tolist(), strict=True)
+    )
+    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
 
 
 def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:
