@@ -73,6 +73,7 @@ def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured
     assert "mvsplat" in [exporter.name for exporter in loaded.exporters]
 
 
+@pytest.mark.slow
 def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -> None:
     """The model saw the middle square of photos of 400 x 320, at 256 x 256."""
     tiny = with_texture(smooth_scene(256, 256))
