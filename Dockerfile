@@ -1,6 +1,8 @@
 # gsmerge on a CPU, with the rights of whoever runs it, so that it writes beside the scene:
 # docker build -t gsmerge . && docker run --rm -u "$(id -u):$(id -g)" -v "$PWD:/data" gsmerge compact scene.ply
-FROM python:3.11-slim-bookworm
+# The base by its digest, for images that can be made again: --build-arg BASE=python@sha256:...
+ARG BASE=python:3.11-slim-bookworm
+FROM $BASE
 
 WORKDIR /opt/gsmerge
 COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./

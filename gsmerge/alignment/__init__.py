@@ -1,7 +1,7 @@
 """Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private.
 
 ``search`` yields grids of each size and convention of the poses, ``readings`` reads the rows of one grid: from
-``layouts``, or, with pixels missing, from ``ordered_rows`` and ``incomplete``. ``score`` measures readings, ``judge``
+``layouts``, or, with pixels missing, from ``dropped_rows``. ``score`` measures readings, ``judge``
 chooses one, and ``explain`` says why none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows
 without pixels, ``upright`` those of rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras.
 What few files need loads at its first use.
@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.alignment.judge import Recovery
-from gsmerge.alignment.layouts import ESTIMATED, MAY_BE_UNALIGNED, TRIMS, WITH_PHOTOS, Layout
+from gsmerge.alignment.layouts import ESTIMATED, MAY_BE_UNALIGNED, TRIMS, Layout, da3_borders
 from gsmerge.alignment.rotations import choose_rotations, read_rotations, w_seems_last
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align
@@ -23,7 +23,7 @@ from gsmerge.alignment.search import AlignmentResult, align
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions
     from gsmerge.alignment.dropped_depths import fill_from_depths, guess_depths
-    from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows, estimate_with_photos
+    from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
     from gsmerge.alignment.focal import estimate_focal
     from gsmerge.alignment.unaligned import check_cameras, choose_poses, find_padding
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _LATER = {
     "cameras": ("move_cameras", "other_conventions"),
     "dropped_depths": ("fill_from_depths", "guess_depths"),
-    "estimate": ("estimate_cameras", "estimate_from_rows", "estimate_with_photos"),
+    "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),
     "focal": ("estimate_focal",),
     "unaligned": ("check_cameras", "choose_poses", "find_padding"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resiz
 from gsmerge.types import Cameras
 
 MAY_BE_UNALIGNED: tuple[str, ...] = ("unordered", "none")  # orders of files whose rows need not belong to pixels
-ESTIMATED, WITH_PHOTOS = "estimated from the grid", "estimated from rows and photos"  # sources of estimated cameras
+ESTIMATED = "estimated from the grid"  # source of cameras
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every side
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
@@ -113,6 +113,11 @@ def da3_trim(side: int) -> int:
     return int(8 / 256 * side)
 
 
+def da3_borders(side: int) -> list[int]:
+    """List the pixels that Depth Anything 3 may have cut off at both ends of what is left of a side."""
+    return [border for border in range(side) if da3_trim(side + 2 * border) == border]
+
+
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
     """List the possible orders of a file's views: the order of the cameras, and the order of the names."""
     views = range(len(names))
@@ -141,6 +146,22 @@ def exact_layouts(count: int, views: int, width: int, height: int) -> Iterator[L
                 continue
             chosen = next((ids for ids in every_nth(views) if len(ids) == num_used), tuple(range(num_used)))
             yield from _orders(count, box, per_pixel, chosen, width, height)
+
+
+def dropped_layout(pixel_ids: np.ndarray, views: int, width: int, height: int) -> Layout:
+    """Return the layout of rows by their pixels ``[n]``, -1 for none; some pixels may have no row."""
+    area = width * height
+    parts = [np.flatnonzero(pixel_ids // area == view) for view in range(views)]
+    mixed = any(len(a) and len(b) and a[-1] > b[0] for a, b in pairwise(parts))
+    pixels, order = tuple(pixel_ids[rows] % area for rows in parts), "view-fastest" if mixed else "view-major"
+    chosen = tuple(range(views))
+    return Layout(f"some pixels dropped, {order}", "pruned", order, width, height, chosen, tuple(parts), pixels)
+
+
+def move_layout(layout: Layout, width: int, height: int, left: int, top: int) -> Layout:
+    """Move a layout into a grid of another size, so that its first pixel comes to (left, top)."""
+    places = (np.divmod(pixels, layout.width) for pixels in layout.pixels)
+    return replace(layout, width=width, height=height, pixels=tuple((y + top) * width + x + left for y, x in places))
 
 
 def full_layouts(views: int, per_pixel: int, width: int, height: int) -> Iterator[Layout]:

@@ -7,7 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.alignment.layouts import Layout, depth_layouts, exact_layouts, plain_layout, subsample
+from gsmerge.alignment.layouts import (
+    MAY_BE_UNALIGNED,
+    Layout,
+    depth_layouts,
+    every_nth,
+    exact_layouts,
+    move_layout,
+    plain_layout,
+    subsample,
+)
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     QUICK_SAMPLES,
@@ -15,6 +24,7 @@ from gsmerge.alignment.score import (
     SHUFFLED_MARGIN,
     SMALLEST_PX,
     AlignmentInput,
+    Correspondences,
     Reading,
     beats_shuffled,
     candidate_similarities,
@@ -25,15 +35,19 @@ from gsmerge.alignment.score import (
     score_layout,
     score_shuffled,
 )
-from gsmerge.geometry import IDENTITY, median
+from gsmerge.geometry import IDENTITY
+from gsmerge.types import Cameras
 
 ENOUGH, FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
 _SIMPLER = 1.15  # a simpler frame wins unless it is worse than this factor ...
 _SIMPLER_PX = 0.02  # ... and this many pixels
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 # pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
 _SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
+_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
 _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
+_LIKELY_VIEWS = 16  # cameras that a part may be of, by a few of its Gaussians
 
 
 def read_grid(inputs: AlignmentInput, *, exact_frames: bool = False) -> list[Reading]:
@@ -59,10 +73,13 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
     layouts = possible_layouts(inputs)
     for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
         yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
-    if not exact_frames:
-        from gsmerge.alignment.incomplete import read_incomplete  # of the few files that lack rows
-
-        yield from ([reading] for reading in read_incomplete(inputs))
+    num_pixels = len(inputs.cameras) * inputs.cameras.width * inputs.cameras.height
+    lacks_pixels = _PER_VIEW * len(inputs.cameras) <= finite and len(inputs.gaussians) < num_pixels
+    if not exact_frames and lacks_pixels and inputs.order not in MAY_BE_UNALIGNED:
+        yield _follow_rows(inputs)
+        layouts = dropped_layouts(inputs)
+        for effort in (0, 1, 2):
+            yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
 
 
 def _read_plain(inputs: AlignmentInput) -> list[Reading]:
@@ -117,6 +134,43 @@ def possible_layouts(inputs: AlignmentInput) -> list[Layout]:
     return [layout for layout in layouts if inputs.order in ("auto", layout.order)]
 
 
+def _follow_rows(inputs: AlignmentInput) -> list[Reading]:
+    """Read rows that lack pixels in the frames that need no solving."""
+    from gsmerge.alignment.dropped_rows import follow_rows  # of the few files that lack rows
+
+    means, readings = inputs.gaussians.means, []
+    for frame in candidate_similarities(None, inputs.cameras, scale=inputs.scale, effort=0):
+        layout = follow_rows(means, inputs.valid, frame.move(inputs.cameras))
+        if layout is not None and inputs.order in ("auto", layout.order):
+            readings.append(score_layout(inputs, layout, frame))
+    return readings
+
+
+def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
+    """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
+    cameras = inputs.cameras
+    grid = inputs.dropped()
+    if grid is None:
+        return []
+    layout, own = grid
+    if inputs.order not in ("auto", layout.order):
+        return []
+    if sum(map(len, layout.rows)) == len(layout.views) * layout.width * layout.height:
+        return []  # which no more than a border lacks
+    margins = cameras.width - layout.width, cameras.height - layout.height
+    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
+    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
+        return []
+    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
+    layout = replace(layout, views=chosen)
+    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
+    lefts, tops = (
+        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
+        for margin, shift in zip(margins, shifts.tolist(), strict=True)
+    )
+    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
+
+
 def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:
     """Score a layout in its best frame for each likely order of the views; any order with effort 2."""
     layouts = {labelled.views: labelled for labelled in layout.with_views_in(inputs.labellings)}
@@ -140,14 +194,24 @@ def best_frame(inputs: AlignmentInput, layout: Layout, samples: int, effort: int
 
 
 def _nearest_views(inputs: AlignmentInput, layout: Layout) -> tuple[int, ...] | None:
-    """Find for each part the camera into whose pixels it projects best; None where two choose the same."""
-    pairs = inputs.pairs(subsample(layout, 300))
-    chosen = []
+    """Find for each part the camera into whose pixels it projects best; None where two choose the same.
+
+    A few Gaussians choose some cameras, more Gaussians the best of these.
+    """
+    pairs, cameras = inputs.pairs(subsample(layout, 300)), inputs.cameras
+    every, nearest = np.arange(len(cameras)), []
     for part in range(len(layout.views)):
         part_pairs = pairs.select(pairs.parts == part)
-        if not len(part_pairs.rows):
+        if not (count := len(part_pairs.rows)):
             return None
-        views = (np.full(len(part_pairs.rows), view) for view in range(len(inputs.cameras)))
-        errors = [median(pixel_errors(replace(part_pairs, views=view_ids), inputs.cameras)) for view_ids in views]
-        chosen.append(int(np.argmin(errors)))
-    return tuple(chosen) if len(set(chosen)) * layout.per_pixel == len(chosen) else None
+        few = part_pairs.select(np.arange(0, count, -(-count // ENOUGH)))
+        views = every[np.argsort(_errors_in(few, every, cameras), kind="stable")[:_LIKELY_VIEWS]]
+        nearest.append(int(views[np.argmin(_errors_in(part_pairs, views, cameras))]))
+    return tuple(nearest) if len(set(nearest)) * layout.per_pixel == len(nearest) else None
+
+
+def _errors_in(pairs: Correspondences, views: np.ndarray, cameras: Cameras) -> np.ndarray:
+    """Measure the median distance ``[v]`` of the Gaussians of one part from their pixels in each of ``views [v]``."""
+    times, ids = (len(views), 1), np.repeat(views, len(pairs.rows))
+    tiled = replace(pairs, points=np.tile(pairs.points, times), pixels=np.tile(pairs.pixels, times), views=ids)
+    return np.asarray(np.median(pixel_errors(tiled, cameras).reshape(len(views), -1), axis=1))

@@ -129,25 +129,32 @@ def focal_uncertainty(
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
     """Measure the median distance of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera, pixels.
 
-    A projective camera is any 3 x 4 matrix. It is solved by the direct linear transform with reweighting (Hartley and
-    Zisserman 2004, section 7.1). 0 if there are too few points to decide.
+    0 if there are too few points to decide.
     """
-    if len(points) < MIN_POINTS:
-        return 0.0
+    return 0.0 if len(points) < MIN_POINTS else projective_camera(points, pixels)[1]
+
+
+def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
+    """Solve for the projective camera ``[3,4]`` that shows points ``[n,3]`` nearest to their ``pixels [n,2]``.
+
+    Any matrix is one. It is solved by the direct linear transform with reweighting (Hartley and Zisserman 2004, section
+    7.1). Also returns the median distance from the pixels.
+    """
     middle = np.median(points, 0)
     unit = float(np.median(np.abs(points - middle))) or 1.0
     near = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
     near /= np.linalg.norm(near, axis=1, keepdims=True)
     values, axes = eigh(matmul(near.T, near))
     used = values > _FLAT * values[-1]  # of points in a plane or in a line, other axes say nothing
-    near = matmul(near, axes[:, used] / np.sqrt(values[used]))
+    basis = axes[:, used] / np.sqrt(values[used])
+    near = matmul(near, basis)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     wanted = (pixels - centre) / size
     zero = np.zeros_like(near)
     across = np.concatenate([near, zero, -wanted[:, :1] * near], 1)
     down = np.concatenate([zero, near, -wanted[:, 1:] * near], 1)
     weights = np.ones(len(points))
-    error = np.full(len(points), np.inf)
+    camera, error = np.zeros((3, near.shape[1])), np.full(len(points), np.inf)
     for _ in range(_PROJECTIVE_ROUNDS):
         heavy = np.concatenate([across * weights[:, None], down * weights[:, None]])
         camera = eigh(matmul(heavy.T, heavy))[1][:, 0].reshape(3, -1)
@@ -156,4 +163,8 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
             error = np.linalg.norm(places[:, :2] / places[:, 2:] - wanted, axis=1)
             error = np.where(np.isfinite(error), error, np.inf)
             weights = np.sqrt(robust_weights(error, 2, _SMALLEST_ERROR, np.abs(places[:, 2]) + _SMALLEST_ERROR))
-    return size * float(np.median(error))
+    camera = matmul(camera, basis.T)
+    camera[:2] = size * camera[:2] + centre[:, None] * camera[2]
+    camera[:, :3] /= unit
+    camera[:, 3] -= matmul(camera[:, :3], middle)
+    return camera, size * float(np.median(error))

@@ -29,6 +29,7 @@ MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
 _ROUNDS = 4  # of reweighted least squares
 _MAX_POINTS = 2000  # that a camera's pose is solved from
+_SAME_TURN = 0.01  # of rotation matrices that differ by errors alone
 _SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
 _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
 
@@ -124,8 +125,11 @@ def candidate_similarities(
         angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
         if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
             return  # no exporter does so: the cameras are inexact, and a rotation hides it
-        text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted"
-        yield replace(frame, description=text, kind="other")
+        turned = (matmul(UPRIGHT, viewmat[:3, :3]) for viewmat in cameras.viewmats)
+        upright = any(np.abs(rotation - free).max() < _SAME_TURN for rotation in turned)
+        name = "rotated upright" if upright else f"rotated by {angle:.1f} degrees"
+        text = f"{name}, positions scaled by {frame.scale:.4g} and shifted"
+        yield replace(frame, description=text, kind="upright" if upright else "other")
 
 
 def solve_frame(
@@ -219,6 +223,8 @@ class AlignmentInput:
     depths: Callable[[], np.ndarray | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
     scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
+    # finds the grid of rows that lack pixels, and cameras for it; None where there is none
+    dropped: Callable[[], tuple[Layout, Cameras] | None] = lambda: None
 
     def pairs(self, layout: Layout) -> Correspondences:
         """Return the valid rows of a layout with their pixels and views."""

@@ -16,10 +16,10 @@ from gsmerge.alignment.judge import Fit, Recovery, accept_reading, choose_fit
 from gsmerge.alignment.layouts import (
     ESTIMATED,
     MAY_BE_UNALIGNED,
-    WITH_PHOTOS,
     GridFit,
     Layout,
     check_photo_size,
+    dropped_layout,
     other_grids,
     photo_grid,
     square_grids,
@@ -86,6 +86,14 @@ class _Source:
         """Photos at their own size, ``[c,h,w,3]`` float32."""
         return as_floats(self.photos)
 
+    @cached_property
+    def dropped(self) -> tuple[Layout, Cameras] | None:
+        """Grid of the rows, if they lack pixels, and cameras for it; None where they are no such grid."""
+        from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
+
+        grid = find_dropped_grid(self.ply.gaussians.means, self.ply.valid)
+        return None if grid is None else (grid[0], grid[1].cameras)
+
     def could_show(self, grid: GridFit) -> bool:
         """Return whether any cameras could show the rows as the pixels of a grid; remembered for each size."""
         if grid.size not in self.seen:
@@ -105,6 +113,7 @@ class _Source:
             images=images,
             labellings=view_orders(self.camera_file.names),
             depths=self.depths,
+            dropped=lambda: self.dropped,
             order=self.order,
             scale=self.scale,
         )
@@ -160,8 +169,19 @@ def align(
         if fit is None:
             raise
     else:
-        fit = source.choose(_fit_rounds(source, grid))
+        fit = _fit_estimated(source, grid) or source.choose(_fit_rounds(source, grid))
     return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
+
+
+def _fit_estimated(source: _Source, grid: GridFit) -> Fit | None:
+    """Fit the pixels that rows have shown cameras by; None where cameras were not estimated so."""
+    pixel_ids = source.camera_file.pixel_ids
+    if pixel_ids is None:
+        return None
+    inputs = source.inputs(grid)
+    layout = dropped_layout(pixel_ids, len(grid.cameras), *grid.size)
+    recovery = accept_reading(inputs, [score_layout(inputs, layout, IDENTITY)])
+    return None if recovery is None else Fit(grid, recovery)
 
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
@@ -311,8 +331,8 @@ def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
     notes, usual = [*grid.notes], source.camera_file
     if grid.camera_file.convention != usual.convention:
         notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
-    if usual.source in (ESTIMATED, WITH_PHOTOS):
-        from_what = "own grid" if usual.source == ESTIMATED else "order and the photos' colours"
+    if usual.source == ESTIMATED:
+        from_what = "own grid" if usual.pixel_ids is None else "own order"
         separate = len(set(map(bytes, usual.Ks))) > 1
         what = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
         notes.append(f"no cameras were given: {what} are estimated from the Gaussians' {from_what}")

@@ -17,6 +17,7 @@ from gsmerge.types import Cameras, Gaussians
 
 _SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
 _SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
+_FEW_SAMPLES, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
 _MIN_SEEN = 0.5  # share of them that some camera sees
 _MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
 _MAX_FRONT_RATIO = 0.5  # the same of the foremost ones alone, in a frame that colours chose
@@ -65,29 +66,33 @@ def check_cameras(
     *,
     foremost: bool = False,
 ) -> CameraCheck:
-    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``.
+    """Measure the share of sampled Gaussians that views see, and how well colours fit ``images [c,h,w,3]``, if any.
 
-    Images may be None. With ``foremost`` only Gaussians that no other hides count for the colours.
+    With ``foremost`` only Gaussians that no other hides count for the colours.
     """
+    samples = min(samples, max(_FEW_SAMPLES, _MAX_PROJECTED // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
     visible, errors, shuffled_errors = np.zeros(len(rows), bool), [], []
     rng = np.random.default_rng(0)
-    for view in range(len(cameras)):
+    at_once = 1 + _SEEN_SAMPLES // max(1, len(rows))
+    for first in range(0, len(cameras), at_once):
+        some = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
-            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
+            xy, depth = project_points(points[None], some.viewmats, some.Ks)
             xy = np.floor(xy)
-        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
-        visible |= inside
-        if foremost:
-            inside[inside] = _are_foremost(xy[inside], depth[inside], cameras.width * cameras.height)
-        if inside.any():
-            x, y = xy[inside].astype(np.int64).T
-            photo = photo_colors(images, np.full(len(x), view), y, x)
-            errors.append(np.abs(colors[inside] - photo).mean(1))
-            shuffled_errors.append(np.abs(colors[inside] - rng.permutation(photo)).mean(1))
+        inside = (depth > 0) & (xy >= 0).all(2) & (xy < (cameras.width, cameras.height)).all(2)
+        visible |= inside.any(0)
+        for view in np.flatnonzero(inside.any(1)) if len(images) else ():
+            seen = inside[view]
+            if foremost:
+                seen[seen] = _are_foremost(xy[view, seen], depth[view, seen], cameras.width * cameras.height)
+            x, y = xy[view, seen].astype(np.int64).T
+            photo = photo_colors(images, np.full(len(x), first + view), y, x)
+            errors.append(np.abs(colors[seen] - photo).mean(1))
+            shuffled_errors.append(np.abs(colors[seen] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan
     if errors and (other := float(np.concatenate(shuffled_errors).mean())) > _SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other

@@ -41,15 +41,17 @@ class ReadBudget:
     Args:
         path: The file.
         file_bytes: Its bytes, with those of files that are read together with it.
+        memory_per_byte: Bytes of memory for each of them.
     """
 
     path: StrPath
     file_bytes: int
+    memory_per_byte: int = _MEMORY_PER_BYTE
 
     @property
     def memory(self) -> int:
         """Bytes of memory that the file allows."""
-        return _FREE_MEMORY + _MEMORY_PER_BYTE * self.file_bytes
+        return _FREE_MEMORY + self.memory_per_byte * self.file_bytes
 
     def check_memory(self, num_bytes: float, what: str) -> None:
         """Raise SceneError if ``what`` takes ``num_bytes`` at once, and the file allows less."""

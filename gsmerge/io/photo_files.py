@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_budget, read_errors
+from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.memory import free_pages, make_array
@@ -34,12 +34,15 @@ ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a 
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
 _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
-_DECODING_BYTES = 9  # more of a pixel while a photo is decoded: a copy, and the coefficients of a progressive JPEG
+_MEMORY_PER_BYTE = 100  # of a photo or mask that is decoded by itself
+_COPIES = 2, 3  # of all pixels: OpenCV's, and at most those of Pillow and of what becomes of its image
+_PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # of a pixel, 4 in other modes
+_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
+_EMBEDDED_BYTES = 9  # more of a pixel while embedded photos are decoded
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # the last two with numbers of 64 bits
 _TAG_BYTES = np.array([0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 0, 0, 8, 8, 8, 0])  # of a number of each type
 _TILE_TAGS = (322, 323)  # width and length, pixels
 _BITS_TAG, _SAMPLES_TAG = 258, 277
-_MIN_SAMPLE_BYTES = 4  # of a pixel of a tile: OpenCV decodes to RGBA
 _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
@@ -177,7 +180,7 @@ def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
     The memory limit is that of its bytes and of its ``photo`` together, since masks compress to almost nothing.
     """
 
-    budget = ReadBudget(path, check_file(path) + (0 if photo is None else check_file(photo)))
+    budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
         _check_channels(budget, image)
@@ -206,22 +209,42 @@ def decode_alpha(path: Path) -> np.ndarray | None:
     def alpha(image: Image.Image) -> Image.Image | None:
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
-        _check_channels(read_budget(path), image)
+        _check_channels(_photo_budget(path), image)
         return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
     return None if values is None or values.min() > _HALF_OPAQUE else values > _HALF_OPAQUE
 
 
+def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
+    """Return the budget of a photo or a mask that is decoded by itself, with the bytes of files ``beside`` it."""
+    return ReadBudget(path, sum(map(check_file, (path, *beside))), _MEMORY_PER_BYTE)
+
+
 def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
-    """Raise SceneError if an image, and one channel of it, take more memory than its file allows."""
-    num_bytes = (len(image.getbands()) + 1) * image.width * image.height
+    """Raise SceneError if Pillow takes more memory for an image, and one channel of it, than its file allows."""
+    pixel = _PILLOW_BYTES.get(image.mode, 4)
+    more = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
+    num_bytes = max(_COPIES[1] * pixel, pixel + more) * image.width * image.height
     budget.check_memory(num_bytes, f"{image.width} x {image.height} pixels")
+
+
+def _decoder_bytes(image: Image.Image) -> float:
+    """Return the bytes for each pixel, as measured, that a decoder takes beside the image that it writes.
+
+    They are the frames of a WebP, a strip of a TIFF and its RGBA, or the coefficients of a progressive JPEG.
+    """
+    if image.format == "WEBP":
+        return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
+    if (tags := getattr(image, "tag_v2", None)) is not None:
+        return 1 + max(_CHANNELS, _sample_bytes(tags))
+    shares = [across * down for _, across, down, _ in getattr(image, "layer", ())]
+    return _COEFFICIENT_BYTES * sum(shares) / max(shares, default=1)
 
 
 def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
     """Decode an image and return the result of ``choose``; SceneError if it cannot be decoded."""
-    size = _stored_size(path)  # refuses what is no image, or too large
+    size, _ = _read_header(path)  # refuses what is no image, or too large
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -240,7 +263,7 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
 
 def _undecodable(path: Path, size: Size) -> SceneError:
     """Make the error of an image that a library did not decode; MemoryError if there was no memory for it."""
-    np.empty((_CHANNELS + _DECODING_BYTES, *size), np.uint8)  # libraries do not tell
+    np.empty((_CHANNELS + _EMBEDDED_BYTES, *size), np.uint8)  # libraries do not tell
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
@@ -250,18 +273,19 @@ def image_size(path: Path) -> Size:
     SceneError if it is another file, cannot be read, has an impossible size, or its pixels take more memory than the
     file allows.
     """
-    width, height = _stored_size(path)
-    read_budget(path).check_memory(_CHANNELS * width * height, f"{width} x {height} pixels")
+    (width, height), pixel_bytes = _read_header(path)
+    _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
     return width, height
 
 
-def _stored_size(path: Path) -> Size:
+def _read_header(path: Path) -> tuple[Size, float]:
+    """Read the size of an image, and the bytes of memory for each pixel while it is decoded."""
     num_bytes = check_file(path)
     with read_errors(path), path.open("rb") as file:
-        width, height = _header_size(path, file)
+        (width, height), pixel_bytes = _parse_header(path, file)
     if num_bytes > _MAX_PIXEL_BYTES * width * height + _MAX_EXTRA:
         raise SceneError(path, f"expected an image of {width} x {height}, found {num_bytes >> 20} MiB for it")
-    return width, height
+    return (width, height), pixel_bytes
 
 
 def quarter_turns(path: Path) -> int:
@@ -275,8 +299,8 @@ def quarter_turns(path: Path) -> int:
             return 0
 
 
-def _header_size(path: Path, file: BinaryIO) -> Size:
-    start = file.read(24)
+def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
+    start, pixel_bytes = file.read(24), 0.0
     file.seek(0)
     try:
         if start[:8] == _PNG:  # Pillow refuses a PNG for damage outside its pixels as well
@@ -287,6 +311,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 image = Image.open(file, formats=_FORMATS)
+            pixel_bytes = _decoder_bytes(image)
             tags = getattr(image, "tag_v2", None)
             width, height = image.size if tags is None else (tags[_WIDTH_TAG], tags[_HEIGHT_TAG])
             if tags is not None:
@@ -299,7 +324,7 @@ def _header_size(path: Path, file: BinaryIO) -> Size:
     except Exception as error:  # whatever a damaged header makes the library raise
         raise SceneError(path, "expected an image, found a file that cannot be decoded", "replace it") from error
     check_pixels(path, width, height)
-    return width, height
+    return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + pixel_bytes)
 
 
 def _check_tags(path: Path, file: BinaryIO) -> None:
@@ -327,9 +352,13 @@ def _check_tags(path: Path, file: BinaryIO) -> None:
 def _check_tile(budget: ReadBudget, tags: Mapping[int, Any]) -> None:
     """Raise SceneError if a tile of a TIFF, for which decoders make room, takes more memory than the file allows."""
     width, length = (tags.get(tag, 0) for tag in _TILE_TAGS)
-    sample_bytes = tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8
-    num_bytes = max(_MIN_SAMPLE_BYTES, sample_bytes) * width * length
+    num_bytes = max(_CHANNELS + 1, _sample_bytes(tags)) * width * length
     budget.check_memory(num_bytes, f"a tile of {width} x {length} pixels")
+
+
+def _sample_bytes(tags: Mapping[int, Any]) -> float:
+    """Return the bytes of a TIFF's pixel."""
+    return float(tags.get(_SAMPLES_TAG, 1) * max(tags.get(_BITS_TAG, (1,))) / 8)
 
 
 def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np.ndarray]) -> np.ndarray | PhotoReader:
@@ -339,13 +368,13 @@ def decode_embedded(budget: ReadBudget, names: Sequence[str], files: Sequence[np
     in size, or they take more memory or time than the file's budget.
     """
     path = Path(budget.path)
-    sizes = [_header_size(path, io.BytesIO(data.tobytes())) for data in files]
+    sizes = [_parse_header(path, io.BytesIO(data.tobytes()))[0] for data in files]
     width, height = sizes[0]
     odd = next((name for name, size in zip(names, sizes, strict=True) if size != sizes[0]), None)
     if odd is not None:
         raise SceneError(path, f"{odd}: expected images of one size, found another than {width} x {height}")
     at_once = len(files) if _CHANNELS * len(files) * width * height <= _AT_ONCE else 1
-    num_bytes = (_CHANNELS * at_once + _DECODING_BYTES) * width * height
+    num_bytes = (_CHANNELS * at_once + _EMBEDDED_BYTES) * width * height
     budget.check_memory(num_bytes, f"{at_once} photos of {width} x {height}")
     _check_scans(budget, files, sizes[0])
     if at_once < len(files):

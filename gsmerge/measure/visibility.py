@@ -94,6 +94,7 @@ def front_rows(gaussians: Gaussians, cameras: Cameras) -> list[np.ndarray]:
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
     """Yield for each view a mask ``[n]`` of the points ``[n,3]`` inside its picture."""
-    for view in range(len(cameras)):
-        (pixels,), (depths,) = project(points, cameras[[view]])
-        yield (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(1)
+    at_once = 1 + _CHUNK // max(1, len(points))
+    for first in range(0, len(cameras), at_once):
+        pixels, depths = project(points, cameras[first : first + at_once])
+        yield from (depths > 0) & ((pixels >= 0) & (pixels < (cameras.width, cameras.height))).all(2)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -24,7 +24,6 @@ from gsmerge.io.photo_files import (
     PhotoTransform,
     Size,
     decode_image,
-    decode_images,
     image_size,
     resize_and_crop,
     resize_to,
@@ -59,9 +58,7 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile 
     if cameras is not None:
         return cameras
     cameras = estimate_grid(ply, path, paths, folder)
-    if cameras is None:
-        return alignment.estimate_with_photos(path, *rows, names, size, partial(decode_images, paths))
-    if paths and cameras.photo_map is None:
+    if cameras is not None and paths and cameras.photo_map is None:
         grid = f"{len(cameras)} views of {cameras.widths[0]} x {cameras.heights[0]} pixels"
         problem = f"expected photos of the {grid} whose grid the Gaussians are"
         raise SceneError(folder, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
@@ -79,13 +76,19 @@ def estimate_grid(
     match = match_photos(pictures, paths)
     if match is None:
         return cameras
-    Ks = cameras.Ks.copy()
+    (x, y), Ks, pixel_ids = match.trim, cameras.Ks.copy(), cameras.pixel_ids
     Ks[:, :2, 2] += match.trim
+    if pixel_ids is not None:
+        line, column = np.divmod(pixel_ids, pictures.shape[2])
+        view, line = np.divmod(line, pictures.shape[1])
+        width, height = pictures.shape[2] + 2 * x, pictures.shape[1] + 2 * y
+        pixel_ids = np.where(pixel_ids < 0, -1, (view * height + line + y) * width + column + x)
     return replace(
         cameras,
         Ks=Ks,
-        widths=cameras.widths + 2 * match.trim,
-        heights=cameras.heights + 2 * match.trim,
+        widths=cameras.widths + 2 * x,
+        heights=cameras.heights + 2 * y,
+        pixel_ids=pixel_ids,
         names=tuple(paths[photo].relative_to(folder).as_posix() for photo in match.chosen),
         photo_map=(match.size, match.transform),
     )
@@ -98,7 +101,7 @@ class PhotoMatch:
     chosen: list[int]  # their places among the photos, of each view
     size: Size  # of the photos
     transform: PhotoTransform  # from there to the size of the views
-    trim: int  # pixels at every side of a view that the grid lacks
+    trim: tuple[int, int]  # columns and lines at both sides of a view that the grid lacks
 
 
 def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | None:
@@ -108,11 +111,14 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
         return None
     sizes = [image_size(path) for path in paths]
     size = max(sizes, key=sizes.count)
+    trims = [(trim, trim) for trim in (0, *alignment.TRIMS)]
+    trims += product(alignment.da3_borders(width), alignment.da3_borders(height))
     fits = [
         (trim, transform)
-        for trim in (0, *alignment.TRIMS)
-        for transform in _transforms(size, width + 2 * trim, height + 2 * trim)
+        for trim in dict.fromkeys(trims)
+        for transform in _transforms(size, width + 2 * trim[0], height + 2 * trim[1])
     ]
+    fits.sort(key=lambda fit: bool(fit[1].crops))  # of those that show the same, the simple one
     ratio = _SIDE / max(width, height)
     small = max(1, round(width * ratio)), max(1, round(height * ratio))
     wanted = [_grey(picture, small) for picture in pictures]
@@ -123,7 +129,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
             return np.full((len(fits), views), -1.0)
         photo = decode_image(paths[number], size)
         shown = ((trim, transform.photos([photo])[0]) for trim, transform in fits)
-        greys = [_grey(picture[trim : trim + height, trim : trim + width], small) for trim, picture in shown]
+        greys = [_grey(picture[y : y + height, x : x + width], small) for (x, y), picture in shown]
         with np.errstate(invalid="ignore", divide="ignore"):  # pictures of one colour
             return np.nan_to_num([[correlation(grey, view) for view in wanted] for grey in greys])
 
@@ -137,7 +143,7 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
         return None
     best = max(float(each.mean()) for each, _, _ in options)
     near = [option for option in options if option[2] == list(range(views)) and option[0].mean() > best - _CLEARLY]
-    _, number, chosen = max(near or options, key=lambda option: float(option[0].mean()))
+    _, number, chosen = max(near or options, key=lambda option: round(float(option[0].mean()), 3))
     trim, transform = fits[number]
     return PhotoMatch(chosen, size, transform, trim)
 

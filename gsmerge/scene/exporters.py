@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from gsmerge.alignment import MAY_BE_UNALIGNED, WITH_PHOTOS, Layout
+from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.settings.reading import QuatChoice, ReadHints
@@ -124,7 +124,7 @@ _EXPORTERS = (
                 "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
                 " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
                 'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`; `gs_ply` alone'
-                ' where its photos show the cameras; of `"npz"` alone the depth maps',
+                ' without the farthest tenth; of `"npz"` alone the depth maps',
                 "0000.ply", 'export_format="npz-gs_ply" writes its cameras beside the file',
             ),
             Model(
@@ -140,7 +140,7 @@ _EXPORTERS = (
             ),
         ),
         "logit", "view-major", ("box+depth", "box", "pruned"), _ANY, check_rotations=False,
-        cameras=("DA3 npz", "COLMAP binary", "COLMAP text", WITH_PHOTOS),
+        cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
     # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
     # the median, divided by a quantile and rotated upright: a scale and a shift that are stored nowhere.

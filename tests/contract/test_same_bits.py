@@ -38,7 +38,6 @@ OTHERS = (
 ALLOWED = {
     ("io/cameras/camera_file.py", "cv2.remap"),  # of bytes: whole numbers
     ("alignment/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly
-    ("alignment/ordered_rows.py", "np.hypot"),  # of medians by which a reading is chosen
 }
 
 

@@ -32,9 +32,9 @@ FORMATS = ("out.sog", "lod-meta.json", "out.ply", "out.spz", "out.splat", "out.g
 
 
 @pytest.fixture(scope="module")
-def made_result(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made_result(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a result with harmonics, its cameras inside and beside it. Read only."""
-    scene, folder = gsmerge.read_scene(made_scene), tmp_path_factory.mktemp("result")
+    scene, folder = gsmerge.read_scene(small_scene), tmp_path_factory.mktemp("result")
     gaussians = gsmerge.compact(scene, effort="draft", budget=400, fit="none").gaussians
     random = np.random.default_rng(0)
     gaussians = replace(gaussians, shN=random.normal(0, 0.1, (400, 15, 3)).astype(np.float32))
@@ -73,7 +73,7 @@ def read_model(folder: Path) -> tuple[CameraFile, int]:
     return gsmerge.read_cameras(folder), count
 
 
-def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, made_scene: Path, run: Run) -> None:
+def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, small_scene: Path, run: Run) -> None:
     """Its views have the names of their photos below images/, where trainers look for them."""
     model, before = tmp_path / "colmap" / "sparse" / "0", gsmerge.read_cameras(tmp_path / "in.cameras.json")
     done = run("convert", result, f"{tmp_path / 'colmap'}/", code=0)
@@ -84,18 +84,18 @@ def test_a_folder_named_colmap_is_a_model(result: Path, tmp_path: Path, made_sce
     assert {path.name for path in tmp_path.iterdir()} == {"in.ply", "in.cameras.json", "colmap"}
     assert run("convert", result, tmp_path / "colmap").code == 2
     quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--overwrite")
-    run("compact", made_scene, "-o", tmp_path / "colmap", *quick, code=0)
+    run("compact", small_scene, "-o", tmp_path / "colmap", *quick, code=0)
     cameras, count = read_model(model)
     assert (count, len(cameras)) == (200, len(before))
     assert sorted(path.name for path in model.iterdir()) == ["cameras.bin", "images.bin", "points3D.bin"]
     linked = tmp_path / "colmap" / "images"
     assert sorted(path.name for path in linked.iterdir()) == sorted(cameras.names)
-    assert all((made_scene / "images" / name).samefile(linked / name) for name in cameras.names)
+    assert all((small_scene / "images" / name).samefile(linked / name) for name in cameras.names)
 
 
-def test_photos_that_are_there_stay_as_they_are(result: Path, tmp_path: Path, made_scene: Path, run: Run) -> None:
+def test_photos_that_are_there_stay_as_they_are(result: Path, tmp_path: Path, small_scene: Path, run: Run) -> None:
     """A conversion finds photos beside the cameras; a folder for them that exists is nobody else's to change."""
-    shutil.copytree(made_scene / "images", tmp_path / "images")
+    shutil.copytree(small_scene / "images", tmp_path / "images")
     linked = tmp_path / "colmap" / "images"
     run("convert", result, tmp_path / "colmap", code=0)
     first, *others = sorted(linked.iterdir())
@@ -109,15 +109,15 @@ def test_photos_that_are_there_stay_as_they_are(result: Path, tmp_path: Path, ma
 
 
 def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
-    result: Path, tmp_path: Path, made_scene: Path, run: Run
+    result: Path, tmp_path: Path, small_scene: Path, run: Run
 ) -> None:
     (tmp_path / "in.cameras.json").unlink()
     with refuses(SceneError, "in.ply", "cameras", "--cameras"):
         convert_files(ConvertOptions([result], tmp_path / "points3D.bin"))
     for option in (("--levels", 2), ("--budget", "1MB")):
-        assert_refused(run("compact", made_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", "COLMAP")
+        assert_refused(run("compact", small_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", "COLMAP")
     model = tmp_path / "own" / "colmap" / "sparse" / "0"
-    scene = gsmerge.read_scene(made_scene)
+    scene = gsmerge.read_scene(small_scene)
     gsmerge.write_ply(tmp_path / "own" / "scene.ply", scene.gaussians)
     model.mkdir(parents=True)
     seen = [np.zeros(0, np.int64)] * len(scene)
@@ -235,7 +235,7 @@ def test_triples_are_three_numbers(text: str) -> None:
         PlacementOptions(translate=text)
 
 
-def test_the_command(made_scene: Path, tmp_path: Path, result: Path, run: Run) -> None:
+def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) -> None:
     done = run("convert", result, tmp_path / "b.spz", "--up", "y", code=0)
     assert done.out.startswith(f"{tmp_path / 'b.spz'}: 400 Gaussians")
     assert "b.cameras.json" in done.out
@@ -246,9 +246,9 @@ def test_the_command(made_scene: Path, tmp_path: Path, result: Path, run: Run) -
     assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
 
 
-def test_the_cameras_of_a_result_are_turned_with_it(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_the_cameras_of_a_result_are_turned_with_it(small_scene: Path, tmp_path: Path, run: Run) -> None:
     quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q")
-    run("compact", made_scene, "-o", tmp_path / "a.ply", *quick, code=0)
+    run("compact", small_scene, "-o", tmp_path / "a.ply", *quick, code=0)
     run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--up", "y", "--scale", "2", "-q", code=0)
     a, b = (
         gsmerge.render(read(tmp_path / f"{name}.ply"), moved(tmp_path / f"{name}.cameras.json")).images for name in "ab"
@@ -261,10 +261,10 @@ def moved(path: Path) -> Cameras:
     return gsmerge.to_cameras(gsmerge.read_cameras(path))
 
 
-def test_all_columns_of_a_ply(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_all_columns_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Unity's importer wants 62."""
     quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--set", "columns=full")
-    run("compact", made_scene, "-o", tmp_path / "a.ply", *quick, code=0)
+    run("compact", small_scene, "-o", tmp_path / "a.ply", *quick, code=0)
     run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--sh-degree", 0, "--set", "columns=full", code=0)
     for name in ("a.ply", "b.ply"):
         header = (tmp_path / name).read_bytes().split(b"end_header")[0]

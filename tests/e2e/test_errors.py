@@ -51,20 +51,20 @@ class Broken:
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
 )
 def test_failures_inside_the_work(
-    error: BaseException, code: int, line: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    error: BaseException, code: int, line: str, small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(error))
-    before = listing(scene_copy)
-    outcome = run("compact", scene_copy, "--quiet")
+    before = listing(small_copy)
+    outcome = run("compact", small_copy, "--quiet")
     assert (outcome.code, outcome.err, outcome.out) == (code, f"{ERROR}{line}\n", "")
-    assert listing(scene_copy) == before
+    assert listing(small_copy) == before
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write anywhere")
-def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
-    locked = scene_copy / "locked"
+def test_a_folder_without_permission(small_copy: Path, run: Run) -> None:
+    locked = small_copy / "locked"
     locked.mkdir(mode=0o500)
-    assert_refused(run("compact", scene_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "Permission denied")
+    assert_refused(run("compact", small_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "Permission denied")
     assert list(locked.iterdir()) == []
 
 
@@ -78,65 +78,65 @@ def test_a_folder_without_permission(scene_copy: Path, run: Run) -> None:
     ],
 )
 def test_a_lack_of_memory_is_no_damage(
-    file: str, reader: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    file: str, reader: str, small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = scene_copy / file
+    path = small_copy / file
     if path.suffix == ".npz":
         np.savez(path, extrinsics=np.eye(4)[None], intrinsics=np.eye(3)[None])
-        words: tuple[object, ...] = ("inspect", scene_copy / "scene.ply", "--cameras", path)
+        words: tuple[object, ...] = ("inspect", small_copy / "scene.ply", "--cameras", path)
     else:
-        write_gaussians(path, gsmerge.read_ply(scene_copy / "scene.ply").gaussians, overwrite=True)
+        write_gaussians(path, gsmerge.read_ply(small_copy / "scene.ply").gaussians, overwrite=True)
         words = ("inspect", path)
     monkeypatch.setattr(reader, Broken(MemoryError("Unable to allocate 9 GiB")))
     assert_refused(run(*words), 3, "", OUT_OF_MEMORY)
 
 
-def test_a_scene_of_points_without_size_leaves_no_file(scene_copy: Path, run: Run) -> None:
-    gaussians = gsmerge.read_ply(scene_copy / "scene.ply").gaussians
+def test_a_scene_of_points_without_size_leaves_no_file(small_copy: Path, run: Run) -> None:
+    gaussians = gsmerge.read_ply(small_copy / "scene.ply").gaussians
     points = replace(gaussians, scales=np.full_like(gaussians.scales, 1e-30))
-    gsmerge.write_ply(scene_copy / "scene.ply", points, overwrite=True)
-    before = listing(scene_copy)
-    outcome = run("compact", scene_copy, "--fit", "none")
-    assert_refused(outcome, 3, scene_copy / "scene.ply", "none")
-    assert listing(scene_copy) == before
+    gsmerge.write_ply(small_copy / "scene.ply", points, overwrite=True)
+    before = listing(small_copy)
+    outcome = run("compact", small_copy, "--fit", "none")
+    assert_refused(outcome, 3, small_copy / "scene.ply", "none")
+    assert listing(small_copy) == before
 
 
-def test_debug_shows_the_traceback(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_debug_shows_the_traceback(small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.compaction.files.compact", Broken(KeyError("lost")))
-    outcome = run("compact", scene_copy, "--quiet", "--debug", code=1)
+    outcome = run("compact", small_copy, "--quiet", "--debug", code=1)
     assert outcome.err.startswith("Traceback (")
-    assert "Traceback" not in run("compact", scene_copy, "--quiet").err  # and is forgotten by the next call
+    assert "Traceback" not in run("compact", small_copy, "--quiet").err  # and is forgotten by the next call
 
 
 @pytest.mark.parametrize("kind", ["compact", "extend", "compact a state"])
 def test_failures_while_writing_leave_nothing(
-    kind: str, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    kind: str, small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def half(path: Path, *_: object, **__: object) -> None:
         Path(path).write_bytes(b"ply\n")
         raise OSError(28, "No space left on device")
 
-    quick, state = ("--set", "superpixels=40"), scene_copy / "kept.gsm"
+    quick, state = ("--set", "superpixels=40"), small_copy / "kept.gsm"
     words, name = {
-        "compact": (("compact", scene_copy, *quick, "--fit", "none"), "scene.compact.ply"),
-        "extend": (("extend", scene_copy / "new.gsm", scene_copy, *quick), "new.gsm"),
+        "compact": (("compact", small_copy, *quick, "--fit", "none"), "scene.compact.ply"),
+        "extend": (("extend", small_copy / "new.gsm", small_copy, *quick), "new.gsm"),
         "compact a state": (("compact", state, "--fit", "none"), "kept.compact.ply"),
     }[kind]
-    assert run("extend", state, scene_copy, *quick).code == 0
+    assert run("extend", state, small_copy, *quick).code == 0
     for place in ("gsmerge.compaction.files", "gsmerge.states.files"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
     monkeypatch.setattr("gsmerge.states.files.save_state", half)
-    before = listing(scene_copy)
+    before = listing(small_copy)
     outcome = run(*words, "--quiet", code=3)
     assert outcome.err.count("\n") == 1
     assert name in outcome.err
     assert "No space" in outcome.err
-    assert listing(scene_copy) == before
+    assert listing(small_copy) == before
 
 
 @pytest.mark.parametrize("more", [("--levels", 2), ()])
 def test_several_outputs_are_all_there_or_none(
-    more: tuple[object, ...], scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    more: tuple[object, ...], small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that is full at the second level, or at the end."""
     from gsmerge.io import write_gaussians
@@ -153,11 +153,11 @@ def test_several_outputs_are_all_there_or_none(
 
     monkeypatch.setattr("gsmerge.compaction.files.write_gaussians", full)
     monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", no_room)
-    before = listing(scene_copy)
+    before = listing(small_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")
-    outcome = run("compact", scene_copy, "-o", scene_copy / "out.ply", *quick, *more, "--quiet")
+    outcome = run("compact", small_copy, "-o", small_copy / "out.ply", *quick, *more, "--quiet")
     assert (outcome.code, outcome.err.count("\n")) == (3, 1), outcome.err
-    assert listing(scene_copy) == before
+    assert listing(small_copy) == before
 
 
 @pytest.mark.usefixtures("foreground")
@@ -166,24 +166,24 @@ def test_several_outputs_are_all_there_or_none(
     ("name", "code"),
     [("SIGTERM", 143), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("SIGHUP", 129), ("SIGINT", 130)))],
 )
-def test_a_signal_ends_it_in_order(name: str, code: int, scene_copy: Path, root: Path) -> None:
+def test_a_signal_ends_it_in_order(name: str, code: int, small_copy: Path, root: Path) -> None:
     """Whenever it comes: no file is left, and one line says why."""
-    before = listing(scene_copy)
-    command = [sys.executable, "-m", "gsmerge", "compact", str(scene_copy), "-o", str(scene_copy / "out.ply"), "-q"]
+    before = listing(small_copy)
+    command = [sys.executable, "-m", "gsmerge", "compact", str(small_copy), "-o", str(small_copy / "out.ply"), "-q"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=root) as process:
-        while process.poll() is None and listing(scene_copy) == before:
+        while process.poll() is None and listing(small_copy) == before:
             time.sleep(0.002)
         process.send_signal(signal.Signals[name])
         _, err = process.communicate()
     assert process.returncode == code
     assert err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
-    assert listing(scene_copy) == before
+    assert listing(small_copy) == before
 
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 def test_a_signal_in_a_callback_is_not_lost(
-    name: str, code: int, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    name: str, code: int, small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Kernels are compiled and loaded with calls back into Python, which cannot hand an exception on."""
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.Signals[name]))
@@ -195,16 +195,16 @@ def test_a_signal_in_a_callback_is_not_lost(
             time.sleep(0.001)
 
     monkeypatch.setattr("gsmerge.compaction.files.compact", busy)
-    outcome = run("compact", scene_copy, code=code)
+    outcome = run("compact", small_copy, code=code)
     assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
-    assert not (scene_copy / "scene.compact.ply").exists()
+    assert not (small_copy / "scene.compact.ply").exists()
 
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGINT", 130)])
 @pytest.mark.parametrize("error", [SystemError("returned a result with an exception set"), SceneError("a.ply", "odd")])
 def test_a_signal_that_a_library_makes_an_error_of(
-    name: str, code: int, error: Exception, scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    name: str, code: int, error: Exception, small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def compact(*_: object, **__: object) -> None:
         try:
@@ -213,13 +213,13 @@ def test_a_signal_that_a_library_makes_an_error_of(
             raise error from interrupt
 
     monkeypatch.setattr("gsmerge.compaction.files.compact", compact)
-    outcome = run("compact", scene_copy, code=code)
+    outcome = run("compact", small_copy, code=code)
     assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
 
 
 @pytest.mark.usefixtures("foreground")
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals as POSIX has them")
-def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ignored_signal_stays_ignored(small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
     seen = []
     monkeypatch.setattr(
@@ -227,10 +227,10 @@ def test_an_ignored_signal_stays_ignored(scene_copy: Path, run: Run, monkeypatch
     )
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        run("compact", scene_copy, "--quiet")
+        run("compact", small_copy, "--quiet")
     finally:
         signal.signal(signal.SIGHUP, before)
-    run("compact", scene_copy, "--quiet")
+    run("compact", small_copy, "--quiet")
     assert seen[0] == signal.SIG_IGN
     assert callable(seen[1])
     assert signal.getsignal(signal.SIGHUP) == before
@@ -263,9 +263,9 @@ OFTEN = ("output is full", "output ends early", "little memory")  # the others a
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=[pytest.mark.slow] * (case not in OFTEN)) for case in ODD_PLACES]
 )
-def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Path) -> None:
+def test_odd_places_to_write_to_and_run_in(case: str, small_copy: Path, root: Path) -> None:
     command, code, line = ODD_PLACES[case]
-    done = in_shell(command, scene_copy, root)
+    done = in_shell(command, small_copy, root)
     assert done.returncode == code, done.stderr
     assert line in done.stderr
     if line:
@@ -274,21 +274,21 @@ def test_odd_places_to_write_to_and_run_in(case: str, scene_copy: Path, root: Pa
 
 
 def test_a_working_directory_that_vanishes_meanwhile(
-    made_scene: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_scene: Path, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     monkeypatch.setattr("gsmerge.cli.render_command.say_notes", lambda *_, **__: shutil.rmtree(tmp_path / "gone"))
-    outcome = run("render", made_scene, "-o", "a.png", code=3)
+    outcome = run("render", small_scene, "-o", "a.png", code=3)
     monkeypatch.chdir(tmp_path)
     assert says(outcome.err.splitlines()[-1], f"{ERROR}.", "working directory"), outcome.err
 
 
 @pytest.mark.slow
-def test_names_that_the_terminal_cannot_show(scene_copy: Path, root: Path) -> None:
+def test_names_that_the_terminal_cannot_show(small_copy: Path, root: Path) -> None:
     done = in_shell(
         f"$G compact . -o '\N{SNOWMAN}.ply' {QUICK}; $G inspect '\N{SNOWMAN}.ply'",
-        scene_copy,
+        small_copy,
         root,
         PYTHONIOENCODING="ascii",
     )

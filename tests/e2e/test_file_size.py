@@ -19,9 +19,9 @@ def file_bytes(folder: Path) -> int:
 
 
 @sweep("name", FORMATS, often=3)
-def test_compact_meets_it(name: str, made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_compact_meets_it(name: str, small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "out"
-    done = run("compact", made_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--json", code=0)
+    done = run("compact", small_scene, "-o", out / name, "--budget", "40KB", *QUICK, "--json", code=0)
     size = 40_000
     assert 0.97 * size <= file_bytes(out) <= size
     document = json.loads(done.out)
@@ -29,7 +29,7 @@ def test_compact_meets_it(name: str, made_scene: Path, tmp_path: Path, run: Run)
     assert sum(level["bytes"] for level in levels) == file_bytes(out)
 
 
-def test_harmonics_count(tmp_path: Path, made_scene: Path, run: Run) -> None:
+def test_harmonics_count(tmp_path: Path, small_scene: Path, run: Run) -> None:
     """They take two thirds of a .sog, or nothing: what is built first is far off."""
     from dataclasses import replace
 
@@ -37,13 +37,13 @@ def test_harmonics_count(tmp_path: Path, made_scene: Path, run: Run) -> None:
 
     import gsmerge
 
-    gaussians = gsmerge.read_ply(made_scene / "scene.ply").gaussians
+    gaussians = gsmerge.read_ply(small_scene / "scene.ply").gaussians
     for strength in (0.0, 0.2):
         shN = np.random.default_rng(0).normal(0, strength, (len(gaussians), 15, 3)).astype(np.float32)
         folder = tmp_path / f"{strength}"
         folder.mkdir()
         gsmerge.write_ply(folder / "scene.ply", replace(gaussians, shN=shN))
-        (folder / "transforms.json").write_bytes((made_scene / "transforms.json").read_bytes())
+        (folder / "transforms.json").write_bytes((small_scene / "transforms.json").read_bytes())
         run("compact", folder, "-o", folder / "out" / "a.spz", "--budget", "40KB", *QUICK, code=0)
         assert 0.97 * 40_000 <= file_bytes(folder / "out") <= 40_000
 
@@ -60,7 +60,7 @@ def test_states_and_batch_meet_it(name: str, size: int, made_scene: Path, tmp_pa
     assert 0.97 * size <= written.stat().st_size <= size
 
 
-def test_a_size_that_nothing_fits_into_is_refused(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    done = run("compact", made_scene, "-o", tmp_path / "a.sog", "--budget", "5B", *QUICK)
+def test_a_size_that_nothing_fits_into_is_refused(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    done = run("compact", small_scene, "-o", tmp_path / "a.sog", "--budget", "5B", *QUICK)
     assert done.code == 2
     assert "13 bytes" in done.err

@@ -40,11 +40,11 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memor
 
 
 def often() -> set[str]:
-    """Every third case of a kind that has many, and all others: the default run; the rest is in the sweep."""
+    """Every fifth case of a kind that has many, and all others: the default run; the rest is in the sweep."""
     kinds: dict[str, list[str]] = {}
     for name in CASES:
         kinds.setdefault(name.partition(": ")[0], []).append(name)
-    return {name for cases in kinds.values() for name in cases[:: 3 if len(cases) > FEW else 1]} - {*SLOW}
+    return {name for cases in kinds.values() for name in cases[:: 5 if len(cases) > FEW else 1]} - {*SLOW}
 
 
 def limits(num_bytes: int) -> Limits:

@@ -76,11 +76,11 @@ class Quiet(SimpleHTTPRequestHandler):
 
 
 @pytest.fixture(scope="module")
-def site(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from gsmerge.cli import main
 
     folder = tmp_path_factory.mktemp("made") / "site"
-    assert main(["compact", str(made_scene), "-o", str(folder), "--effort", "draft", "-q"]) == 0
+    assert main(["compact", str(small_scene), "-o", str(folder), "--effort", "draft", "-q"]) == 0
     return folder
 
 
@@ -118,7 +118,7 @@ def picture(tab: Browser) -> np.ndarray:
 
 @needs_browser()
 def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
-    tab: Browser, served: str, site: Path, made_scene: Path
+    tab: Browser, served: str, site: Path, small_scene: Path
 ) -> None:
     tab.open(served)
     wait(tab)
@@ -128,7 +128,7 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     tab.run(f"stage.style.flex = 'none'; stage.style.minHeight = 0; stage.style.width = '{width}px'")
     tab.run(f"stage.style.height = '{height}px'; const usual = frame; frame = () => ({{...usual(), exact: true}}); 0")
     tab.run("site.frame = frame; site.look(data.start); 0")
-    scene = gsmerge.read_scene(made_scene)
+    scene = gsmerge.read_scene(small_scene)
     middle = tab.run("data.views[data.start].viewmat")
     view = int(np.abs(scene.cameras.viewmats.reshape(-1, 16) - middle).sum(1).argmin())
     gaussians = gsmerge.read_gaussians(site / "scene.sog").gaussians

@@ -23,11 +23,11 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.01)
 
 
-def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_levels_are_a_chain(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "chain.ply"
     said = run(
         "compact",
-        made_scene,
+        small_scene,
         "-o",
         out,
         "--levels",
@@ -50,9 +50,9 @@ def test_levels_are_a_chain(made_scene: Path, tmp_path: Path, run: Run) -> None:
     assert psnrs == sorted(psnrs, reverse=True)
 
 
-def test_no_level_replaces_a_file(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_no_level_replaces_a_file(small_scene: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "chain.level2.ply").write_text("mine")
-    said = run("compact", made_scene, "-o", tmp_path / "chain.ply", "--levels", 3, code=2)
+    said = run("compact", small_scene, "-o", tmp_path / "chain.ply", "--levels", 3, code=2)
     assert "chain.level2.ply: exists" in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chain.level2.ply"]
 
@@ -74,10 +74,10 @@ def test_a_psnr_is_met_with_few(scene: Scene) -> None:
     assert actual.report.choices["search"]["met"]
 
 
-def test_a_target_out_of_reach_ends_with_4(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
     said = run(
-        "compact", made_scene, "-o", out, "--quality", "90dB", "--set", "fit_steps=8", "--budget", "20KB", code=4
+        "compact", small_scene, "-o", out, "--quality", "90dB", "--set", "fit_steps=8", "--budget", "20KB", code=4
     )
     assert "quality: 90 dB " in said.err
     assert len(read_ply(out).gaussians) > 0
@@ -93,8 +93,8 @@ def test_a_loss_spends_less_where_more_may_be_lost(scene: Scene) -> None:
     assert all(0 < point["psnr"] < 60 and 0 < point["ssim"] <= 1 for point in curve)
 
 
-def test_auto_without_a_fit_reports_its_curve(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    said = run("compact", made_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit", "none", code=0)
+def test_auto_without_a_fit_reports_its_curve(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    said = run("compact", small_scene, "-o", tmp_path / "a.ply", "--budget", "auto", "--fit", "none", code=0)
     lines = said.out.splitlines()
     assert "PSNR" in lines[2]
     assert len(lines) == 7

@@ -26,10 +26,10 @@ CLOSE = 0.3  # dB between a result fitted to photos and one fitted to colours th
 
 
 @pytest.fixture(scope="module")
-def bare(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bare(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene without its photos. Read only."""
     folder = tmp_path_factory.mktemp("bare") / "scene"
-    shutil.copytree(made_scene, folder, ignore=shutil.ignore_patterns("targets", "images"))
+    shutil.copytree(small_scene, folder, ignore=shutil.ignore_patterns("targets", "images"))
     return folder
 
 
@@ -54,14 +54,14 @@ def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: 
 
 @pytest.mark.parametrize("effort", ["draft", "fast"])
 def test_as_good_as_with_photos(
-    effort: str, bare: Path, made_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
+    effort: str, bare: Path, small_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
 ) -> None:
     """Judged by photos that neither has seen."""
     actual = []
-    for folder in (made_scene, bare):
+    for folder in (small_scene, bare):
         out = tmp_path / f"{len(actual)}.ply"
         gsmerge.write_ply(out, gsmerge.compact(folder, effort=effort, threads=1).gaussians)
-        actual.append(target_psnr(made_scene / "targets", out))
+        actual.append(target_psnr(small_scene / "targets", out))
     assert actual[1] > actual[0] - CLOSE
 
 
@@ -89,10 +89,10 @@ def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
 
 
 def test_a_batch_says_it_of_every_scene(
-    bare: Path, made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    bare: Path, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
-    for name, folder in (("bare", bare), ("photos", made_scene)):
+    for name, folder in (("bare", bare), ("photos", small_scene)):
         ignore = shutil.ignore_patterns("targets")
         shutil.copytree(folder, tmp_path / "scenes" / name, ignore=ignore)
     run("batch", tmp_path / "scenes", "--output", tmp_path / "out", *QUICK, "-q", code=0)

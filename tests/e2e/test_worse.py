@@ -78,10 +78,10 @@ def test_several_cameras_change_no_k(small_scene: Path) -> None:
     assert gsmerge.compact(gsmerge.read_scene(small_scene), fit="none", threads=1).report.options["k"] == 1
 
 
-def test_a_worse_result_is_named(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_a_worse_result_is_named(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
-    said = run("compact", made_scene, "-o", out, *FEW, code=0)
-    document = json.loads(run("compact", made_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
+    said = run("compact", small_scene, "-o", out, *FEW, code=0)
+    document = json.loads(run("compact", small_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
     psnr = document["psnr_input_views"]
     assert psnr["after"] < psnr["before"] - 0.5
     assert names(document["worse"], f"{psnr['after']:.2f} dB", f"{psnr['before']:.2f} dB")
@@ -89,29 +89,29 @@ def test_a_worse_result_is_named(made_scene: Path, tmp_path: Path, run: Run) -> 
     (line,) = [line for line in said.err.splitlines() if SAID in line]
     assert f": {document['worse']}; " in line
     for option in ("--quiet", "--json"):
-        assert run("compact", made_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
+        assert run("compact", small_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
 
 
-def test_strict_ends_with_code_4_and_writes_the_result(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_strict_ends_with_code_4_and_writes_the_result(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
-    said = run("compact", made_scene, "-o", out, *FEW, "--strict", code=4)
+    said = run("compact", small_scene, "-o", out, *FEW, "--strict", code=4)
     assert said.err.count(SAID) == 1
     assert len(gsmerge.read_ply(out).gaussians) == 30
     better = ("--set", "fit_steps=60", "--threads", 1)
-    assert "warning" not in run("compact", made_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
+    assert "warning" not in run("compact", small_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
 
 
-def test_levels_are_compared_as_well(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run) -> None:
     usual = ("--set", "fit_steps=60", "--threads", 1, "--budget", 120, "--levels", 3, "--json")
-    said = run("compact", made_scene, "-o", tmp_path / "x.ply", *usual, code=0)
+    said = run("compact", small_scene, "-o", tmp_path / "x.ply", *usual, code=0)
     document = json.loads(said.out)
     assert not any(SAID in note for note in document["notes"])
     assert document["worse"].startswith("level ")
     assert any(document["worse"] in level["notes"] for level in document["levels"])
 
 
-def test_what_is_left_out_on_purpose_is_no_loss(made_scene: Path) -> None:
-    scene = gsmerge.read_scene(made_scene)
+def test_what_is_left_out_on_purpose_is_no_loss(small_scene: Path) -> None:
+    scene = gsmerge.read_scene(small_scene)
     x, y, z = scene.gaussians.means[len(scene.gaussians) // 2]
     report = gsmerge.compact(scene, crop=f"sphere:{x},{y},{z},.3", fit_steps=20, threads=1).report
     assert report.psnr_after < report.psnr_before
@@ -120,12 +120,12 @@ def test_what_is_left_out_on_purpose_is_no_loss(made_scene: Path) -> None:
 
 @pytest.mark.parametrize(("colors", "red"), [({"FORCE_COLOR": "1"}, True), ({"NO_COLOR": "1"}, False)], ids=str)
 def test_the_warning_is_red(
-    made_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, colors: dict[str, str], red: bool
+    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, colors: dict[str, str], red: bool
 ) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     for name, value in colors.items():
         monkeypatch.setenv(name, value)
-    said = run("compact", made_scene, "-o", tmp_path / "few.ply", *FEW, code=0)
+    said = run("compact", small_scene, "-o", tmp_path / "few.ply", *FEW, code=0)
     before, _, after = said.err.partition("gsmerge: warning: ")
     assert (before.endswith("\033[31m"), "\033[0m" in after) == (red, red)
 
@@ -147,18 +147,18 @@ def test_a_batch_names_worse_results(
     assert SAID in again.err
 
 
-def test_pages_and_documents_of_comparisons_name_worse_results(made_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_pages_and_documents_of_comparisons_name_worse_results(small_scene: Path, tmp_path: Path, run: Run) -> None:
     small = tmp_path / "few.ply"
-    run("compact", made_scene, "-o", small, *FEW, "-q", code=0)
+    run("compact", small_scene, "-o", small, *FEW, "-q", code=0)
     pages = [tmp_path / name for name in ("report.html", "report.json", "report.md")]
     said = run(
-        "evaluate", made_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
+        "evaluate", small_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
     )
     assert "note: few.ply " in said.err
     (note,) = [note for note in json.loads(pages[1].read_text())["notes"] if SAID in note]
     for page in (pages[0], pages[2]):
         assert note.split("'")[1].removeprefix("s ") in page.read_text()
     page = tmp_path / "view.html"
-    said = run("view", made_scene, small, "-o", page, "--no-open", code=0)
+    said = run("view", small_scene, small, "-o", page, "--no-open", code=0)
     assert "note: few.ply " in said.err
     assert "photos worse than" in page.read_text()

@@ -65,11 +65,11 @@ def sparse(path: Path, size: int, start: bytes = b"") -> None:
 
 
 def add_bomb(path: Path, name: str, method: int, start: bytes = b"") -> None:
-    """Add a member to an archive that unpacks to 268 MB, of which the directory promises 512 bytes."""
+    """Add a member to an archive that unpacks to 168 MB, of which the directory promises 512 bytes."""
     with zipfile.ZipFile(path, "a", method) as archive:
         with archive.open(name, "w") as file:
             file.write(start)
-            for _ in range(16):
+            for _ in range(10):
                 file.write(bytes(1 << 24))
         archive.getinfo(name).file_size = 512
 

@@ -22,7 +22,7 @@ PLATFORMS = (  # the first has one target alone, which takes the least time
 )  # fmt: skip
 
 
-@sweep("tag", PLATFORMS)
+@sweep("tag", PLATFORMS, often=0)
 def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
     where = find_platform(tag)
     paths = build(tmp_path, platform=tag)

@@ -66,6 +66,7 @@ def test_methods_rank_as_published() -> None:
     assert scores[0] > scores[1] + 2
 
 
+@pytest.mark.slow
 def test_splits_and_merges_pay() -> None:
     image = photos()["coffee"]
     for density in (5_000, 12_000):

@@ -86,6 +86,8 @@ class CameraFile:
     focal: str | None = ""
     # how photos of a size are brought to the cameras' where the photos have shown it; None where that is to be found
     photo_map: tuple[Size, PhotoTransform] | None = None
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for none, where the rows have shown the cameras by it
+    pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.names)

@@ -11,7 +11,7 @@ import pytest
 from exports import Smooth, da3_rows, depth_map_mask, export_rows, save_export, smooth_scene, with_intrinsics
 from tiny_scene import write_images
 
-from gsmerge.alignment.estimate import _possible_grids
+from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import SH_C0
 
@@ -56,8 +56,8 @@ def test_cameras_and_pixels_from_photos(tmp_path: Path, fy: float) -> None:
     assert np.allclose(cameras.Ks[:, 1, 1], fy, rtol=0.01)
     assert np.allclose(cameras.centres, tiny.c2w[:, :3, 3], atol=0.03)
     assert loaded.cameras is not None
-    assert loaded.cameras.source == "estimated from rows and photos"
-    assert any("from the Gaussians' order and the photos' colours" in note for note in loaded.notes)
+    assert loaded.cameras.source == "estimated from the grid"
+    assert any("from the Gaussians' own order" in note for note in loaded.notes)
     assert [exporter.name for exporter in loaded.exporters] == ["da3"]
     dropped = f"{tiny.depths.size - len(kept):,} pixels that the exporter dropped"
     assert f"{dropped} are put back at depths where the photos agree" in loaded.notes
@@ -76,17 +76,5 @@ def test_every_other_view(tmp_path: Path) -> None:
 def test_photos_of_another_place(tmp_path: Path) -> None:
     tiny = textured()
     others = np.random.default_rng(9).integers(0, 256, tiny.images.shape, np.uint8)
-    loaded = export(tmp_path, replace(tiny, images=others), da3_rows(tiny))
-    assert len(loaded.scene) == 0
-    assert any("are not used: no cameras" in note for note in loaded.notes)
-
-
-def test_the_number_of_rows_says_which_sizes_are_possible() -> None:
-    box = (364 - 2 * 11) * (504 - 2 * 15)
-    for dropped, possible in ((0.0, True), (0.05, True), (0.1, True), (0.3, False)):
-        count = round(7 * (box - dropped * 364 * 504))
-        sizes = [(g.transform.width, g.transform.height, len(g.views)) for g in _possible_grids(count, 7, (960, 704))]
-        assert ((504, 364, 7) in sizes) == possible
-    assert (504, 364, 6) in [
-        (g.transform.width, g.transform.height, len(g.views)) for g in _possible_grids(6 * box, 12, (960, 704))
-    ]
+    with pytest.raises(SceneError, match="photos of the 3 views"):
+        export(tmp_path, replace(tiny, images=others), da3_rows(tiny))

@@ -57,7 +57,7 @@ def upright(tiny: Smooth, rows: np.ndarray, first: int = 0) -> tuple[np.ndarray,
 
 def check_centres(loaded: Loaded, centres: np.ndarray, scale: float) -> None:
     assert np.allclose(loaded.scene.cameras.centres, centres, atol=0.01 * scale)
-    assert any("rotated upright" in note for note in loaded.notes)
+    assert any("rotated" in note for note in loaded.notes)
 
 
 @sweep("first", [0, 2])
@@ -73,6 +73,7 @@ def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured
     assert "mvsplat" in [exporter.name for exporter in loaded.exporters]
 
 
+@pytest.mark.slow
 def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -> None:
     """The model saw the middle square of photos of 400 x 320, at 256 x 256."""
     tiny = with_texture(smooth_scene(256, 256))
@@ -100,12 +101,14 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
         load_scene(folder)
 
 
-def test_no_frame_is_chosen_in_which_photos_are_far_from_the_rows(tmp_path: Path, textured: Smooth) -> None:
-    """The same rows scaled and shifted again do not show themselves, and fit nowhere."""
+def test_rows_scaled_and_shifted_again_show_their_pixels(tmp_path: Path, textured: Smooth) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
     moved = turned(rows, np.eye(3), scale=1.3, shift=np.array([0.3, -0.2, 0.4]))
-    with refuses(SceneError, "scene.ply", "cameras"):
-        load_scene(save_export(tmp_path, textured, moved))
+    loaded = load_scene(save_export(tmp_path, textured, moved))
+    assert loaded.alignment is not None
+    assert loaded.alignment.ok
+    assert loaded.recovery is not None
+    assert loaded.recovery.confirmed
 
 
 def test_too_few_rows_for_a_stretch(tmp_path: Path, textured: Smooth) -> None:

@@ -42,6 +42,7 @@ def along(places: np.ndarray) -> Scene:
     return scenes.make_scene(scenes.wall(), cameras, noise=0.01)
 
 
+@pytest.mark.slow
 def test_blocks_are_as_good_as_one_piece() -> None:
     places = np.linspace(0, 1, 36)
     scene, between = along(places), along((places[1:] + places[:-1]) / 2)

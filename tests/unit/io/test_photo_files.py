@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import subprocess
+import sys
 import weakref
 import zlib
 from pathlib import Path
@@ -11,11 +13,13 @@ import cv2
 import numpy as np
 import pytest
 from messages import refuses
+from PIL import Image
+from sweeps import sweep
 from tiny_scene import Tiny, write_images
 
 from gsmerge.errors import SceneError
+from gsmerge.io import bounds, read_images
 from gsmerge.io import photo_files as photos
-from gsmerge.io import read_images
 from gsmerge.io.image_names import match_images, natural_key
 from gsmerge.io.photo_files import decode_image, image_size
 from gsmerge.runtime.threads import use_threads
@@ -307,3 +311,65 @@ def test_running_out_of_memory_is_said_as_such(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(photos.Image, "open", fail)
     with pytest.raises(MemoryError):
         photos.decode_mask(path)
+
+
+KINDS = {  # what Pillow writes of one colour, with much, little and no memory beside the pixels
+    "lossless.webp": {"lossless": True},
+    "alpha.webp": {},
+    "moving.webp": {"save_all": True},
+    "whole.jpg": {"progressive": True, "subsampling": 0},
+    "half.jpg": {"progressive": True, "subsampling": 2},
+    "ink.jpg": {"progressive": True},
+    "strip.tiff": {"compression": "tiff_deflate", "tiffinfo": {278: 3000}},
+    "float.tiff": {"compression": "tiff_deflate", "tiffinfo": {278: 3000}},
+    "grey.png": {},
+    "alpha.png": {},
+}
+MODES = {"alpha": "RGBA", "ink": "CMYK", "float": "F", "grey": "L"}
+DECODE = """
+import re, sys
+from pathlib import Path
+from gsmerge.io import photo_files as photos
+def read(path):
+    counted = []
+    photos.ReadBudget.check_memory = lambda budget, num_bytes, what: counted.append(num_bytes)
+    if sys.argv[2] == "mask":
+        photos.decode_mask(path), photos.decode_alpha(path)
+    else:
+        photos.decode_image(path, photos.image_size(path))
+    return max(counted)
+peak = lambda: 1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
+path = Path(sys.argv[1])
+read(path.with_stem("small"))  # whatever is loaded once
+before = peak()
+print(read(path), peak() - before)
+"""
+
+
+@sweep("kind", sorted(KINDS), often=0)
+@pytest.mark.parametrize("what", ["photo", "mask"])
+@pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux counts it")
+def test_decoding_takes_no_more_memory_than_is_counted(kind: str, what: str, tmp_path: Path) -> None:
+    path = tmp_path / kind
+    mode = MODES.get(path.stem, "RGB")
+    if (what, mode) == ("photo", "F"):  # which OpenCV refuses
+        pytest.skip("no photo")
+    for place, side in ((path.with_stem("small"), 20), (path, 3000)):
+        frames = [Image.new(mode, (side, side), color) for color in (0, 1)[: 1 + ("save_all" in KINDS[kind])]]
+        frames[0].save(place, append_images=frames[1:], **KINDS[kind])
+    words = [sys.executable, "-c", DECODE, path, what]
+    counted, taken = map(float, subprocess.run(words, check=True, capture_output=True, text=True).stdout.split())
+    assert taken <= counted + 2 * path.stat().st_size + 4e6  # of the libraries themselves
+
+
+@pytest.mark.parametrize(("kind", "subsampling", "side"), [("webp", None, 330), ("jpg", 0, 360), ("jpg", 2, 560)])
+def test_photos_take_what_their_bytes_allow(
+    kind: str, subsampling: int | None, side: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"a.{kind}"
+    monkeypatch.setattr(bounds, "_FREE_MEMORY", 640_000)
+    Image.new("RGB", (side, side)).save(path, **({} if subsampling is None else {"subsampling": subsampling}))
+    with refuses(SceneError, path, f"{side} x {side}", f"{path.stat().st_size:,}"):
+        image_size(path)
+    path.write_bytes(path.read_bytes() + bytes(side * side // 8))  # as an ordinary photo of 24 megapixels and 3 MB
+    assert image_size(path) == (side, side)

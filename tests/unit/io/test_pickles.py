@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.io import pickles
@@ -120,7 +121,7 @@ def test_damage_ends_in_a_value_or_in_a_refusal() -> None:
     assert 1000 < next(refused) < 5000
 
 
-@pytest.mark.parametrize("unit", [b"]", b"}", b"(", b"}K\1Ns", b"\x8c\3\xe2\x82\xac"])
+@sweep("unit", [b"]", b"}K\1Ns", b"}", b"(", b"\x8c\3\xe2\x82\xac"], often=2)
 def test_structures_stay_within_the_budget(unit: bytes) -> None:
     num_bytes = 200_000
     tracemalloc.start()

@@ -119,7 +119,6 @@ def test_rows_that_are_no_grid(tmp_path: Path) -> None:
     count = len(tiny.gaussians)
     others = {
         "shuffled": rng.permutation(count),
-        "dropped": np.flatnonzero(rng.random(count) < 0.9)[: count // 2],
         "sorted": np.lexsort(tiny.gaussians.means.T),
     }
     for name, index in others.items():

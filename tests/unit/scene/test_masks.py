@@ -128,6 +128,6 @@ def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
     mask, photo = tmp_path / "mask.png", tmp_path / "photo.jpg"
     write(mask, np.full((6000, 6000), 255, np.uint8))
     photo.write_bytes(bytes(1_000_000))
-    with refuses(SceneError, mask, "6000 x 6000", "72 MB"):
+    with refuses(SceneError, mask, "6000 x 6000", "108 MB"):
         decode_mask(mask)
     assert decode_mask(mask, photo).all()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from exports import smooth_scene
 from messages import refuses
+from sweeps import sweep
 from tiny_scene import (
     FLIP,
     Tiny,
@@ -232,15 +233,16 @@ def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize(
+@sweep(
     ("text", "found"),
     [
-        ("no", "JSON"),
         ("{}", "'scale'"),
+        ("no", "JSON"),
         (json.dumps({"transform": [[1, 2], [3, 4]], "scale": 1}), [2, 2]),
         (json.dumps({"transform": np.eye(4).tolist(), "scale": -1}), "another map"),
         (json.dumps({"transform": (2 * np.eye(4)).tolist(), "scale": 1}), "another map"),
     ],
+    often=1,
 )
 def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
     trained(tmp_path)

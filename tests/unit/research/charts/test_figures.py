@@ -166,4 +166,4 @@ def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_names_are_no_formulas_in_drawings(name: str, tmp_path: Path) -> None:
     records = [replace(r, settings={**r.settings, "checkpoint": name}) for r in make_grid() if r.method != "input"]
     records += [replace(r, settings=dict(r.settings)) for r in make_grid() if r.method == "gsmerge"]
-    assert draw_figures(figures_of(records), tmp_path)
+    assert draw_figures([f for f in figures_of(records) if f.name in ("quality-ratio", "stages")], tmp_path)

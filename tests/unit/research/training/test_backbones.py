@@ -168,6 +168,7 @@ def test_a_run_is_repeated_and_resumed_to_the_bit(
         train([other], [], tmp_path / "run", RUN, backbone=guess, threads=1)
 
 
+@pytest.mark.slow
 def test_depths_that_depend_on_the_subset_train_other_networks(
     scene: Scene, data: Path, run: tuple[Guess, Path], tmp_path: Path
 ) -> None:

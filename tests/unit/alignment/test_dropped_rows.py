@@ -1,0 +1,108 @@
+"""Files that lack pixels, view after view or with the views side by side, with cameras and without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import Smooth, da3_rows, export_rows, save_export, smooth_scene
+from sweeps import sweep
+
+from gsmerge.alignment.dropped_rows import find_dropped_grid
+from gsmerge.scene.read import load_scene
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Smooth:
+    return smooth_scene(48, 36)
+
+
+def view_fastest(smooth: Smooth, dropped: float, seed: int = 0) -> np.ndarray:
+    """Grid rows by pixel, then view, without a share of them."""
+    cells = smooth.height * smooth.width
+    every = np.arange(3 * cells).reshape(3, cells).T.reshape(-1)
+    return every[np.random.default_rng(seed).random(len(every)) >= dropped]
+
+
+@pytest.mark.parametrize("dropped", [0.1, 0.4])
+def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dropped: float) -> None:
+    """All but one in a hundred: in pictures so small, two views can see a row equally near to where it should be."""
+    kept = view_fastest(smooth, dropped)
+    loaded = load_scene(save_export(tmp_path, smooth, export_rows(smooth, kept)))
+    scene = loaded.pixel_scene()
+    assert loaded.recovery.best.layout.order == "view-fastest"
+    actual = np.flatnonzero(scene.stored.reshape(-1))
+    wrong = np.setxor1d(actual, kept)
+    assert len(wrong) <= 0.02 * len(kept)  # a row in a wrong place is missing in another
+    same = np.intersect1d(actual, kept)
+    right = np.abs((scene.gaussians.opacities - smooth.gaussians.opacities)[same]) < 1e-5
+    assert float(right.mean()) > 0.985
+    assert any("view-fastest" in note for note in loaded.notes)
+
+
+@sweep("size", [(96, 72), (64, 48)])
+@pytest.mark.parametrize("dropped", [0.1, 0.3, "faint", "far"])
+@sweep("nested", [0.4, 1.0, 1.3])
+def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, size: tuple[int, int]) -> None:
+    """At random, or by a rule; in the frame of the cameras, or in another scale, which can put rows near to others."""
+    tiny = smooth_scene(*size)
+    if dropped == "far":
+        kept = da3_rows(tiny)
+    elif dropped == "faint":
+        kept = np.flatnonzero(tiny.gaussians.opacities > 0.1)
+    else:
+        kept = np.flatnonzero(np.random.default_rng(3).random(len(tiny.gaussians)) > float(dropped))
+    c2w = tiny.c2w.copy()
+    c2w[:, :3, 3] *= nested
+    loaded = load_scene(save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept)))
+    assert loaded.recovery.best.layout.kind == "pruned"
+    assert loaded.recovery.best.frame.scale == pytest.approx(1 / nested, rel=2e-3)
+    scene = loaded.pixel_scene()
+    actual = np.flatnonzero(scene.stored.reshape(-1))
+    assert len(np.setxor1d(actual, kept)) < 0.01 * len(kept)
+    same = np.intersect1d(actual, kept)
+    right = np.abs((scene.gaussians.opacities - tiny.gaussians.opacities)[same]) < 1e-5
+    assert float(right.mean()) > 0.99
+
+
+@pytest.mark.parametrize(("order", "dropped"), [("view-major", 0.1), ("view-major", "far"), ("view-fastest", "far")])
+def test_rows_alone(tmp_path: Path, order: str, dropped: float | str) -> None:
+    """Cameras and pixels without any file beside the rows; 'far': the farthest tenth and borders of each view."""
+    tiny = smooth_scene(96, 72)
+    kept = da3_rows(tiny) if dropped == "far" else np.flatnonzero(np.random.default_rng(3).random(3 * 96 * 72) > 0.1)
+    if order == "view-fastest":
+        cells = 96 * 72
+        kept = kept[np.lexsort((kept // cells, kept % cells))]
+    loaded = load_scene(save_export(tmp_path, tiny, export_rows(tiny, kept), cameras=False) / "scene.ply")
+    scene = loaded.pixel_scene()
+    assert loaded.cameras is not None
+    assert loaded.cameras.source == "estimated from the grid"
+    assert any("own order" in note for note in loaded.notes)
+    assert loaded.recovery.best.layout.order == order
+    assert scene.num_gaussians >= 0.99 * len(kept)
+    assert np.allclose(scene.cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.02)
+    assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.05)
+
+
+@pytest.mark.parametrize("index", ["shuffled", "sorted", "voxels"])
+def test_rows_in_no_order_are_no_grid(index: str) -> None:
+    tiny, rng = smooth_scene(96, 72), np.random.default_rng(0)
+    means = tiny.gaussians.means
+    order = {"shuffled": rng.permutation(len(means)), "sorted": np.lexsort(means.T)}
+    _, voxels = np.unique(np.floor(means / 0.03).astype(int), axis=0, return_index=True)
+    means = means[order.get(index, voxels)]
+    assert find_dropped_grid(means, np.ones(len(means), bool)) is None
+
+
+def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
+    """Gaussians anywhere in their pixels: of several scales that fit as well, none is taken."""
+    tiny, rng = smooth_scene(64, 48), np.random.default_rng(2)
+    means = tiny.gaussians.means + rng.normal(0, 0.02, tiny.gaussians.means.shape).astype(np.float32)
+    tiny = replace(tiny, gaussians=replace(tiny.gaussians, means=means))
+    c2w = tiny.c2w.copy()
+    c2w[:, :3, 3] *= 1.5
+    kept = np.flatnonzero(rng.random(len(means)) > 0.4)
+    folder = save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept))
+    assert not load_scene(folder, order="view-major").scene.aligned
