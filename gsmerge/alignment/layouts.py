@@ -28,6 +28,7 @@ SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or 
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_MIN_ROWS = 0.5  # of the pixels of half the photos' size, where rows may be of those that were not dropped
 _NEAR_SIZE = 0.05  # of the longer side, by which cameras' sizes may differ that are no more than assumed
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
@@ -347,8 +348,9 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     what = "photos and cameras" if size is not None else "cameras"
     ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
-        usual = (*patch_grids(base), *(resize_to(base, half) for half in _half_sizes(base)))
-        ranked += [(3, t) for t in usual if ply.count < len(camera_file) * t.width * t.height]
+        kept = ply.count / len(camera_file)
+        halves = (resize_to(base, half) for half in _half_sizes(base) if kept >= _MIN_ROWS * half[0] * half[1])
+        ranked += [(3, t) for t in (*patch_grids(base), *halves) if kept < t.width * t.height]
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
         for file in files:
