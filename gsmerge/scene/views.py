@@ -85,9 +85,15 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
 def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
     """Choose the photos that the model saw if the photos beside them do not show the scene, with a note.
 
-    WorldMirror squeezes tall photos into ``images``, and crops them in ``images_resized``.
+    WorldMirror squeezes tall photos into ``images``, and crops them in ``images_resized``. Photos that none of the
+    views of an estimated grid was found in are left out.
     """
     usual = files.images
+    unnamed = camera_file.source == ESTIMATED and camera_file.names[0] == "view 0"
+    if unnamed and usual is not None and usual.is_dir():
+        grid = f"{len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
+        note = f"the photos in {usual} are not used: they do not show the {grid} whose grid the Gaussians are"
+        return replace(files, images=None), [note]
     if usual is None or usual.name == _SEEN_PLACE or not (usual.parent / _SEEN_PLACE).is_dir():
         return files, []
     seen = usual.parent / _SEEN_PLACE
