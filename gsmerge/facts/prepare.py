@@ -16,6 +16,7 @@ import numpy as np
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
+from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_judges,
@@ -195,6 +196,8 @@ def _prepare_pixels(
 ) -> Prepared:
     """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
     scene, views = _with_pictures(canonical, add_row_colors)
+    if not views:
+        scene = fill_holes(scene, None)  # also where the colours are those of the pixels beside
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views) if views else Reference(ROW_COLORS, every, every)
     given = _with_photos(given, scene, repeated)
@@ -235,7 +238,7 @@ def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> 
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks))
         if views:
-            return pictured, views
+            return fill_holes(pictured, pictured.masks), views
     return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
 
 
