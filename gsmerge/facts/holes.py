@@ -21,12 +21,12 @@ from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
-# Chosen on exports of four captures in the way of Depth Anything 3, and on the same with shuffled and with merged rows.
+# Chosen on exports of eight captures in the way of Depth Anything 3, and on the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
-FACTORS = np.geomspace(1, 8, 13)  # of the depth of a view's farthest surface, that are tried
+FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
 FARTHER = 0.001  # difference of colours, sRGB, that each next depth must gain
-OTHERS = 4  # nearest views that a picture is compared with
+OTHERS = 3  # nearest views that a picture is compared with
 BLUR = 3.0  # standard deviation of the window over which differences are averaged, pixels
 LEAST = 1e-3  # weight in that window of the pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
