@@ -21,7 +21,7 @@ from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
-# Chosen on exports of eight captures in the way of Depth Anything 3, and on the same with shuffled and with merged rows.
+# Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
