@@ -32,14 +32,13 @@ LEAST = 1e-3  # weight in that window of the pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
 
 
-def fill_holes(scene: PicturedScene, shown: np.ndarray | None) -> PicturedScene:
+def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers; add a note.
 
-    ``shown [v,h,w]``: pixels whose picture says what is there; None: all. Where rows belong to pixels, only pixels
+    ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels
     without a row get a Gaussian, and it takes their row; elsewhere the new Gaussians follow the others.
     """
-    free = ~scene.valid if scene.aligned else np.ones(scene.images.shape[:3], bool)
-    free = free if shown is None else free & shown
+    free = shown & ~scene.valid if scene.aligned else shown
     if not free.any():
         return scene
     holes, parts = np.zeros_like(free), dict[int, Gaussians]()

@@ -175,11 +175,13 @@ class Prepared:
 
 
 @stage("prepare")
-def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
+def prepare(
+    scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None, *, fill: bool = True
+) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite Gaussian, or if there are
-    images without cameras.
+    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians where only pictures show something.
+    Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
     given, (views, repeated) = scene, distinct_views(scene)
@@ -188,7 +190,17 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
     finish = _prepare_pixels if scene.aligned else _prepare_others
-    return finish(given, scene, frame, tuple(repeated), options)
+    prepared = finish(given, scene, frame, tuple(repeated), options)
+    return _without_holes(prepared) if fill and prepared.reference.of_views else prepared
+
+
+def _without_holes(prepared: Prepared) -> Prepared:
+    """Return a copy with Gaussians also where the photos show something and no Gaussian is."""
+    scene, views = prepared.scene, list(prepared.reference.fit_views)
+    shown = np.zeros(scene.images.shape[:3], bool)
+    by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
+    shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
+    return replace(prepared, scene=fill_holes(scene, shown))
 
 
 def _prepare_pixels(
@@ -196,8 +208,6 @@ def _prepare_pixels(
 ) -> Prepared:
     """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
     scene, views = _with_pictures(canonical, add_row_colors)
-    if not views:
-        scene = fill_holes(scene, None)  # also where the colours are those of the pixels beside
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views) if views else Reference(ROW_COLORS, every, every)
     given = _with_photos(given, scene, repeated)
@@ -238,7 +248,7 @@ def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> 
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks))
         if views:
-            return fill_holes(pictured, pictured.masks), views
+            return pictured, views
     return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
 
 

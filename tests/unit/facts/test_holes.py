@@ -58,6 +58,11 @@ def without_pixels(scene: PicturedScene) -> PicturedScene:
     return replace(scene, gaussians=scene.gaussians[rows], pixel_ids=None, missing=None)
 
 
+def filled_everywhere(scene: PicturedScene) -> PicturedScene:
+    """The scene filled where its pictures show something: everywhere."""
+    return fill_holes(scene, np.ones(scene.images.shape[:3], bool))
+
+
 def depths_of(scene: PicturedScene) -> np.ndarray:
     """Depth of each pixel's Gaussian ``[v,h,w]``."""
     means = scene.gaussians.means.reshape(*scene.valid.shape, 3)
@@ -65,7 +70,7 @@ def depths_of(scene: PicturedScene) -> np.ndarray:
 
 
 def test_far_pixels_lie_where_the_photos_agree() -> None:
-    filled = fill_holes(scene_of(), None)
+    filled = filled_everywhere(scene_of())
     far = (slice(None), slice(6, FLOOR - 6), slice(10, -10))
     assert filled.valid[far].all()
     assert (np.abs(np.log(depths_of(filled)[far] / FAR)) < 0.1).mean() > 0.9
@@ -73,7 +78,7 @@ def test_far_pixels_lie_where_the_photos_agree() -> None:
 
 def test_rows_stay_and_missing_stays() -> None:
     scene = scene_of()
-    filled = fill_holes(scene, None)
+    filled = filled_everywhere(scene)
     assert np.array_equal(filled.missing, scene.missing)
     assert np.array_equal(filled.stored, scene.valid)
     kept = scene.valid.reshape(-1)
@@ -82,7 +87,7 @@ def test_rows_stay_and_missing_stays() -> None:
 
 
 def test_without_parallax_far_pixels_are_beside_the_others() -> None:
-    filled = fill_holes(scene_of(moved=0.0), None)
+    filled = filled_everywhere(scene_of(moved=0.0))
     new = filled.valid & filled.missing
     assert new[:, :FLOOR].any()
     assert np.allclose(depths_of(filled)[new], NEAR, rtol=1e-3)
@@ -95,7 +100,7 @@ def test_holes_between_rows_have_the_depth_beside_them() -> None:
     kept[:, 40:48, 12:-12] = False
     opacities = np.where(kept.reshape(-1), scene.gaussians.opacities, 0)
     holed = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities), pixel_ids=grid_ids(kept))
-    filled = fill_holes(holed, None)
+    filled = filled_everywhere(holed)
     inner = (slice(None), slice(42, 46), slice(20, -20))
     assert (np.abs(np.log(depths_of(filled)[inner] / NEAR)) < 0.02).mean() > 0.95
 
@@ -103,7 +108,7 @@ def test_holes_between_rows_have_the_depth_beside_them() -> None:
 def test_rows_without_pixels_are_followed_by_new_ones() -> None:
     scene = without_pixels(scene_of())
     with record_run() as record:
-        filled = fill_holes(scene, None)
+        filled = filled_everywhere(scene)
     count = len(scene.gaussians)
     assert all(np.array_equal(values[:count], getattr(scene.gaussians, name))
                for name, values in vars(filled.gaussians).items())  # fmt: skip
@@ -126,9 +131,9 @@ def test_nothing_is_added_where_everything_is_covered() -> None:
     scene = scene_of()
     rows = replace(scene.gaussians, opacities=np.full_like(scene.gaussians.opacities, 0.9))
     full = replace(scene, gaussians=rows, pixel_ids=grid_ids(np.ones_like(scene.valid)), missing=None)
-    assert fill_holes(full, None) is full
+    assert filled_everywhere(full) is full
     unordered = replace(full, pixel_ids=None)
-    assert fill_holes(unordered, None) is unordered
+    assert filled_everywhere(unordered) is unordered
 
 
 def test_views_that_show_no_gaussian_stay_empty() -> None:
@@ -136,12 +141,12 @@ def test_views_that_show_no_gaussian_stay_empty() -> None:
     viewmats = scene.cameras.viewmats.copy()
     viewmats[2, :3, :3] = np.diag([-1, 1, -1])  # looks away
     turned = replace(scene, cameras=replace(scene.cameras, viewmats=viewmats))
-    assert not (fill_holes(turned, None).valid & scene.missing)[2].any()
+    assert not (filled_everywhere(turned).valid & scene.missing)[2].any()
 
 
 def test_one_camera_alone_fills_at_the_depth_beside() -> None:
     scene = scene_of(moved=0.0)
-    filled = fill_holes(without_pixels(scene), None)
+    filled = filled_everywhere(without_pixels(scene))
     new = filled.gaussians.means[int(scene.valid.sum()) :, 2]
     assert np.allclose(new, NEAR, rtol=1e-3)
 
