@@ -379,11 +379,10 @@ def _merge_unseen(
 ) -> tuple[Gaussians, int | None]:
     """Merge and clean the unseen Gaussians; return them, and the number that shares of a budget refer to, or None."""
     scene, unseen = prepared.scene, prepared.unseen
-    num_file, num_all = prepared.input_scene.num_gaussians, scene.num_gaussians + len(unseen)
+    num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
     if len(unseen) == 0:
-        other = len(scene) < len(prepared.input_scene) or num_all > num_file  # views repeat, or holes are filled
-        return unseen, num_file if other else None
-    num_input = min(num_file, num_all)
+        return unseen, num_input
+    num_input = prepared.size.num_gaussians + len(unseen)
     exact = exact_count(options.budget, num_input, unseen.sh_degree)
     rate = segment.share * options.decode.mean_k if exact is None else exact / num_input
     visible = unseen[unseen.opacities >= options.decode.min_opacity]

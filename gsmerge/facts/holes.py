@@ -23,6 +23,7 @@ from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
+MOST = 0.5  # share of empty pixels from which on rows without pixels may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
 FARTHER = 0.001  # difference of colours, sRGB, that each next depth must gain
@@ -36,7 +37,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers; add a note.
 
     ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels
-    without a row get a Gaussian, and it takes their row; elsewhere the new Gaussians follow the others.
+    without a row get a Gaussian, and it takes their row; elsewhere the new Gaussians follow the others, unless most
+    pixels are empty: the scene may be a part of what the photos show.
     """
     free = shown & ~scene.valid if scene.aligned else shown
     if not free.any():
@@ -52,7 +54,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
             parts[view] = _fill_view(scene, view, holes[view], covered, blended[..., 0] / np.maximum(1 - left, 1e-6))
 
     tile_views(scene, fill)
-    if not parts:
+    if not parts or not (scene.aligned or holes.sum() < MOST * shown.sum()):
         return scene
     added = Gaussians.concat([parts[view] for view in sorted(parts)])
     note(f"{len(added):,} pixels that no Gaussian covers are filled with the colours of their pictures")

@@ -148,13 +148,15 @@ class Prepared:
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
+    num_filled: int = 0  # Gaussians that were added to a scene without pixels, where only photos show something
 
     @property
     def size(self) -> SceneSize:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
         fitted = bool(self.reference.fit_views)
-        return measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
+        size = measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
+        return replace(size, num_gaussians=size.num_gaussians - self.num_filled)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -200,7 +202,8 @@ def _without_holes(prepared: Prepared) -> Prepared:
     shown = np.zeros(scene.images.shape[:3], bool)
     by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
     shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
-    return replace(prepared, scene=fill_holes(scene, shown))
+    filled = fill_holes(scene, shown)
+    return replace(prepared, scene=filled, num_filled=len(filled.gaussians) - len(scene.gaussians))
 
 
 def _prepare_pixels(
