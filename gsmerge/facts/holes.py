@@ -36,8 +36,8 @@ SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
 def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers; add a note.
 
-    ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels
-    without a row get a Gaussian, and it takes their row; elsewhere the new Gaussians follow the others, unless most
+    ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels without a row
+    get a Gaussian, which takes their row. Elsewhere the new Gaussians follow the others, and none is added where most
     pixels are empty: the scene may be a part of what the photos show.
     """
     free = shown & ~scene.valid if scene.aligned else shown
@@ -54,7 +54,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
             parts[view] = _fill_view(scene, view, holes[view], covered, blended[..., 0] / np.maximum(1 - left, 1e-6))
 
     tile_views(scene, fill)
-    if not parts or not (scene.aligned or holes.sum() < MOST * shown.sum()):
+    if not parts or not (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
         return scene
     added = Gaussians.concat([parts[view] for view in sorted(parts)])
     note(f"{len(added):,} pixels that no Gaussian covers are filled with the colours of their pictures")
