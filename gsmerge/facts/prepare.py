@@ -148,7 +148,6 @@ class Prepared:
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
-    num_filled: int = 0  # Gaussians that were added to a scene without pixels, where only photos show something
 
     @property
     def size(self) -> SceneSize:
@@ -156,7 +155,8 @@ class Prepared:
         measured = self.input_scene if self.reference.placed else self.scene
         fitted = bool(self.reference.fit_views)
         size = measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
-        return replace(size, num_gaussians=size.num_gaussians - self.num_filled)
+        # Gaussians that fill holes are not the file's
+        return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -203,7 +203,7 @@ def _without_holes(prepared: Prepared) -> Prepared:
     by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
     shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
     filled = fill_holes(scene, shown)
-    return replace(prepared, scene=filled, num_filled=len(filled.gaussians) - len(scene.gaussians))
+    return replace(prepared, scene=filled)
 
 
 def _prepare_pixels(
