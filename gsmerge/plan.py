@@ -385,7 +385,7 @@ def _merge_unseen(
     num_input = prepared.input_scene.num_gaussians if len(scene) < len(prepared.input_scene) else None
     if len(unseen) == 0:
         return unseen, num_input
-    num_input = scene.num_gaussians + len(unseen)
+    num_input = prepared.size.num_gaussians + len(unseen)
     exact = exact_count(options.budget, num_input, unseen.sh_degree)
     rate = segment.share * options.decode.mean_k if exact is None else exact / num_input
     visible = unseen[unseen.opacities >= options.decode.min_opacity]

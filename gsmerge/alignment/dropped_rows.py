@@ -16,6 +16,7 @@ from gsmerge.alignment.calibration import Calibration, calibrate
 from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
 from gsmerge.alignment.score import find_correspondences
+from gsmerge.kernels.elementary import arccos, cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
@@ -234,11 +235,14 @@ def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarr
     """
     columns, places = _count_columns(u, starts)
     slants = np.linspace(-_SLANT, _SLANT, 2 * _SLANTS + 1) / max(1, y[-1])
-    turns = 2j * np.pi * (places - slants[:, None] * y[starts])
-    sums = (np.exp(turns) * np.diff(np.append(starts, len(u)))).sum(1)
-    best = np.abs(sums).argmax()
-    places -= slants[best] * y[starts] + np.angle(sums[best]) / (2 * np.pi)
-    return columns + np.repeat(np.rint(places).astype(np.int64), np.diff(np.append(starts, len(u))))
+    lengths = np.diff(np.append(starts, len(u)))
+    turns = 2 * np.pi * (places - slants[:, None] * y[starts])
+    real, imaginary = (cos(turns) * lengths).sum(1), (sin(turns) * lengths).sum(1)
+    size = np.sqrt(real * real + imaginary * imaginary)
+    best = size.argmax()
+    turn = np.sign(imaginary[best]) * arccos((real[best] / max(size[best], 1e-300)).clip(-1, 1))
+    places -= slants[best] * y[starts] + turn / (2 * np.pi)
+    return columns + np.repeat(np.rint(places).astype(np.int64), lengths)
 
 
 def _common_columns(view: _View, share: float) -> _View:

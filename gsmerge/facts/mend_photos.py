@@ -158,7 +158,7 @@ def own_pictures(scene: Scene, views: list[int]) -> np.ndarray:
 
 
 def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Fill unknown pixels ``[h,w]`` with the colour of the nearest known pixel."""
+    """Fill unknown pixels of a picture ``[h,w,c]`` with the values of the nearest known pixel."""
     if valid.all() or not valid.any():
         return picture
     _, labels = cv2.distanceTransformWithLabels(
@@ -166,4 +166,4 @@ def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
     )
     nearest = np.zeros(int(labels.max()) + 1, np.int64)
     nearest[labels[valid]] = np.flatnonzero(valid)
-    return np.asarray(picture.reshape(-1, 3)[nearest[labels]])
+    return np.asarray(picture.reshape(valid.size, -1)[nearest[labels]])

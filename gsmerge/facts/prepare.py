@@ -16,6 +16,7 @@ import numpy as np
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.exposure import equalise_exposure
+from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_judges,
@@ -153,7 +154,9 @@ class Prepared:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
         fitted = bool(self.reference.fit_views)
-        return measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
+        size = measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
+        # Gaussians that fill holes are not the file's
+        return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -174,11 +177,13 @@ class Prepared:
 
 
 @stage("prepare")
-def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None) -> Prepared:
+def prepare(
+    scene: Scene, options: PrepareOptions | None = None, frame: Frame | None = None, *, fill: bool = True
+) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame``: canonical frame; None: the scene's own. Raises ValueError if there is no finite Gaussian, or if there are
-    images without cameras.
+    ``frame``: canonical frame; None: the scene's own. ``fill``: add Gaussians where only pictures show something.
+    Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
     given, (views, repeated) = scene, distinct_views(scene)
@@ -187,7 +192,18 @@ def prepare(scene: Scene, options: PrepareOptions | None = None, frame: Frame | 
         scene = subset(scene, views)
     scene, frame = canonicalise(add_views(scene), frame)
     finish = _prepare_pixels if scene.aligned else _prepare_others
-    return finish(given, scene, frame, tuple(repeated), options)
+    prepared = finish(given, scene, frame, tuple(repeated), options)
+    return _without_holes(prepared) if fill and prepared.reference.of_views else prepared
+
+
+def _without_holes(prepared: Prepared) -> Prepared:
+    """Return a copy with Gaussians also where the photos show something and no Gaussian is."""
+    scene, views = prepared.scene, list(prepared.reference.fit_views)
+    shown = np.zeros(scene.images.shape[:3], bool)
+    by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
+    shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
+    filled = fill_holes(scene, shown)
+    return replace(prepared, scene=filled)
 
 
 def _prepare_pixels(

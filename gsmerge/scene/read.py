@@ -351,24 +351,17 @@ def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFil
 
 
 def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
-    """Restore pixels that the exporter dropped, if their depths are known or can be guessed; with a note."""
-    images = scene.images
-    if images is None or scene.missing is None:
+    """Restore pixels that the exporter dropped where depth maps beside the file have them; with a note."""
+    if scene.images is None or scene.missing is None or layout.kind != "box+depth":
         return scene, []
-    from gsmerge.alignment import fill_from_depths, guess_depths
+    depths = read_depths(Path(camera_file.path))
+    if depths is None:
+        return scene, []
+    from gsmerge.alignment import fill_from_depths
 
-    depths = read_depths(Path(camera_file.path)) if layout.kind == "box+depth" else None
-    source = "from the depth maps"
-    if depths is not None:
-        full = fill_from_depths(scene, depths[views], images)
-    elif layout.kind == "pruned" and layout.per_pixel == 1:
-        full = fill_from_depths(scene, guess_depths(scene, images), images)
-        source = "at depths where the photos agree"
-    else:
-        return scene, []
+    full = fill_from_depths(scene, depths[views], scene.images)
     count = int(full.valid.sum()) - int(scene.valid.sum())
-    note = f"{count:,} pixels that the exporter dropped are put back {source}"
-    return full, [note] * (count > 0)
+    return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] * (count > 0)
 
 
 def _place_rows(

@@ -1,0 +1,188 @@
+"""Gaussians for pixels that the views show and no Gaussian covers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import da3_rows, export_rows, save_export, smooth_scene
+from messages import noted
+
+from gsmerge import compact
+from gsmerge.facts.holes import fill_holes
+from gsmerge.facts.prepare import prepare
+from gsmerge.geometry import camera_depths, rgb_to_sh0
+from gsmerge.raster import render
+from gsmerge.runtime.record import record_run
+from gsmerge.scene.read import load_scene
+from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
+
+WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24
+K = np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]])
+
+
+def scene_of(*, moved: float = 0.5, floor: int = FLOOR) -> PicturedScene:
+    """Three views of a far wall above a near one, each ``moved`` to the right; the far wall and borders are missing."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    depth = np.where(y < floor, FAR, NEAR)
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    means, images = [], []
+    for view in range(3):
+        viewmats[view, 0, 3] = -moved * view
+        rays = np.stack([(x - 48) / 80, (y - 32) / 80, np.ones_like(x)], -1)
+        world = rays * depth[..., None] + np.array([moved * view, 0, 0])
+        u, v = world[..., 0], world[..., 1]
+        colors = [np.sin(9 * u + 3 * v), np.sin(5 * u - 8 * v), np.sin(2 * u * v + 4 * v)]
+        images.append(0.5 + 0.4 * np.stack(colors, -1))
+        means.append(world.reshape(-1, 3))
+    kept = np.zeros((3, HEIGHT, WIDTH), bool)
+    kept[:, floor:-2, 3:-3] = True
+    photos, count = np.stack(images).astype(np.float32), kept.size
+    gaussians = Gaussians(
+        means=np.concatenate(means).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), 0.03, np.float32),
+        opacities=np.where(kept.reshape(-1), np.float32(0.9), np.float32(0)),
+        sh0=rgb_to_sh0(photos.reshape(-1, 1, 3)),
+        shN=np.zeros((count, 0, 3), np.float32),
+    )
+    cameras = Cameras(viewmats, np.tile(K, (3, 1, 1)), WIDTH, HEIGHT)
+    return PicturedScene(gaussians, cameras, photos, grid_ids(kept), ("a", "b", "c"), ~kept)
+
+
+def without_pixels(scene: PicturedScene) -> PicturedScene:
+    """The same rows, those that are there, in no order."""
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(scene.valid))
+    return replace(scene, gaussians=scene.gaussians[rows], pixel_ids=None, missing=None)
+
+
+def filled_everywhere(scene: PicturedScene) -> PicturedScene:
+    """The scene filled where its pictures show something: everywhere."""
+    return fill_holes(scene, np.ones(scene.images.shape[:3], bool))
+
+
+def depths_of(scene: PicturedScene) -> np.ndarray:
+    """Depth of each pixel's Gaussian ``[v,h,w]``."""
+    means = scene.gaussians.means.reshape(*scene.valid.shape, 3)
+    return np.stack([camera_depths(*pair) for pair in zip(means, scene.cameras.viewmats[:, None, None], strict=True)])
+
+
+def test_far_pixels_lie_where_the_photos_agree() -> None:
+    filled = filled_everywhere(scene_of())
+    far = (slice(None), slice(6, FLOOR - 6), slice(10, -10))
+    assert filled.valid[far].all()
+    assert (np.abs(np.log(depths_of(filled)[far] / FAR)) < 0.1).mean() > 0.9
+
+
+def test_rows_stay_and_missing_stays() -> None:
+    scene = scene_of()
+    filled = filled_everywhere(scene)
+    assert np.array_equal(filled.missing, scene.missing)
+    assert np.array_equal(filled.stored, scene.valid)
+    kept = scene.valid.reshape(-1)
+    assert all(np.array_equal(values[kept], getattr(scene.gaussians, name)[kept])
+               for name, values in vars(filled.gaussians).items())  # fmt: skip
+
+
+def test_without_parallax_far_pixels_are_beside_the_others() -> None:
+    filled = filled_everywhere(scene_of(moved=0.0))
+    new = filled.valid & filled.missing
+    assert new[:, :FLOOR].any()
+    assert np.allclose(depths_of(filled)[new], NEAR, rtol=1e-3)
+
+
+def test_holes_between_rows_have_the_depth_beside_them() -> None:
+    """Squares missing from the near wall: the photos do not speak for another depth."""
+    scene = scene_of()
+    kept = scene.valid.copy()
+    kept[:, 40:48, 12:-12] = False
+    opacities = np.where(kept.reshape(-1), scene.gaussians.opacities, 0)
+    holed = replace(scene, gaussians=replace(scene.gaussians, opacities=opacities), pixel_ids=grid_ids(kept))
+    filled = filled_everywhere(holed)
+    inner = (slice(None), slice(42, 46), slice(20, -20))
+    assert (np.abs(np.log(depths_of(filled)[inner] / NEAR)) < 0.02).mean() > 0.95
+
+
+def test_rows_without_pixels_are_followed_by_new_ones() -> None:
+    scene = without_pixels(scene_of())
+    with record_run() as record:
+        filled = filled_everywhere(scene)
+    count = len(scene.gaussians)
+    assert all(np.array_equal(values[:count], getattr(scene.gaussians, name))
+               for name, values in vars(filled.gaussians).items())  # fmt: skip
+    before, after = (render(some.gaussians, some.cameras).alphas for some in (scene, filled))
+    assert (before < 0.5).mean() > 0.3
+    assert (after > 0.5).mean() > 0.99
+    assert noted(record.notes, f"{len(filled.gaussians) - count:,} pixels that no Gaussian covers are filled")
+
+
+def test_a_part_of_what_the_photos_show_stays_one() -> None:
+    scene = without_pixels(scene_of(floor=40))
+    assert filled_everywhere(scene) is scene
+
+
+def test_only_pixels_that_are_shown_are_filled() -> None:
+    scene = scene_of()
+    shown = np.zeros_like(scene.valid)
+    shown[1, 4:12] = True
+    new = fill_holes(scene, shown).valid & scene.missing
+    assert new.any()
+    assert not (new & ~shown).any()
+
+
+def test_nothing_is_added_where_everything_is_covered() -> None:
+    scene = scene_of()
+    rows = replace(scene.gaussians, opacities=np.full_like(scene.gaussians.opacities, 0.9))
+    full = replace(scene, gaussians=rows, pixel_ids=grid_ids(np.ones_like(scene.valid)), missing=None)
+    assert filled_everywhere(full) is full
+    unordered = replace(full, pixel_ids=None)
+    assert filled_everywhere(unordered) is unordered
+
+
+def test_views_that_show_no_gaussian_stay_empty() -> None:
+    scene = scene_of()
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[2, :3, :3] = np.diag([-1, 1, -1])  # looks away
+    turned = replace(scene, cameras=replace(scene.cameras, viewmats=viewmats))
+    assert not (filled_everywhere(turned).valid & scene.missing)[2].any()
+
+
+def test_one_camera_alone_fills_at_the_depth_beside() -> None:
+    scene = scene_of(moved=0.0)
+    filled = filled_everywhere(without_pixels(scene))
+    new = filled.gaussians.means[int(scene.valid.sum()) :, 2]
+    assert np.allclose(new, NEAR, rtol=1e-3)
+
+
+@pytest.mark.parametrize("photos", [True, False])
+def test_dropped_pixels_are_filled_with_cameras(tmp_path: Path, photos: bool) -> None:
+    """Rows of Depth Anything 3 with cameras in the place of its depth maps, with photos or their own colours."""
+    tiny = smooth_scene(96, 72)
+    folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)))
+    loaded = load_scene(folder).pixel_scene()
+    scene = loaded if photos else replace(loaded, images=None)
+    assert np.array_equal(np.flatnonzero(scene.valid.reshape(-1)), da3_rows(tiny))
+    with record_run() as record:
+        prepared = prepare(scene)
+    assert noted(record.notes, "pixels that no Gaussian covers are filled")
+    alphas = render(prepared.scene.gaussians, prepared.scene.cameras).alphas
+    assert (alphas > 0.5).mean() > 0.99
+    assert np.array_equal(prepared.input_scene.valid, scene.valid)
+
+
+def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
+    scene = scene_of()
+    images = scene.images.copy()
+    images[1] = np.random.default_rng(0).random(images[1].shape)
+    prepared = prepare(replace(scene, images=images))
+    assert prepared.reference.fit_views == (0, 2)
+    assert (prepared.scene.valid & scene.missing).any((1, 2)).tolist() == [True, False, True]
+
+
+def test_shares_of_a_budget_are_of_the_file() -> None:
+    """Not of the file and the Gaussians that were added."""
+    scene = without_pixels(scene_of())
+    count = len(scene.gaussians)
+    assert len(compact(scene, budget="10%", effort="draft").gaussians) == round(0.1 * count)
