@@ -79,10 +79,12 @@ def follow_rows(means: np.ndarray, valid: np.ndarray, cameras: Cameras) -> Layou
     ids, place = np.full(len(means), -1), 0
     for view, camera in enumerate(projections):
         placed, x, y = _walk(points[place:], camera, (-1, 0), width, height - 1)
+        if not len(placed):
+            break
         ids[rows[place + placed]] = (view * height + y) * width + x
-        place += int(placed[-1]) + 1 if len(placed) else 0
+        place += int(placed[-1]) + 1
     few = points[: _MIN_LINES * width * count]
-    if (ids >= 0).sum() < _MIN_PLACED * len(rows) and count > 1:
+    if (ids >= 0).sum() < _MIN_PLACED * len(rows) and 1 < count <= _MAX_MIXED:
         reach = width * height * count
         if len(_walk_mixed(few, projections, -1, width, reach)[0]) >= _MIN_PLACED * len(few):
             ids[:] = -1
@@ -113,8 +115,8 @@ def _find_lengths(points: np.ndarray) -> list[tuple[int, int]]:
     slack = np.rint(_SLACK * around).astype(int)
     similar = sums[around + slack] - sums[np.maximum(around - slack - 1, 0)]
     middle = int(np.rint(np.flatnonzero(similar == similar.max()).mean()))
-    found = [(lag, 0) for lag in exact]
-    return [*found, (middle, int(slack[middle]))] if similar.max() >= _SIMILAR * len(lags) else found
+    lengths = [(lag, 0) for lag in exact]
+    return [*lengths, (middle, int(slack[middle]))] if similar.max() >= _SIMILAR * len(lags) else lengths
 
 
 @dataclass(frozen=True)
@@ -156,9 +158,8 @@ def _find_lines(points: np.ndarray, length: int, slack: int) -> list[np.ndarray]
     """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     count = len(steps) // length * length
-    usual = np.median(steps[:count].reshape(-1, length), 1)[
-        np.minimum(np.arange(len(steps)) // length, count // length - 1)
-    ]
+    usual = np.median(steps[:count].reshape(-1, length), 1).repeat(length)
+    usual = np.pad(usual, (0, len(steps) - count), mode="edge")
     rows = np.flatnonzero(steps > _WRAP * usual) + 1
     if len(rows) * length > _MOST_JUMPS * len(points):
         return []
@@ -290,9 +291,8 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         reach = max(_MIN_AHEAD, int(_AHEAD * lines))
         after = _walk(points[view.rows[-1] + 1 : high], view.camera, (view.x[-1], view.y[-1]), width, reach)
         ahead = points[low : view.rows[0]][::-1]
-        before = _walk(
-            ahead, matmul(_backwards(width), view.camera), (width - 1 - view.x[0], -1 - view.y[0]), width, reach
-        )
+        last = width - 1 - view.x[0], -1 - view.y[0]
+        before = _walk(ahead, matmul(_backwards(width), view.camera), last, width, reach)
         if not len(after[0]) + len(before[0]):
             return view
         rows = np.concatenate([view.rows[0] - 1 - before[0][::-1], view.rows, view.rows[-1] + 1 + after[0]])
