@@ -359,3 +359,16 @@ class Similarity:
 
 
 IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+
+
+def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
+    """Compute the map into the mean pose of cameras ``[c,4,4]`` in which all lie within +-1, as Long-LRM moves them."""
+    rotation, centres = np.empty((3, 3)), camera_centres(viewmats)
+    rotation[2], down = normalize(viewmats[:, 2, :3].mean(0)), viewmats[:, 1, :3].mean(0)
+    rotation[1] = normalize(down - (down * rotation[2]).sum() * rotation[2])
+    rotation[0] = np.cross(rotation[1], rotation[2])
+    shift = -matmul(rotation, centres.mean(0))
+    farthest = float(np.abs(matmul(centres, rotation.T) + shift).max())
+    scale = 1 / farthest if farthest > 0 else 1.0
+    text = "moved into their mean pose and scaled to lie within 1"
+    return Similarity(rotation, scale, scale * shift, text, "other")

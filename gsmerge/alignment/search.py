@@ -29,7 +29,7 @@ from gsmerge.alignment.layouts import (
 from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
 from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity
+from gsmerge.geometry import IDENTITY, Similarity, mean_pose_frame
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
@@ -232,7 +232,8 @@ def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     from gsmerge.alignment.unaligned import check_cameras  # few files come here
 
     rows = source.ply.gaussians, source.ply.valid
-    grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+    others = (_with_poses(grid, other) for other in _conventions(source.camera_file))
+    grids = chain(others, [_in_mean_pose(grid)] if source.scale is None else [])
     yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
     yield from other_sizes
 
@@ -256,6 +257,13 @@ def _conventions(camera_file: CameraFile) -> Iterator[CameraFile]:
 def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
     """Return a grid whose cameras have other poses."""
     return replace(grid, camera_file=camera_file, cameras=replace(grid.cameras, viewmats=camera_file.viewmats))
+
+
+def _in_mean_pose(grid: GridFit) -> GridFit:
+    """Return a grid whose cameras are moved into their mean pose."""
+    frame = mean_pose_frame(grid.camera_file.viewmats)
+    moved = _with_poses(grid, replace(grid.camera_file, viewmats=frame.move_viewmats(grid.camera_file.viewmats)))
+    return replace(moved, notes=(*grid.notes, f"the cameras are {frame.description}"))
 
 
 def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:

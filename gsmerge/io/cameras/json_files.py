@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, normalize
+from gsmerge.geometry import Similarity, mean_pose_frame
 from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     MAX_NORMALISED_FOCAL,
@@ -272,8 +272,8 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
     move, scale = _numbers(pose_path), _numbers(scale_path)
     if frame_ids is not None and len(poses) and move is None and scale is None:
-        with _number_errors(path, "expected poses that can be inverted"), np.errstate(all="ignore"):
-            move, scale = _average_frame(invert(poses))
+        with np.errstate(all="ignore"):  # what overflows is refused with the cameras
+            poses = mean_pose_frame(poses).move_viewmats(poses)
     if scale is not None and (scale.size != 1 or not scale[0] > 0):
         raise SceneError(scale_path, "expected one positive number")
     if move is not None and move.size != 16:
@@ -285,19 +285,6 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     except np.linalg.LinAlgError as error:
         raise SceneError(pose_path, "expected a matrix that can be inverted") from error
     return StoredCameras([frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)])
-
-
-def _average_frame(c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the map ``[16]`` into the mean pose of cameras, and the scale ``[1]`` that brings them within +-1."""
-    mean = np.eye(4)
-    forward, down = c2w[:, :3, 2].mean(0), c2w[:, :3, 1].mean(0)
-    mean[:3, 2] = normalize(forward)
-    mean[:3, 1] = normalize(down - (down * mean[:3, 2]).sum() * mean[:3, 2])
-    mean[:3, 0] = np.cross(mean[:3, 1], mean[:3, 2])
-    mean[:3, 3] = c2w[:, :3, 3].mean(0)
-    move = invert(mean)
-    farthest = float(np.abs(matmul(move, c2w)[:, :3, 3]).max())
-    return move.reshape(-1), np.array([1 / farthest if farthest > 0 else 1.0])
 
 
 def _numbers(path: Path) -> np.ndarray | None:
