@@ -235,6 +235,7 @@ class GridFit:
     # network's usual sizes (3)
     rank: int = 0
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses that the photos confirm, to which Gaussians are to be moved
 
     @property
     def size(self) -> Size:

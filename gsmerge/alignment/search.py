@@ -55,6 +55,7 @@ class AlignmentResult:
     transform: PhotoTransform | None = None  # what was done to the photos
     recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses to which each view's Gaussians are yet to be moved with it
     problem: str | None = None  # why the rows belong to no pixels; None where they do
 
     @property
@@ -283,10 +284,13 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
         if score_layout(other_inputs, best.layout, IDENTITY).ok:
             return []
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
-    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
+    names, path = source.camera_file.names, str(source.camera_file.path)
+    moved = move_cameras(pairs, grid.cameras, names, path, inputs.images)
     if moved is None:
         return []
-    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moved.moves)
+    given = grid.cameras.viewmats if moved.confirmed else None
+    moves = () if moved.confirmed else moved.moves
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
     return [fit for fit in source.fit([grid], exact_frames=True) if fit.recovery.confirmed is not False]
 
 
@@ -338,4 +342,5 @@ def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
         transform=grid.transform,
         recovery=fit.recovery,
         moves=grid.moves,
+        given=grid.given,
     )

@@ -23,7 +23,7 @@ from gsmerge.alignment import (
     read_rotations,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, rgb_to_sh0
+from gsmerge.geometry import Similarity, move_views, rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.read import holds_images, read_depths
@@ -303,6 +303,7 @@ def _make_load(
         scene, note = _put_back(scene, camera_file, layout, views)
         scene, turned = _with_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
+        scene = scene if result.given is None else move_views(scene, result.given[views])
         alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
