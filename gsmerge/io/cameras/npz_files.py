@@ -14,6 +14,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import Photos
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
@@ -31,7 +33,7 @@ _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _L
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 READ_ARRAYS = frozenset((*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS, "c2w", "K", "order"))
-_MAX_INTRINSIC, _SMALL = 1e12, 1e-9
+_MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
 _MAX_HEADER = 1 << 16  # bytes of an array's header
 _KINDS = "biufU"
 
@@ -66,7 +68,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
     width = height = 0
     if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
         height, width = grid.shape[1:3]
-        Ks = None if Ks is None else _at_size(Ks, width, height)
+        Ks = None if Ks is None else _at_size(_without_colmap_scale(path, Ks, width, height), width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
@@ -184,6 +186,18 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     for row in range(images.shape[1]):  # by rows, whose floats take little memory
         out[:, row] = np.round(np.nan_to_num(np.clip(images[:, row], 0, 1).astype(np.float32)) * 255)
     return out
+
+
+def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Scale intrinsics to the depth maps that a COLMAP export of the same call has scaled to the photos' sizes."""
+    folder = path.parent.parent.parent
+    for suffix in (".bin", ".txt"):
+        with suppress(SceneError):
+            views = read_colmap(CameraSource(folder), suffix).views
+            sizes = np.array([view.size for view in views], np.float64).reshape(-1, 2, 1).clip(min=1)
+            if len(views) == len(Ks) and np.allclose(np.array([view.K for view in views]), Ks, rtol=_SAME):
+                return Ks * np.insert([[width], [height]] / sizes, 2, 1, axis=1)
+    return Ks
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from messages import refuses
 from tiny_scene import (
     Tiny,
     assert_same,
+    write_colmap_binary,
+    write_colmap_text,
     write_npz,
 )
 
@@ -46,6 +49,19 @@ def test_npz_intrinsics_of_another_size_are_scaled(tmp_path: Path, tiny: Tiny) -
     normalised = centred / np.array([[20], [14], [1]])
     write_npz(tmp_path / "b.npz", tiny, intrinsics=np.tile(normalised, (3, 1, 1)))
     assert_same(read_cameras(tmp_path / "b.npz"), tiny, K=centred, atol=1e-6)
+
+
+def test_npz_intrinsics_of_a_colmap_export_of_the_same_call_are_scaled_back(tmp_path: Path, tiny: Tiny) -> None:
+    """Older versions of Depth Anything 3 scale them in place, to the photos' sizes."""
+    photos = replace(tiny, K=tiny.K * np.array([[1.1], [1.5], [1]]), width=22, height=21)
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, intrinsics=np.tile(photos.K, (3, 1, 1)).astype(np.float32))
+    for write in (write_colmap_text, write_colmap_binary):
+        write(tmp_path, photos)
+        assert_same(read_cameras(tmp_path / "exports/npz"), tiny, atol=1e-6)
+    photos.K[0, 0] += 1
+    write_colmap_binary(tmp_path, photos)
+    (tmp_path / "cameras.txt").unlink()
+    assert not np.allclose(read_cameras(tmp_path / "exports/npz").Ks, tiny.K)
 
 
 def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
