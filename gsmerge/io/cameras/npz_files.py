@@ -35,6 +35,7 @@ _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 READ_ARRAYS = frozenset((*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS, "c2w", "K", "order"))
 _MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
 _MAX_HEADER = 1 << 16  # bytes of an array's header
+_POINTS, _SAMPLES = "world_points", 1000  # of each view, by which poses are read
 _KINDS = "biufU"
 
 
@@ -48,7 +49,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
     Intrinsics that are normalised, or of another image size than the depth maps (as after a COLMAP export in the same
     call), are scaled to the depth maps. Other readable files: ``cameras.npz`` of Lyra 2; the output of VGGT
-    (``extrinsic``, world to camera); the output of AnySplat (the same, camera to world, normalised, in a batch of one).
+    (``extrinsic``, world to camera), of MapAnything (camera to world, as its points show) and of AnySplat (the same,
+    normalised, in a batch of one).
     SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
@@ -73,7 +75,21 @@ def read_da3(source: CameraSource) -> StoredCameras:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
         return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    return StoredCameras(_views(poses, Ks, (width, height)), photos)
+    convention = C2W_OPENCV if _POINTS in array_names(path) and _are_camera_to_world(path, poses) else None
+    return StoredCameras(_views(poses, Ks, (width, height)), photos, convention=convention)
+
+
+def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
+    """Return whether the stored points of the pixels lie at the depths of the maps if poses are camera-to-world."""
+    points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
+    if depths is None or len(depths) != len(poses) or points.shape != (*depths.shape, 3) or not points.size:
+        return False
+    few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLES))
+    z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
+    rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
+    found = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
+    as_w2c, as_c2w = (float(np.median(np.abs(depth - z[..., 0]))) for depth in found)
+    return as_c2w < as_w2c
 
 
 def read_dump(source: CameraSource) -> StoredCameras:
