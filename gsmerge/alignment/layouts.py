@@ -25,6 +25,7 @@ PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_STRETCHED, _MAX_STRETCH = 16, 0.15  # multiples of its sides, to which ReSplat stretches photos, and by how much
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
@@ -307,7 +308,8 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
         return
     cameras = to_cameras(camera_file, base)
     what = "photos and cameras" if size is not None else "cameras"
-    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    by_count = grids_of_count(ply.count, len(camera_file), base)
+    ranked = [(2 if t.crops or not same_shape((t.width, t.height), base) else 1, t) for t in by_count]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
         ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
     for rank, transform in ranked:
@@ -346,8 +348,9 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
                     yield resize_to(size, to)
                 is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
                 if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
-                    crops.append(resize_and_crop(size, to))
-    yield from (crop for crop in crops if crop.crops)
+                    stretched = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
+                    crops += [resize_to(size, to)] * stretched + [resize_and_crop(size, to)]
+    yield from (crop for crop in crops if crop.crops or not same_shape((crop.width, crop.height), size))
 
 
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:
