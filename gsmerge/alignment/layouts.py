@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.cameras.camera_file import PATCH, CameraFile, sizes_of, to_cameras
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import ASPECT_TOLERANCE, PhotoTransform, Size, resize_and_crop, resize_to, same_shape
@@ -21,7 +21,6 @@ TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at eve
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
-PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
