@@ -45,6 +45,7 @@ _INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "scene_scale.txt"
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
+_SAME_POSE = 1e-4  # difference of numbers in poses that two files write
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
 
 
@@ -179,8 +180,8 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 def read_inria(source: CameraSource) -> StoredCameras:
     """Read the cameras of a ``cameras.json``; SceneError if a key is missing or not a number.
 
-    It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle unless ``cx`` and
-    ``cy`` say where.
+    It has rows of the camera-to-world rotation, and the centre; InstantSplat writes the poses that it optimised beside
+    it. The principal point is in the middle unless ``cx`` and ``cy`` say where.
     """
     views, path = [], source.path
     check_count(path, len(source.json))
@@ -198,7 +199,24 @@ def read_inria(source: CameraSource) -> StoredCameras:
             cx, cy = (_number(entry.get(key, half)) for key, half in middle.items())
         K = make_pinhole(fx, fy, cx, cy)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
-    return StoredCameras(views)
+    return StoredCameras(_with_optimised_poses(views, path.parent / "pose"))
+
+
+def _with_optimised_poses(views: list[View], folder: Path) -> list[View]:
+    """Return views with the poses that InstantSplat optimised, where it wrote them with those that it began from."""
+    from gsmerge.io.cameras.npz_files import read_matrices  # few folders need it
+
+    found = max(folder.glob("ours_*/pose_optimized.npy"), key=lambda path: natural_key(path.parent.name), default=None)
+    before, after = (None, None) if found is None else map(read_matrices, (found.with_name("pose_org.npy"), found))
+    if before is None or after is None or not len(before) == len(after) == len(views):
+        return views
+    try:
+        began, optimised = invert(before)[:, :3], invert(after)[:, :3]
+    except np.linalg.LinAlgError:
+        return views
+    if not np.allclose([view.pose for view in views], began, rtol=_SAME_POSE, atol=_SAME_POSE):
+        return views
+    return [view._replace(pose=pose) for view, pose in zip(views, optimised, strict=True)]
 
 
 def read_world_mirror(source: CameraSource) -> StoredCameras:

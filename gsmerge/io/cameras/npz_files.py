@@ -16,13 +16,13 @@ import zipfile
 from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
-from gsmerge.io.bounds import check_pixels, read_budget
+from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
@@ -245,7 +245,7 @@ def array_shape(path: Path, name: str) -> tuple[int, ...]:
     """Read the shape of an array in an ``.npz`` from its header; empty if it is missing or cannot be read."""
     try:
         with open_archive(path) as archive:
-            return _read_header(archive, _members(archive)[name])[0]
+            return _read_header(archive.open(_members(archive)[name]))[0]
     except Exception:  # whatever a damaged archive makes the libraries raise
         return ()
 
@@ -277,7 +277,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    name, (shape, dtype) = info.filename, _read_header(archive, info)
+    name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
         raise SceneError(path, f"{name}: expected numbers, found {kind}")
@@ -287,10 +287,20 @@ def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
-def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    with archive.open(info) as file:
-        start = io.BytesIO(file.read(_MAX_HEADER))
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    with stream:
+        start = io.BytesIO(stream.read(_MAX_HEADER))
     first = np.lib.format.read_magic(start) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(start)
     return shape, dtype
+
+
+def read_matrices(path: Path) -> np.ndarray | None:
+    """Read finite matrices ``[c,4,4]`` from a ``.npy``; None if it holds none."""
+    with suppress(Exception):  # whatever a damaged file makes the library raise
+        size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
+        if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:
+            matrices = np.load(path, allow_pickle=False).astype(np.float64)
+            return matrices if np.isfinite(matrices).all() else None
+    return None
