@@ -233,9 +233,11 @@ def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     from gsmerge.alignment.unaligned import check_cameras  # few files come here
 
     rows = source.ply.gaussians, source.ply.valid
-    others = (_with_poses(grid, other) for other in _conventions(source.camera_file))
-    grids = chain(others, [_in_mean_pose(grid)] if source.scale is None else [])
+    grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
     yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
+    moved = _in_mean_pose(grid)
+    if source.scale is None and check_cameras(*rows, moved.cameras, source.inputs(grid).images).ok:
+        yield source.fit([moved])
     yield from other_sizes
 
 
