@@ -156,11 +156,27 @@ def align(
         grid = photo_grid(camera_file, photo_size(photos))
     except SceneError:
         fit = source.choose(_fit_other_sizes(source))
-        if fit is None:
+        cropped = _cropped_grid(source) if fit is None else fit.grid
+        if cropped is None:
             raise
+        grid = cropped
     else:
         fit = source.choose(_fit_rounds(source, grid))
     return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
+
+
+def _cropped_grid(source: _Source) -> GridFit | None:
+    """Return photos resized or cropped to the cameras' size that show the colours of rows; None if none do."""
+    from gsmerge.alignment.unaligned import check_cameras
+
+    best, least = None, 0.0
+    for grid in other_grids(source.ply.info, source.camera_file, photo_size(source.photos)):
+        if grid.rank == 0:
+            inputs = source.inputs(grid)
+            check = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, inputs.images)
+            if check.ok and not math.isnan(check.color_ratio) and check.score > least:
+                best, least = grid, check.score
+    return best
 
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
