@@ -200,6 +200,18 @@ def test_resplat_s_grids(size: tuple[int, int], tmp_path: Path) -> None:
     assert home(scene, tiny) == 1
 
 
+def test_photos_of_depth_maps_without_images_are_resized(tmp_path: Path) -> None:
+    """Grey rows do not tell whether photos were cropped."""
+    tiny = smooth_scene(112, 84)
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None, depth=tiny.depths)
+    size = (240, 176)
+    photos = np.stack(original(tiny, resize_to(size, (112, 84)), size)[1])
+    photos[:, :, [0, 1, 2, -3, -2, -1]] = 255  # which is far from grey
+    write_photos(tmp_path, tiny, list(photos))
+    loaded = load_scene(tmp_path, images=tmp_path / "images")
+    assert noted(loaded.notes, "photos of 240 x 176 are resized to 112 x 84")
+
+
 def test_mappings_move_a_point_and_its_photo_alike() -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
