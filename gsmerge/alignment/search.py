@@ -360,5 +360,5 @@ def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
         transform=grid.transform,
         recovery=fit.recovery,
         moves=grid.moves,
-        given=grid.given,
+        given=None if grid.given is None else frame.move_viewmats(grid.given),
     )

@@ -304,7 +304,9 @@ def _make_load(
         scene, note = _put_back(scene, camera_file, layout, views)
         scene, turned = _with_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
-        scene = scene if result.given is None else move_views(scene, result.given[views])
+        if result.given is not None:
+            scene = move_views(scene, result.given[views])
+            result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
         alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)

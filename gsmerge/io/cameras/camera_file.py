@@ -32,7 +32,7 @@ _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
-_OTHER_SIZE = 0.1  # share by which a side differs from that of another size
+_OTHER_SIZE, _WHOLE = 0.1, 1e-3  # share by which a side differs from that of another size; pixels off a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
 
 # Of the rows of a file, which a file of cameras may name
@@ -280,7 +280,8 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     alike = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
     if not alike or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
         return camera_file
-    width, height = (np.full(len(camera_file), PATCH * max(1, round(side / PATCH))) for side in sides.tolist())
+    unit = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
+    width, height = (np.full(len(camera_file), unit * round(side / unit)) for side in sides.tolist())
     return replace(camera_file, widths=width, heights=height)
 
 

@@ -113,15 +113,16 @@ def test_photos_tell_whether_cameras_or_gaussians_are_off(wrong: str, tmp_path: 
     """Cameras and the Gaussians of each view have different poses; photos agree under one of the two."""
     right = scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120))
     moved = motions.disagreeing(right, 1.5, 0.02)
-    gaussians, cameras = (right, moved) if wrong == "cameras" else (moved, right)
-    write_gaussians(tmp_path / "scene.ply", gaussians.gaussians)
-    write_transforms(tmp_path / "transforms.json", cameras.cameras, right.names)
+    rows, poses = (right, moved) if wrong == "cameras" else (moved, right)
+    write_gaussians(tmp_path / "scene.ply", rows.gaussians)
+    write_transforms(tmp_path / "transforms.json", poses.cameras, right.names)
     for name, image in zip(right.names, right.images, strict=True):
         cv2.imwrite(str(tmp_path / name), (255 * image[..., ::-1]).round())
     loaded = load_scene(tmp_path)
     assert noted(loaded.notes, f"the {wrong} are off")
     assert len(loaded.moves) == (3 if wrong == "cameras" else 0)
-    assert pose_changes(right.cameras.viewmats, loaded.scene.cameras.viewmats)[0].max() < 0.1
+    for cameras in (loaded.scene.cameras, loaded.views.cameras):
+        assert pose_changes(right.cameras.viewmats, cameras.viewmats)[0].max() < 0.1
     assert np.abs(loaded.scene.gaussians.means - right.gaussians.means).max() < 0.02
 
 
