@@ -324,6 +324,11 @@ _EXPORTERS = (
                 "`gaussians_001.ply`; `input_frame_idx.txt`; in some versions `pos_avg_inv.txt` and `scene_scale.txt`",
                 "read right with the data set's file of cameras",
             ),
+            Model(
+                "tttLRM", "cwchenwang/tttLRM 1d133c2",
+                "`gaussians_001.ply` in the mean pose of its cameras, without faint rows; no cameras",
+                "read right with cameras of its views alone",
+            ),
         ),
         "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS,
     ),
@@ -341,7 +346,10 @@ _EXPORTERS = (
                 "`point_cloud/iteration_N/point_cloud.ply`, `cameras.json`",
                 f"{_NO_PIXELS}; name the photos",
             ),
-            Model("InstantSplat", "NVlabs/InstantSplat 3c29c20", "as INRIA 3DGS", f"{_NO_PIXELS}; name the photos"),
+            Model(
+                "InstantSplat", "NVlabs/InstantSplat 3c29c20; `train.py` 3bb6a7f",
+                "as INRIA 3DGS; `pose/ours_N/pose_optimized.npy`", f"{_NO_PIXELS}; name the photos",
+            ),
             Model("ZipSplat", "cvg/ZipSplat 69fd35b", "`scene.ply` of tokens and a film; no cameras", _WITH_CAMERAS),
             Model(
                 "SAM 3D Objects", "facebookresearch/sam-3d-objects; `gaussian_model.py` aa18aba",
