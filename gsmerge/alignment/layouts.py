@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.cameras.camera_file import PATCH, CameraFile, sizes_of, to_cameras
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.image_names import natural_key
@@ -23,10 +23,10 @@ TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at eve
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
-PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_STRETCHED, _MAX_STRETCH = 16, 0.15  # multiples of its sides, to which ReSplat stretches photos, and by how much
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
 _MIN_ROWS = 0.5  # of the pixels of half the photos' size, where rows may be of those that were not dropped
 _NEAR_SIZE = 0.05  # of the longer side, by which cameras' sizes may differ that are no more than assumed
@@ -260,6 +260,7 @@ class GridFit:
     # network's usual sizes (3)
     rank: int = 0
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses that the photos confirm, to which Gaussians are to be moved
 
     @property
     def size(self) -> Size:
@@ -346,7 +347,8 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     near = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
     files = [camera_file] + [near] * (near is not camera_file)
     what = "photos and cameras" if size is not None else "cameras"
-    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    by_count = grids_of_count(ply.count, len(camera_file), base)
+    ranked = [(2 if t.crops or not same_shape((t.width, t.height), base) else 1, t) for t in by_count]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
         kept = ply.count / len(camera_file)
         halves = (resize_to(base, half) for half in _half_sizes(base) if kept >= _MIN_ROWS * half[0] * half[1])
@@ -388,11 +390,12 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
                     yield resize_to(size, to)
                 is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
                 if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
-                    crops.append(resize_and_crop(size, to))
+                    stretched = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
+                    crops += [resize_to(size, to)] * stretched + [resize_and_crop(size, to)]
     for width, height in _half_sizes(size):
         if views * da3_box(width, height).pixels(width, height).size == count:
             yield resize_to(size, (width, height))
-    yield from (crop for crop in crops if crop.crops)
+    yield from (crop for crop in crops if crop.crops or not same_shape((crop.width, crop.height), size))
 
 
 def _half_sizes(size: Size) -> Iterator[Size]:

@@ -23,8 +23,8 @@ from gsmerge.alignment import (
     read_rotations,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, rgb_to_sh0
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
+from gsmerge.geometry import Similarity, move_views, rgb_to_sh0
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.read import CAMERA_PLACES, holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
@@ -246,6 +246,7 @@ def align_scene(
     order = default_order if hints.order == "auto" else hints.order
     files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else ())
+    pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
@@ -311,6 +312,9 @@ def _make_load(
         scene, note = _put_back(scene, camera_file, layout, views)
         scene, turned = _with_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
+        if result.given is not None:
+            scene = move_views(scene, result.given[views])
+            result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
         alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)

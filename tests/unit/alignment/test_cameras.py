@@ -6,9 +6,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import motions
 import numpy as np
 import pytest
+import scenes
 from messages import names, noted, refuses
 from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
@@ -18,6 +20,7 @@ from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes, project_points
+from gsmerge.io import write_gaussians
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -117,6 +120,24 @@ def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path:
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum(names(note, "cameras", "median") for note in load.notes) == 1
     assert len(load.moves) == 3
+
+
+@pytest.mark.parametrize("wrong", ["cameras", "Gaussians"])
+def test_photos_tell_whether_cameras_or_gaussians_are_off(wrong: str, tmp_path: Path) -> None:
+    """Cameras and the Gaussians of each view have different poses; photos agree under one of the two."""
+    right = scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120))
+    moved = motions.disagreeing(right, 1.5, 0.02)
+    rows, poses = (right, moved) if wrong == "cameras" else (moved, right)
+    write_gaussians(tmp_path / "scene.ply", rows.gaussians)
+    write_transforms(tmp_path / "transforms.json", poses.cameras, right.names)
+    for name, image in zip(right.names, right.images, strict=True):
+        cv2.imwrite(str(tmp_path / name), (255 * image[..., ::-1]).round())
+    loaded = load_scene(tmp_path)
+    assert noted(loaded.notes, f"the {wrong} are off")
+    assert len(loaded.moves) == (3 if wrong == "cameras" else 0)
+    for cameras in (loaded.scene.cameras, loaded.views.cameras):
+        assert pose_changes(right.cameras.viewmats, cameras.viewmats)[0].max() < 0.1
+    assert np.abs(loaded.scene.gaussians.means - right.gaussians.means).max() < 0.02
 
 
 def test_tensors_whose_cameras_are_off(large: Tiny) -> None:

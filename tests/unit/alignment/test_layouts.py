@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exports import Smooth, export_rows, save_export, smooth_scene, turned, with_intrinsics
+from exports import Smooth, export_rows, home, save_export, smooth_scene, turned, with_intrinsics
 from messages import names, noted, refuses
 from sweeps import sweep
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_images, write_npz
@@ -184,6 +184,32 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     assert loaded.scene.aligned
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (504, 28)
     assert noted(loaded.notes, "resized", "504 x 28")
+
+
+@pytest.mark.parametrize("size", [(256, 192), (256, 211)], ids=["four times the grid", "stretched"])
+def test_resplat_s_grids(size: tuple[int, int], tmp_path: Path) -> None:
+    """A quarter of what photos were stretched to, in the middle camera; grids of other sizes, trimmed, fit as well."""
+    tiny = smooth_scene(64, 48)
+    middle = np.linalg.inv(tiny.c2w[1])
+    save_export(tmp_path, tiny, turned(export_rows(tiny, rest=45), middle[:3, :3], shift=middle[:3, 3]), cameras=False)
+    K, photos = original(tiny, resize_to(size, (64, 48)), size)
+    write_photos(tmp_path, tiny, photos)
+    write_cameras(tmp_path, tiny, K, size)
+    scene = load_scene(tmp_path).pixel_scene()
+    assert (scene.cameras.width, scene.cameras.height) == (64, 48)
+    assert home(scene, tiny) == 1
+
+
+def test_photos_of_depth_maps_without_images_are_resized(tmp_path: Path) -> None:
+    """Grey rows do not tell whether photos were cropped."""
+    tiny = smooth_scene(112, 84)
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None, depth=tiny.depths)
+    size = (240, 176)
+    photos = np.stack(original(tiny, resize_to(size, (112, 84)), size)[1])
+    photos[:, :, [0, 1, 2, -3, -2, -1]] = 255  # which is far from grey
+    write_photos(tmp_path, tiny, list(photos))
+    loaded = load_scene(tmp_path, images=tmp_path / "images")
+    assert noted(loaded.notes, "photos of 240 x 176 are resized to 112 x 84")
 
 
 def test_mappings_move_a_point_and_its_photo_alike() -> None:
