@@ -11,7 +11,8 @@ import numpy as np
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.types import SH_C0, Array, Cameras, Gaussians
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import SH_C0, Array, Cameras, Gaussians, SceneT
 
 State = TypeVar("State")  # what a descent moves
 MORTON_BITS = 21  # per axis: three fit into 63 bits
@@ -142,6 +143,25 @@ def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[.
     """Return viewmats ``end [v,4,4]`` without the common part (mean, median) of all motions since ``start``."""
     common = middle(motion_vectors(start, end), axis=0)
     return matmul(end, invert(motion_matrices(common[None])))
+
+
+def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
+    """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
+
+    Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
+    """
+    g, size = scene.gaussians, scene.pixels_per_view
+    motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
+    turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (np.empty_like(a) for a in (g.means, g.quats))
+
+    def move(view: int) -> None:
+        rows = slice(view * size, (view + 1) * size)
+        means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
+        quats[rows] = multiply_quats(turns[view], g.quats[rows])
+
+    parallel_map(move, range(len(scene)))
+    gaussians = replace(g, means=means, quats=quats)
+    return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
 def camera_centres(viewmats: np.ndarray) -> np.ndarray:
@@ -359,3 +379,16 @@ class Similarity:
 
 
 IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
+
+
+def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
+    """Compute the map into the mean pose of cameras ``[c,4,4]`` in which all lie within +-1, as Long-LRM moves them."""
+    rotation, centres = np.empty((3, 3)), camera_centres(viewmats)
+    rotation[2], down = normalize(viewmats[:, 2, :3].mean(0)), viewmats[:, 1, :3].mean(0)
+    rotation[1] = normalize(down - (down * rotation[2]).sum() * rotation[2])
+    rotation[0] = np.cross(rotation[1], rotation[2])
+    shift = -matmul(rotation, centres.mean(0))
+    farthest = float(np.abs(matmul(centres, rotation.T) + shift).max())
+    scale = 1 / farthest if farthest > 0 else 1.0
+    text = "moved into their mean pose and scaled to lie within 1"
+    return Similarity(rotation, scale, scale * shift, text, "other")

@@ -34,7 +34,7 @@ from gsmerge.settings.stages import (
 )
 from gsmerge.stages.assign import merge_unseen
 from gsmerge.stages.encode import measured_share
-from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, scene_tree
+from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, has_few_rows, scene_tree
 from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
@@ -159,6 +159,9 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
+    if keeps and has_few_rows(size):
+        few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
+        note(f"{few} the photos' pixels, up to half of the Gaussians")
     tree = None
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1

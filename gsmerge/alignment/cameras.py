@@ -13,7 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.score import Correspondences, check_pairs, pixel_errors, pixel_limit, solve_pose
+from gsmerge.alignment.score import (
+    Correspondences,
+    check_pairs,
+    photo_colors,
+    pixel_errors,
+    pixel_limit,
+    solve_pose,
+)
 from gsmerge.errors import SceneError
 from gsmerge.geometry import camera_depths, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
@@ -24,6 +31,8 @@ from gsmerge.io.cameras.camera_file import (
     list_moves,
     to_viewmats,
 )
+from gsmerge.io.photo_files import NO_IMAGES
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Cameras
 
 _SAME = 1e-6  # of the cameras' distances: no difference
@@ -31,6 +40,8 @@ _SAME = 1e-6  # of the cameras' distances: no difference
 MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
 NEAR_PX = 0.5  # cameras that are nearer stay where they are
 AS_GOOD, AS_GOOD_PX = 1.3, 0.25  # times and pixels more than moved cameras leave, up to which other intrinsics fit
+SAME_FOCAL = 0.01  # by which focal lengths of other intrinsics may differ, relative, where they count as the same
+CLEAR = 0.96  # of the difference of colours between photos that other poses leave: better
 _LINE_ROUNDS = 4  # of reweighted least squares
 
 
@@ -75,15 +86,25 @@ class MovedCameras:
 
     cameras: Cameras
     worst_px: float  # the largest median distance of a view's Gaussians from their pixels before
-    moves: list[dict[str, Any]]  # of every view, see list_moves
+    moves: list[dict[str, Any]]  # of every view, see list_moves; empty where the principal points alone were wrong
+    confirmed: bool = False  # whether the photos agree better if the Gaussians are moved to the given cameras instead
 
     @property
     def note(self) -> str:
         """Sentence for the user about the move."""
-        return (
+        if not self.moves:
+            x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
+            return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
+        what = (
             f"the cameras are off by a median of up to {self.worst_px:.1f} px: each was moved to where its Gaussians"
-            f" lie in their pixels, {describe_moves(self.moves)}"
+            " lie in their pixels"
         )
+        if self.confirmed:
+            what = (
+                f"the Gaussians are off their pixels by a median of up to {self.worst_px:.1f} px: those of each view"
+                " were moved to its camera, since the photos agree better from there"
+            )
+        return f"{what}, {describe_moves(self.moves)}"
 
 
 def max_pixels(width: int, height: int) -> float:
@@ -92,11 +113,18 @@ def max_pixels(width: int, height: int) -> float:
 
 
 def move_cameras(
-    pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks"
+    pairs: Correspondences,
+    cameras: Cameras,
+    names: tuple[str, ...],
+    source: str = "Ks",
+    images: np.ndarray = NO_IMAGES,
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 
-    Raises SceneError, which names ``source``, where the intrinsics rather than the poses are wrong.
+    ``images [c,h,w,3]`` are photos that may show the given poses to be right.
+
+    Where the intrinsics rather than the poses are wrong, principal points in the middle, which are likely no more than
+    assumed, are moved; other intrinsics raise SceneError, which names ``source``.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_pixels(cameras.width, cameras.height):
@@ -112,9 +140,34 @@ def move_cameras(
     after = check_pairs(pairs, moved)
     if not after.ok:
         return None
-    _check_intrinsics(pairs, cameras, before.worst_px, after.worst_px, source)
+    other = _fit_intrinsics(pairs, cameras, after.worst_px)
+    if other is not None:
+        _check_assumed(cameras, other, before.worst_px, source)
+        return MovedCameras(other, before.worst_px, [])
     depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
-    return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth))
+    confirmed = len(images) > 0 and _photos_confirm(pairs, images, cameras, moved)
+    return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth), confirmed)
+
+
+def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
+    """Return whether photos agree better from the given poses, each with the Gaussians of its view, than moved."""
+    motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
+    points = matmul(motions[:, :3, :3], pairs.points[:, :, None])[..., 0] + motions[:, :3, 3]
+    return _disagreement(points, pairs, images, given) < CLEAR * _disagreement(pairs.points, pairs, images, moved)
+
+
+def _disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
+    """Measure the median distance of colours between photos of the same points; inf where only one shows each."""
+    x, y = pairs.pixels.astype(np.int64).T
+    own, errors = photo_colors(images, pairs.views, y, x), []
+    for view in range(len(cameras)):
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
+        inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1) & (pairs.views != view)
+        column, row = xy[inside].astype(np.int64).T
+        errors.append(np.abs(photo_colors(images, np.full(len(row), view), row, column) - own[inside]).mean(1))
+    values = np.concatenate(errors)
+    return float(np.median(values)) if len(values) else np.inf
 
 
 def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,10 +188,10 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     return slopes[:, 0], heights[:, 0], errors
 
 
-def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float, moved_px: float, source: str) -> None:
-    """Raise SceneError if one change of all intrinsics fits the Gaussians as well as moved poses do."""
+def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
+    """Change all intrinsics in one way that fits the Gaussians as well as moved poses do; None if none does."""
     if len(np.unique(pairs.views)) < 2:  # in one view a turn and a shift of the picture are one
-        return
+        return None
     with np.errstate(all="ignore"):
         places, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     good = (depth[:, 0] > 0) & np.isfinite(places[:, 0]).all(1)
@@ -147,10 +200,18 @@ def _check_intrinsics(pairs: Correspondences, cameras: Cameras, before_px: float
     factors, shifts = np.array(axes)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
-    other = check_pairs(pairs, replace(cameras, Ks=Ks))
-    if not (other.ok and other.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX)):
+    other = replace(cameras, Ks=Ks)
+    check = check_pairs(pairs, other)
+    return other if check.ok and check.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX) else None
+
+
+def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:
+    """Raise SceneError if intrinsics that fit differ in more than principal points that were in the middle."""
+    factors = other.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
+    middle = cameras.width / 2, cameras.height / 2
+    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= SAME_FOCAL).all():
         return
-    x, y = (Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+    x, y = (other.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
     raise SceneError(
         source,
         f"expected intrinsics that fit the Gaussians, found others, under which they lie {before_px:.1f} px off their"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import islice
 from pathlib import Path
 
@@ -38,8 +39,11 @@ _STEP = 1.06  # from one that is tried to the next
 _STEPS = 48  # so that the last is four sides
 _FEW_SAMPLES = 3000  # Gaussians that are compared with the photos at each of these
 _SAMPLES = 20_000  # and near the best
-_SPANS = (0.08, 0.02, 0.005, 0.00125)  # shares around the best that are searched next
+_SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # shares of it around the best that are searched next
+_ROUNDS, _FEWER = 8, 4  # of the first of them, at most, where pixels are far from square; with every fourth Gaussian
 _HALF = 4  # places on either side in each
+_ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))  # of intrinsics, changed in turn
+_CHANGES = [np.array([[float((i, j) in entries) for j in range(3)] for i in range(3)]) for entries in _ENTRIES]
 
 
 @dataclass(frozen=True)
@@ -50,18 +54,21 @@ class _Pictures:
     images: np.ndarray  # ``[v,h,w,3]`` float32, small
     ratio: float  # of their side to the photos'
 
-    def cameras(self, viewmats: np.ndarray, focal: float) -> Cameras:
-        """Make cameras of poses ``[c,4,4]`` and a focal length in pixels of the small pictures."""
+    def pinhole(self, focal: float) -> np.ndarray:
+        """Make the usual intrinsics of a focal length in pixels of the small pictures."""
         height, width = self.images.shape[1:3]
-        K = make_pinhole(focal, focal, width / 2, height / 2)
+        return make_pinhole(focal, focal, width / 2, height / 2)
+
+    def cameras(self, viewmats: np.ndarray, K: np.ndarray) -> Cameras:
+        """Make cameras of poses ``[c,4,4]`` and intrinsics in pixels of the small pictures."""
+        height, width = self.images.shape[1:3]
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
 def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile | None:
     """Estimate the intrinsics of cameras that have only poses; return cameras and a note, or None if that fails.
 
-    ``camera_file`` has only poses; ``photos`` are c pictures ``[h,w,3]`` uint8, or empty. Where the focal length
-    follows only from the photos, pixels are taken to be square, and the principal point to be in the middle.
+    ``camera_file`` has only poses; ``photos`` are c pictures ``[h,w,3]`` uint8, or empty.
     """
     camera_size = int(camera_file.widths[0]), int(camera_file.heights[0])
     size = photo_size(photos) or camera_size
@@ -146,8 +153,8 @@ def _intrinsics_of_colors(
         best = max(range(len(focals)), key=lambda number: checks[number].score)
         if checks[best].ok and not math.isnan(checks[best].color_ratio):
             many = _sample(ply, _SAMPLES)
-            focal = _refine(many, pictures, viewmats, focals[best]) / pictures.ratio
-            return make_pinhole(focal, focal, size[0] / 2, size[1] / 2)
+            K = _refine(many, pictures, viewmats, focals[best])
+            return K * np.array([1 / pictures.ratio, 1 / pictures.ratio, 1])[:, None]
     return None
 
 
@@ -172,21 +179,31 @@ def _small_pictures(photos: Photos, size: Size) -> _Pictures:
 def _check(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> CameraCheck:
     """Measure how well the views show the Gaussians with a focal length."""
     valid = np.ones(len(gaussians), bool)
-    return check_cameras(gaussians, valid, pictures.cameras(viewmats, focal), pictures.images)
+    return check_cameras(gaussians, valid, pictures.cameras(viewmats, pictures.pinhole(focal)), pictures.images)
 
 
-def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> float:
-    """Search for the focal length with the smallest colour distance in ever smaller steps."""
+def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, focal: float) -> np.ndarray:
+    """Search for the intrinsics ``[3,3]`` with the smallest colour distance, each in turn, in ever smaller steps."""
     points = gaussians.means.astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1)
 
-    def color_error(place: float) -> float:
-        return _color_error(points, colors, pictures.cameras(viewmats, place), pictures.images)
+    def search(K: np.ndarray, span: float) -> np.ndarray:
+        rows = slice(None, None, _FEWER if span == _SPANS[0] else 1)
 
-    for span in _SPANS:
-        places = [focal * (1 + span * step / _HALF) for step in range(-_HALF, _HALF + 1)]
-        focal = min(places, key=color_error)
-    return focal
+        def color_error(K: np.ndarray) -> float:
+            return _color_error(points[rows], colors[rows], pictures.cameras(viewmats, K), pictures.images)
+
+        for change in _CHANGES:
+            steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
+            K = min((K + focal * span * step / _HALF * change for step in steps), key=color_error)
+        return K
+
+    K = pictures.pinhole(focal)
+    for _ in range(_ROUNDS):
+        before, K = K, search(K, _SPANS[0])
+        if np.array_equal(K, before):
+            break
+    return reduce(search, _SPANS[1:], K)
 
 
 def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, images: np.ndarray) -> float:

@@ -111,7 +111,8 @@ class Fit:
 def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -> Fit | None:
     """Choose the fit that is nearest to its pixels, or among similar fits the one whose photos have the right colours.
 
-    ``read`` resizes the photos to a grid. None where a grid of another size is about as near; SceneError where poses in
+    ``read`` resizes the photos to a grid. None where a grid of another size is about as near
+    and no photos decide; SceneError where poses in
     another convention are.
     """
     best = min(fits, key=lambda fit: fit.px, default=None)
@@ -125,7 +126,11 @@ def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -
         raise SceneError(best.grid.camera_file.path, problem, "convert them to the format's own")
     exact = best.recovery.best.layout.kind != "pruned"  # what lacks pixels fits into grids of nearly its size as well
     if exact and any(fit.grid.size != best.grid.size for fit in rivals):
-        return None
+        colors = [color_error(read(fit.grid), fit.recovery.best.layout) for fit in rivals]  # NaN without photos
+        best = rivals[int(np.argmin(colors))]
+        others = [color for fit, color in zip(rivals, colors, strict=True) if fit.grid.size != best.grid.size]
+        if not min(others) >= COLOR_MARGIN * min(colors):
+            return None
     near = max(_SAME * best.px, best.px + _SAME_PX)
     same = (fit for fit in fits if fit.grid.camera_file is best.grid.camera_file and fit.grid.size == best.grid.size)
     same_px = [fit for fit in same if fit.px <= near]

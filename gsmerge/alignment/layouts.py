@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras
+from gsmerge.io.cameras.camera_file import PATCH, CameraFile, sizes_of, to_cameras
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.image_names import natural_key
@@ -23,11 +23,13 @@ TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at eve
 _MAX_TRIM = 0.25  # of the shorter side, cut off at every side
 PER_PIXEL = (1, 2, 3, 4, 16)  # Gaussians per pixel that backbones write
 DEPTH_SHARE = 0.9  # of each view's pixels, the nearest ones, that Depth Anything 3 keeps
-PATCH = 14  # sides of vision transformers' inputs are multiples of it
 SIDES = (504, 518)  # to which Depth Anything 3 and others resize the longer or the shorter side, pixels
 SQUARE = 256  # side of the pictures of pixelSplat and its relatives, pixels
 _ROUND = (8, PATCH)  # sides of grids that photos are cropped to are multiples of one of them
+_STRETCHED, _MAX_STRETCH = 16, 0.15  # multiples of its sides, to which ReSplat stretches photos, and by how much
 _MIN_KEPT = 0.5  # of a photo's area, when it is cropped
+_MIN_ROWS = 0.5  # of the pixels of half the photos' size, where rows may be of those that were not dropped
+_NEAR_SIZE = 0.05  # of the longer side, by which cameras' sizes may differ that are no more than assumed
 _MAX_ENLARGED = 1.5  # times the side of a photo; some networks enlarge small ones
 
 
@@ -258,6 +260,7 @@ class GridFit:
     # network's usual sizes (3)
     rank: int = 0
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses that the photos confirm, to which Gaussians are to be moved
 
     @property
     def size(self) -> Size:
@@ -268,6 +271,18 @@ class GridFit:
     def guessed(self) -> bool:
         """Whether the size was guessed from the number of rows, which many other sizes would fit as well."""
         return self.rank in (1, 2)
+
+
+def with_photo_size(camera_file: CameraFile, size: Size | None, most: float = 1) -> CameraFile:
+    """Return the cameras with the photos' size if theirs is up to ``most`` pixels off, as twice a principal point is.
+
+    The same cameras where it is not.
+    """
+    stored = sizes_of(camera_file)
+    if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= most:
+        return camera_file
+    widths, heights = (np.full_like(camera_file.widths, side) for side in size)
+    return replace(camera_file, widths=widths, heights=heights)
 
 
 def photo_grid(camera_file: CameraFile, size: Size | None) -> GridFit:
@@ -329,14 +344,19 @@ def other_grids(ply: FileInfo, camera_file: CameraFile, size: Size | None) -> It
     base = size or camera_size
     if base is None or any(not same_shape(s, base) for s in sizes):
         return
-    cameras = to_cameras(camera_file, base)
+    near = with_photo_size(camera_file, base, _NEAR_SIZE * max(base))
+    files = [camera_file] + [near] * (near is not camera_file)
     what = "photos and cameras" if size is not None else "cameras"
-    ranked = [(2 if t.crops else 1, t) for t in grids_of_count(ply.count, len(camera_file), base)]
+    by_count = grids_of_count(ply.count, len(camera_file), base)
+    ranked = [(2 if t.crops or not same_shape((t.width, t.height), base) else 1, t) for t in by_count]
     if ply.sh_degree == 0 and ply.opacity_encoding == "logit":
-        ranked += [(3, t) for t in patch_grids(base) if ply.count < len(camera_file) * t.width * t.height]
+        kept = ply.count / len(camera_file)
+        halves = (resize_to(base, half) for half in _half_sizes(base) if kept >= _MIN_ROWS * half[0] * half[1])
+        ranked += [(3, t) for t in (*patch_grids(base), *halves) if kept < t.width * t.height]
     for rank, transform in ranked:
         note = f"{what} of {base[0]} x {base[1]} are {transform.description}, the Gaussian grid's size"
-        yield GridFit(camera_file, transform.cameras(cameras), transform, (note,), rank)
+        for file in files:
+            yield GridFit(file, transform.cameras(to_cameras(file, base)), transform, (note,), rank)
         if not sizes and transform.crops:
             whole = to_cameras(camera_file, (transform.width, transform.height))
             yield GridFit(camera_file, whole, transform, (f"{note}; the intrinsics are those of the result",), rank)
@@ -370,8 +390,17 @@ def grids_of_count(count: int, views: int, size: Size) -> Iterator[PhotoTransfor
                     yield resize_to(size, to)
                 is_round = to[0] == to[1] or any(to[0] % side == to[1] % side == 0 for side in _ROUND)
                 if to[0] * to[1] < size[0] * size[1] and min(aspect, 1 / aspect) >= _MIN_KEPT and is_round:
-                    crops.append(resize_and_crop(size, to))
-    yield from (crop for crop in crops if crop.crops)
+                    stretched = abs(aspect - 1) <= _MAX_STRETCH and to[0] % _STRETCHED == to[1] % _STRETCHED == 0
+                    crops += [resize_to(size, to)] * stretched + [resize_and_crop(size, to)]
+    for width, height in _half_sizes(size):
+        if views * da3_box(width, height).pixels(width, height).size == count:
+            yield resize_to(size, (width, height))
+    yield from (crop for crop in crops if crop.crops or not same_shape((crop.width, crop.height), size))
+
+
+def _half_sizes(size: Size) -> Iterator[Size]:
+    """Yield the sizes at which Lyra 2 writes Gaussians: half the photos', or half of these as multiples of 14."""
+    yield from product(*({side // 2, PATCH * round(side / PATCH) // 2} for side in size))
 
 
 def _sizes_of_area(pixels: int, trim: int, size: Size) -> Iterator[Size]:

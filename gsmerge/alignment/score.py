@@ -296,7 +296,7 @@ def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
-    """Measure the mean distance, 0 to 1, between base colours and photos at a layout's pixels; NaN without photos."""
+    """Measure the mean distance, 0 to 1, between base colours and photos at a layout's pixels; NaN without either."""
     return _color_distance(inputs, inputs.pairs(sample_layout(layout)))
 
 
@@ -304,6 +304,8 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
     if not len(pairs.rows):
         return math.nan
     base = sh0_to_rgb(gather(inputs.gaussians.sh0, pairs.rows)[:, 0])
+    if (base == base[0]).all():  # depth maps without images
+        return math.nan
     x, y = pairs.pixels.astype(np.int64).T
     colors = photo_colors(inputs.images, pairs.views, y, x)
     return float(np.abs(base.clip(0, 1) - colors).mean(1).mean())

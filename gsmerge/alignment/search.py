@@ -25,11 +25,12 @@ from gsmerge.alignment.layouts import (
     square_grids,
     subsample,
     view_orders,
+    with_photo_size,
 )
 from gsmerge.alignment.readings import is_seen, possible_layouts, read_grid
 from gsmerge.alignment.score import AlignmentInput, scale_by, score_layout
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity
+from gsmerge.geometry import IDENTITY, Similarity, mean_pose_frame
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
@@ -55,6 +56,7 @@ class AlignmentResult:
     transform: PhotoTransform | None = None  # what was done to the photos
     recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses to which each view's Gaussians are yet to be moved with it
     problem: str | None = None  # why the rows belong to no pixels; None where they do
 
     @property
@@ -159,13 +161,16 @@ def align(
         SceneError: If sizes do not agree, several conventions fit, the Gaussians are not those of the cameras' views,
             or other cameras would make pixels of the rows.
     """
+    camera_file = with_photo_size(camera_file, photo_size(photos))
     source = _Source(ply, camera_file, photos, order, scale, depths)
     try:
         grid = photo_grid(camera_file, photo_size(photos))
     except SceneError:
         fit = source.choose(_fit_other_sizes(source))
-        if fit is None:
+        cropped = _cropped_grid(source) if fit is None else fit.grid
+        if cropped is None:
             raise
+        grid = cropped
     else:
         fit = _fit_estimated(source, grid) or source.choose(_fit_rounds(source, grid))
     return _choose_cameras(source, grid, frames) if fit is None else _make_result(source, fit)
@@ -180,6 +185,20 @@ def _fit_estimated(source: _Source, grid: GridFit) -> Fit | None:
     layout = dropped_layout(pixel_ids, len(grid.cameras), *grid.size)
     recovery = accept_reading(inputs, [score_layout(inputs, layout, IDENTITY)])
     return None if recovery is None else Fit(grid, recovery)
+
+
+def _cropped_grid(source: _Source) -> GridFit | None:
+    """Return photos resized or cropped to the cameras' size that show the colours of rows; None if none do."""
+    from gsmerge.alignment.unaligned import check_cameras
+
+    best, least = None, 0.0
+    for grid in other_grids(source.ply.info, source.camera_file, photo_size(source.photos)):
+        if grid.rank == 0:
+            inputs = source.inputs(grid)
+            check = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, inputs.images)
+            if check.ok and not math.isnan(check.color_ratio) and check.score > least:
+                best, least = grid, check.score
+    return best
 
 
 def _choose_cameras(source: _Source, grid: GridFit, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
@@ -254,6 +273,9 @@ def _fit_rounds(source: _Source, grid: GridFit) -> Iterator[list[Fit]]:
     rows = source.ply.gaussians, source.ply.valid
     grids = (_with_poses(grid, other) for other in _conventions(source.camera_file))
     yield source.fit(other for other in grids if check_cameras(*rows, other.cameras, NO_IMAGES).ok)
+    moved = _in_mean_pose(grid)
+    if source.scale is None and check_cameras(*rows, moved.cameras, source.inputs(grid).images).ok:
+        yield source.fit([moved])
     yield from other_sizes
 
 
@@ -278,6 +300,13 @@ def _with_poses(grid: GridFit, camera_file: CameraFile) -> GridFit:
     return replace(grid, camera_file=camera_file, cameras=replace(grid.cameras, viewmats=camera_file.viewmats))
 
 
+def _in_mean_pose(grid: GridFit) -> GridFit:
+    """Return a grid whose cameras are moved into their mean pose."""
+    frame = mean_pose_frame(grid.camera_file.viewmats)
+    moved = _with_poses(grid, replace(grid.camera_file, viewmats=frame.move_viewmats(grid.camera_file.viewmats)))
+    return replace(moved, notes=(*grid.notes, f"the cameras are {frame.description}"))
+
+
 def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
     """Fit a grid without missing pixels by slightly moved cameras; nothing if that does not fit.
 
@@ -295,10 +324,13 @@ def _fit_moved(source: _Source, grid: GridFit) -> list[Fit]:
         if score_layout(other_inputs, best.layout, IDENTITY).ok:
             return []
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
-    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, str(source.camera_file.path))
+    names, path = source.camera_file.names, str(source.camera_file.path)
+    moved = move_cameras(pairs, grid.cameras, names, path, inputs.images)
     if moved is None:
         return []
-    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moved.moves)
+    given = grid.cameras.viewmats if moved.confirmed else None
+    moves = () if moved.confirmed else moved.moves
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
     return [fit for fit in source.fit([grid], exact_frames=True) if fit.recovery.confirmed is not False]
 
 
@@ -350,4 +382,5 @@ def _make_result(source: _Source, fit: Fit) -> AlignmentResult:
         transform=grid.transform,
         recovery=fit.recovery,
         moves=grid.moves,
+        given=None if grid.given is None else frame.move_viewmats(grid.given),
     )

@@ -11,7 +11,7 @@ smallest size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,9 +20,8 @@ from gsmerge.geometry import (
     camera_depths,
     motion_matrices,
     motion_vectors,
-    multiply_quats,
+    move_views,
     project,
-    rotmat_to_quat,
     without_common_motion,
 )
 from gsmerge.kernels.elementary import log, log1p
@@ -30,7 +29,7 @@ from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.raster.photos import NEAR, photos_of
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import PicturedScene, SceneT
+from gsmerge.types import PicturedScene
 
 SIDES = (60, 120, 240)  # longer side of the photos, pixels, one after the other
 MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photos say too little
@@ -106,25 +105,6 @@ def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = Fa
     placed = sorted({view for pair in pairs for view in pair})  # the others stay where they are
     viewmats[placed] = without_common_motion(start[placed], viewmats[placed], np.median)
     return move_views(scene, viewmats)
-
-
-def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
-    """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
-
-    Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
-    """
-    g, size = scene.gaussians, scene.pixels_per_view
-    motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
-    turns, (means, quats) = rotmat_to_quat(motions[:, :3, :3]), (np.empty_like(a) for a in (g.means, g.quats))
-
-    def move(view: int) -> None:
-        rows = slice(view * size, (view + 1) * size)
-        means[rows] = matmul(g.means[rows], motions[view, :3, :3].T) + motions[view, :3, 3]
-        quats[rows] = multiply_quats(turns[view], g.quats[rows])
-
-    parallel_map(move, range(len(scene)))
-    gaussians = replace(g, means=means, quats=quats)
-    return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
 
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> list[tuple[int, int]]:

@@ -18,9 +18,9 @@ import numpy as np
 
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.facts.align_views import move_views
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
+from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.scene.exporters import AUTO

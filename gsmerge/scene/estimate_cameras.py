@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from gsmerge import alignment
-from gsmerge.errors import SceneError
 from gsmerge.geometry import correlation
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
 from gsmerge.io.formats.read import GaussianFile
@@ -46,10 +45,7 @@ def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -
 
 
 def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile | None:
-    """Estimate cameras of the photos in a folder; None where rows and photos do not tell.
-
-    SceneError where the rows are a grid whose views no photo shows.
-    """
+    """Estimate cameras of the photos in a folder, or of a grid that none of them shows; None for other rows."""
     paths = list_images(folder)
     size = image_size(paths[0]) if paths else (0, 0)
     names = [photo.relative_to(folder).as_posix() for photo in paths]
@@ -57,12 +53,7 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile 
     cameras = alignment.estimate_cameras(path, *rows, names, *size)
     if cameras is not None:
         return cameras
-    cameras = estimate_grid(ply, path, paths, folder)
-    if cameras is not None and paths and cameras.photo_map is None:
-        grid = f"{len(cameras)} views of {cameras.widths[0]} x {cameras.heights[0]} pixels"
-        problem = f"expected photos of the {grid} whose grid the Gaussians are"
-        raise SceneError(folder, f"{problem}, found {len(paths)} images that do not show them", "name another folder")
-    return cameras
+    return estimate_grid(ply, path, paths, folder)
 
 
 def estimate_grid(

@@ -134,7 +134,8 @@ _EXPORTERS = (
             ),
             Model(
                 "Lyra 2", "nv-tlabs/lyra 67392d9",
-                "`reconstructed_scene.ply`, every pixel of half the size; `cameras.npz`", "read right with its frames",
+                "`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
+                "read right with its frames",
                 "reconstructed_scene.ply", "its cameras.npz has the cameras: keep it beside the file",
             ),
         ),
@@ -342,6 +343,11 @@ _EXPORTERS = (
                 "read right with the data set's file of cameras",
                 brings="the data set's .json file has the cameras: name it with --cameras",
             ),
+            Model(
+                "tttLRM", "cwchenwang/tttLRM 1d133c2",
+                "`gaussians_001.ply` in the mean pose of its cameras, without faint rows; no cameras",
+                "read right with cameras of its views alone",
+            ),
         ),
         "logit", "view-major", ("full", "pruned"), _ANY, degrees=(3,), byte_columns=_NORMALS,
     ),
@@ -360,8 +366,8 @@ _EXPORTERS = (
                 f"{_NO_PIXELS}; name the photos", *_TRAINED,
             ),
             Model(
-                "InstantSplat", "NVlabs/InstantSplat 3c29c20", "as INRIA 3DGS", f"{_NO_PIXELS}; name the photos",
-                *_TRAINED,
+                "InstantSplat", "NVlabs/InstantSplat 3c29c20; `train.py` 3bb6a7f",
+                "as INRIA 3DGS; `pose/ours_N/pose_optimized.npy`", f"{_NO_PIXELS}; name the photos", *_TRAINED,
             ),
             Model("ZipSplat", "cvg/ZipSplat 69fd35b", "`scene.ply` of tokens and a film; no cameras", _WITH_CAMERAS),
             Model(

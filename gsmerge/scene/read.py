@@ -23,10 +23,10 @@ from gsmerge.alignment import (
     read_rotations,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, rgb_to_sh0
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras
+from gsmerge.geometry import Similarity, move_views, rgb_to_sh0
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
-from gsmerge.io.cameras.read import holds_images, read_depths
+from gsmerge.io.cameras.read import CAMERA_PLACES, holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
@@ -50,7 +50,6 @@ from gsmerge.scene.views import (
     find_larger_and_masks,
     limit_photo_size,
     limit_view_size,
-    photos_without_cameras,
     read_scene_cameras,
     stored_photos,
 )
@@ -247,6 +246,7 @@ def align_scene(
     order = default_order if hints.order == "auto" else hints.order
     files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
     pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else ())
+    pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
@@ -268,13 +268,12 @@ def align_scene(
 
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views, which are placed later; SceneError if there are photos to use."""
+    """Make a scene without views, which are placed later; photos are not used, with a note."""
     option = find_cameras_of_model(ply.info)
     notes = [option] if option else []
     if files.images is not None:
-        if hints.order != "none":
-            raise photos_without_cameras(files, option)
-        notes += [f"the photos in {files.images} are not used: no cameras fit them"]
+        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
+        notes += [f"the photos in {files.images} are not used: no cameras that fit them (looked for {places})"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
@@ -313,6 +312,9 @@ def _make_load(
         scene, note = _put_back(scene, camera_file, layout, views)
         scene, turned = _with_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
+        if result.given is not None:
+            scene = move_views(scene, result.given[views])
+            result = replace(result, cameras=replace(result.cameras, viewmats=result.given))
         alignment = check_alignment(scene.gaussians, scene.cameras, scene.stored)
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
@@ -426,8 +428,7 @@ def _with_rotations(
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
 
-    ``photos`` that cannot be read raise an error; with False photos are left out. SceneError if cameras have no size,
-    or there are photos without cameras.
+    ``photos`` that cannot be read raise an error; with False photos are left out. SceneError if cameras have no size.
     """
     camera_file = read_scene_cameras(ply, files)
     if camera_file is None:

@@ -14,7 +14,7 @@ from gsmerge.alignment import ESTIMATED
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.embedded import SHARP
-from gsmerge.io.cameras.read import CAMERA_PLACES, CHUNK, read_cameras, read_sharp_camera
+from gsmerge.io.cameras.read import CHUNK, read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import (
@@ -85,9 +85,15 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
 def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile) -> tuple[SceneFiles, list[str]]:
     """Choose the photos that the model saw if the photos beside them do not show the scene, with a note.
 
-    WorldMirror squeezes tall photos into ``images``, and crops them in ``images_resized``.
+    WorldMirror squeezes tall photos into ``images``, and crops them in ``images_resized``. Photos that none of the
+    views of an estimated grid was found in are left out.
     """
     usual = files.images
+    unnamed = camera_file.source == ESTIMATED and camera_file.names[0] == "view 0"
+    if unnamed and usual is not None and usual.is_dir():
+        grid = f"{len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
+        note = f"the photos in {usual} are not used: they do not show the {grid} whose grid the Gaussians are"
+        return replace(files, images=None), [note]
     if usual is None or usual.name == _SEEN_PLACE or not (usual.parent / _SEEN_PLACE).is_dir():
         return files, []
     seen = usual.parent / _SEEN_PLACE
@@ -105,14 +111,6 @@ def choose_photos(ply: GaussianFile, files: SceneFiles, camera_file: CameraFile)
         return files, []
     note = f"photos are those of {_SEEN_PLACE}: their colours are those of the Gaussians, those of {usual.name} are not"
     return (replace(files, images=seen), [note]) if better else (files, [])
-
-
-def photos_without_cameras(files: SceneFiles, option: str) -> SceneError:
-    """Make the error for photos without known cameras; ``option`` says what brings them, if that is known."""
-    places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-    problem = f"the photos in {files.images} are there, but no cameras that fit them (looked for {places})"
-    remedy = "name the cameras with --cameras, or do without cameras and photos by --hint order=none"
-    return SceneError(files.ply, problem, f"{option}; {remedy}" if option else remedy)
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:

@@ -41,6 +41,8 @@ COMPACTNESS = 1e-5  # of squared pixels against squared colours; without it regi
 # Largest side of a region, as a share of the image's longer side: the rasterizer's affine approximation bends larger
 # Gaussians. Exceeded only where the budget leaves no other choice.
 MAX_EXTENT = 1 / 8
+FEW_PIXELS = 1 << 18  # of a few small photos
+FEW = 0.5  # times the photos' pixels, up to those: of fewer Gaussians a share is one of pixels, and this one at most
 KNEE_STEP = 1.25  # the slope of the curve is taken over this factor of the count
 KNEE_SLOPE = 1.0  # dB of predicted quality per relative increase of the count: below it, more are not worth it
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no count removes (noise, views that disagree)
@@ -159,12 +161,25 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the superpixels per view.
 
-    A share refers to the Gaussians if there are fewer Gaussians than pixels.
+    A share refers to the Gaussians if there are fewer Gaussians than pixels, unless they are few.
     """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
-    return max(1, min(per_view, int(segment.share * scene.num_gaussians / scene.num_views)))
+    count = segment.share * scene.num_gaussians
+    if has_few_rows(scene):
+        count = max(count, min(segment.share * _few_pixels(scene), FEW * scene.num_gaussians))
+    return max(1, min(per_view, int(count / scene.num_views)))
+
+
+def has_few_rows(scene: SceneSize) -> bool:
+    """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
+    shown = scene.photos and not scene.drawn and not scene.aligned
+    return shown and scene.num_gaussians < FEW * _few_pixels(scene)
+
+
+def _few_pixels(scene: SceneSize) -> int:
+    return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
 
 
 def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:

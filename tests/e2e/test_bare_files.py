@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import unaligned_scenes
-from messages import noted, says
+from messages import noted
 
 import gsmerge
 from gsmerge import Gaussians
@@ -117,13 +117,20 @@ def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Pa
     assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
 
 
-def test_photos_without_cameras(bare: Path, small_scene: Path, tmp_path: Path, run: Any) -> None:
-    photos = small_scene / "images"
-    refused = run("compact", bare, "--images", photos, "-o", tmp_path / "a.ply", code=3).err
-    assert says(refused.removeprefix("gsmerge: error: "), "scene.ply", photos, "no cameras", "--cameras", "order=none")
-    words = ("--images", photos, "--hint", "order=none", "--budget", "20%")
-    report = report_of(run, "compact", bare, *words, "-o", tmp_path / "b.ply")
-    assert noted(report["notes"], photos, "not used", "no cameras")
+@pytest.mark.parametrize("named", [True, False])
+def test_photos_without_cameras_change_nothing(
+    bare: Path, small_scene: Path, tmp_path: Path, run: Any, named: bool
+) -> None:
+    photos, scene = small_scene / "images", bare
+    if not named:
+        scene = shutil.copy(bare, tmp_path)
+        photos = shutil.copytree(photos, tmp_path / "images")
+    quick = ("--budget", "20%", "--effort", "draft")
+    report = report_of(run, "compact", scene, *(("--images", photos) * named), *quick, "-o", tmp_path / "a.ply")
+    assert sum(noted([note], photos, "not used", "no cameras", "transforms.json") for note in report["notes"]) == 1
+    assert sum(noted([note], *PLACED) for note in report["notes"]) == 1
+    run("compact", bare, *quick, "-o", tmp_path / "b.ply", code=0)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
 def test_photos_are_used_with_order_none_where_cameras_are_known(small_scene: Path, tmp_path: Path, run: Any) -> None:

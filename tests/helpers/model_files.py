@@ -91,9 +91,11 @@ def depth_anything(formats: str, folder: Path, *, photos: int = 2) -> Export:
 
 
 def lyra(folder: Path) -> Export:
-    """Write Lyra 2's: Depth Anything 3's rows, all of them, on a grid of half the photos' size; cameras of its own."""
-    scene = made()
-    export = save_pixels(Saver("reconstructed_scene.ply"), scene, folder)
+    """Write Lyra 2's: Depth Anything 3's rows but for a border, of half the photos' size; cameras of its own."""
+    scene = made(112, 80)
+    keep = np.zeros((3, 80, 112), bool)
+    keep[:, 2:-2, 3:-3] = True
+    export = save_pixels(Saver("reconstructed_scene.ply"), scene, folder, keep)
     larger = as_photos(scene, 2)
     video = {"w2c_render": np.tile(np.eye(4), (9, 1, 1)), "intrinsics_render": np.tile(np.eye(3), (9, 1, 1))}
     Ks = np.tile(larger.K, (len(scene.c2w), 1, 1))

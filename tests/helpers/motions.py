@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge import Scene
-from gsmerge.facts.align_views import move_views
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry import motion_matrices, move_views
 
 
 def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:

@@ -31,6 +31,8 @@ _MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # of the image's longer side: fo
 _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
+PATCH = 14  # sides of vision transformers' inputs are multiples of it
+_OTHER_SIZE, _WHOLE = 0.1, 1e-3  # share by which a side differs from that of another size; pixels off a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
 
 # Of the rows of a file, which a file of cameras may name
@@ -266,6 +268,23 @@ def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
     """List the different (width, height) of a file's cameras, without unknown sizes."""
     return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
+
+
+def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
+    """Return cameras of no stored size with that of which their principal points are the middle, unless photos have it.
+
+    ``size``: of the photos. Networks make each side a multiple of ``PATCH``, of which only a rough middle is needed.
+    """
+    if size is None or camera_file.focal is None or _stored_sizes(camera_file) != [(0, 0)]:
+        return camera_file
+    sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
+    ratios = sides / size
+    alike = float(ratios.max()) < (1 + _OTHER_SIZE) * float(ratios.min())
+    if not alike or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > _OTHER_SIZE).all():
+        return camera_file
+    unit = 1 if (np.abs(sides - sides.round()) < _WHOLE).all() else PATCH
+    width, height = (np.full(len(camera_file), unit * round(side / unit)) for side in sides.tolist())
+    return replace(camera_file, widths=width, heights=height)
 
 
 def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> Cameras:

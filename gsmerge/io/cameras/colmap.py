@@ -27,6 +27,7 @@ _NAMES = {number: name for number, name, _ in _MODELS}
 _NUM_PARAMS = {name: count for _, name, count in _MODELS}
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_SAME_SHAPE, _SMALLER = 0.01, 0.9  # relative, of the sides of pictures of one shape, and of a smaller one
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 
 MAX_NAME = 1 << 16  # bytes of an image's name
@@ -99,7 +100,15 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
     K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
     distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
     lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
-    return View("", np.eye(4), K, size, lens)
+    return View("", np.eye(4), K, size if lens else _size_of(K, size), lens)
+
+
+def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the size that intrinsics are of: WorldMirror 1 writes those of what it saw with the size of the photos."""
+    own = 2 * K[:2, 2]
+    x, y = own / np.maximum(size, 1)
+    same_shape = abs(x - y) <= _SAME_SHAPE * abs(x)
+    return (int(own[0]), int(own[1])) if same_shape and x < _SMALLER and (own == np.rint(own)).all() else size
 
 
 def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, View]:

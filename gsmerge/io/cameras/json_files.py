@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, normalize
+from gsmerge.geometry import Similarity, mean_pose_frame
 from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     MAX_NORMALISED_FOCAL,
@@ -46,6 +46,7 @@ FRAMES_FILE, POSE_FILE, SCALE_FILE = "input_frame_idx.txt", "pos_avg_inv.txt", "
 FFGS = "ffgs cameras.json"  # format of cameras whose photos were resized to cover their size, and cropped
 VIEWER_CAMERAS = ".cameras.json"  # ending of the cameras for viewers beside a result
 DATAPARSER = "dataparser_transforms.json"
+_SAME_POSE = 1e-4  # difference of numbers in poses that two files write
 _CENTRED = 1e-3  # pixels by which twice a principal point in the middle may differ from the image's size
 
 
@@ -180,8 +181,8 @@ def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
 def read_inria(source: CameraSource) -> StoredCameras:
     """Read the cameras of a ``cameras.json``; SceneError if a key is missing or not a number.
 
-    It has rows of the camera-to-world rotation, and the centre; the principal point is in the middle unless ``cx`` and
-    ``cy`` say where.
+    It has rows of the camera-to-world rotation, and the centre; InstantSplat writes the poses that it optimised beside
+    it. The principal point is in the middle unless ``cx`` and ``cy`` say where.
     """
     views, path = [], source.path
     check_count(path, len(source.json))
@@ -199,7 +200,24 @@ def read_inria(source: CameraSource) -> StoredCameras:
             cx, cy = (_number(entry.get(key, half)) for key, half in middle.items())
         K = make_pinhole(fx, fy, cx, cy)
         views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
-    return StoredCameras(views)
+    return StoredCameras(_with_optimised_poses(views, path.parent / "pose"))
+
+
+def _with_optimised_poses(views: list[View], folder: Path) -> list[View]:
+    """Return views with the poses that InstantSplat optimised, where it wrote them with those that it began from."""
+    from gsmerge.io.cameras.npz_files import read_matrices  # few folders need it
+
+    found = max(folder.glob("ours_*/pose_optimized.npy"), key=lambda path: natural_key(path.parent.name), default=None)
+    before, after = (None, None) if found is None else map(read_matrices, (found.with_name("pose_org.npy"), found))
+    if before is None or after is None or not len(before) == len(after) == len(views):
+        return views
+    try:
+        began, optimised = invert(before)[:, :3], invert(after)[:, :3]
+    except np.linalg.LinAlgError:
+        return views
+    if not np.allclose([view.pose for view in views], began, rtol=_SAME_POSE, atol=_SAME_POSE):
+        return views
+    return [view._replace(pose=pose) for view, pose in zip(views, optimised, strict=True)]
 
 
 def read_ffgs(source: CameraSource) -> StoredCameras:
@@ -297,8 +315,8 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     poses = np.array([frames[i].pose for i in ids]).reshape(-1, 4, 4)
     move, scale = _numbers(pose_path), _numbers(scale_path)
     if frame_ids is not None and len(poses) and move is None and scale is None:
-        with _number_errors(path, "expected poses that can be inverted"), np.errstate(all="ignore"):
-            move, scale = _average_frame(invert(poses))
+        with np.errstate(all="ignore"):  # what overflows is refused with the cameras
+            poses = mean_pose_frame(poses).move_viewmats(poses)
     if scale is not None and (scale.size != 1 or not scale[0] > 0):
         raise SceneError(scale_path, "expected one positive number")
     if move is not None and move.size != 16:
@@ -310,19 +328,6 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     except np.linalg.LinAlgError as error:
         raise SceneError(pose_path, "expected a matrix that can be inverted") from error
     return StoredCameras([frames[i]._replace(pose=pose) for i, pose in zip(ids, poses, strict=True)])
-
-
-def _average_frame(c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the map ``[16]`` into the mean pose of cameras, and the scale ``[1]`` that brings them within +-1."""
-    mean = np.eye(4)
-    forward, down = c2w[:, :3, 2].mean(0), c2w[:, :3, 1].mean(0)
-    mean[:3, 2] = normalize(forward)
-    mean[:3, 1] = normalize(down - (down * mean[:3, 2]).sum() * mean[:3, 2])
-    mean[:3, 0] = np.cross(mean[:3, 1], mean[:3, 2])
-    mean[:3, 3] = c2w[:, :3, 3].mean(0)
-    move = invert(mean)
-    farthest = float(np.abs(matmul(move, c2w)[:, :3, 3]).max())
-    return move.reshape(-1), np.array([1 / farthest if farthest > 0 else 1.0])
 
 
 def _numbers(path: Path) -> np.ndarray | None:

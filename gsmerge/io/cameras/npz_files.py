@@ -14,16 +14,18 @@ import re
 import warnings
 import zipfile
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
-from gsmerge.io.bounds import check_pixels, read_budget
+from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import Photos
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
@@ -31,8 +33,9 @@ _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _L
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 READ_ARRAYS = frozenset((*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS, "c2w", "K", "order"))
-_MAX_INTRINSIC, _SMALL = 1e12, 1e-9
+_MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
 _MAX_HEADER = 1 << 16  # bytes of an array's header
+_POINTS, _SAMPLES = "world_points", 1000  # of each view, by which poses are read
 _KINDS = "biufU"
 
 
@@ -46,7 +49,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
 
     Intrinsics that are normalised, or of another image size than the depth maps (as after a COLMAP export in the same
     call), are scaled to the depth maps. Other readable files: ``cameras.npz`` of Lyra 2; the output of VGGT
-    (``extrinsic``, world to camera); the output of AnySplat (the same, camera to world, normalised, in a batch of one).
+    (``extrinsic``, world to camera), of MapAnything (camera to world, as its points show) and of AnySplat (the same,
+    normalised, in a batch of one).
     SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
@@ -66,12 +70,26 @@ def read_da3(source: CameraSource) -> StoredCameras:
     width = height = 0
     if grid is not None and grid.ndim >= 3 and min(grid.shape[1:3]) > 0:
         height, width = grid.shape[1:3]
-        Ks = None if Ks is None else _at_size(Ks, width, height)
+        Ks = None if Ks is None else _at_size(_without_colmap_scale(path, Ks, width, height), width, height)
     elif Ks is not None:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # normalised: AnySplat's
         return StoredCameras(_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    return StoredCameras(_views(poses, Ks, (width, height)), photos)
+    convention = C2W_OPENCV if _POINTS in array_names(path) and _are_camera_to_world(path, poses) else None
+    return StoredCameras(_views(poses, Ks, (width, height)), photos, convention=convention)
+
+
+def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
+    """Return whether the stored points of the pixels lie at the depths of the maps if poses are camera-to-world."""
+    points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
+    if depths is None or len(depths) != len(poses) or points.shape != (*depths.shape, 3) or not points.size:
+        return False
+    few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLES))
+    z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
+    rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
+    found = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
+    as_w2c, as_c2w = (float(np.median(np.abs(depth - z[..., 0]))) for depth in found)
+    return as_c2w < as_w2c
 
 
 def read_dump(source: CameraSource) -> StoredCameras:
@@ -186,6 +204,18 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
+def _without_colmap_scale(path: Path, Ks: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Scale intrinsics to the depth maps that a COLMAP export of the same call has scaled to the photos' sizes."""
+    folder = path.parent.parent.parent
+    for suffix in (".bin", ".txt"):
+        with suppress(SceneError):
+            views = read_colmap(CameraSource(folder), suffix).views
+            sizes = np.array([view.size for view in views], np.float64).reshape(-1, 2, 1).clip(min=1)
+            if len(views) == len(Ks) and np.allclose(np.array([view.K for view in views]), Ks, rtol=_SAME):
+                return Ks * np.insert([[width], [height]] / sizes, 2, 1, axis=1)
+    return Ks
+
+
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     """Scale intrinsics to an image size with the principal point in the middle, as these networks assume."""
     size = np.array([width, height])
@@ -215,7 +245,7 @@ def array_shape(path: Path, name: str) -> tuple[int, ...]:
     """Read the shape of an array in an ``.npz`` from its header; empty if it is missing or cannot be read."""
     try:
         with open_archive(path) as archive:
-            return _read_header(archive, _members(archive)[name])[0]
+            return _read_header(archive.open(_members(archive)[name]))[0]
     except Exception:  # whatever a damaged archive makes the libraries raise
         return ()
 
@@ -247,7 +277,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    name, (shape, dtype) = info.filename, _read_header(archive, info)
+    name, (shape, dtype) = info.filename, _read_header(archive.open(info))
     if dtype.kind not in _KINDS:
         kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
         raise SceneError(path, f"{name}: expected numbers, found {kind}")
@@ -257,10 +287,20 @@ def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
-def _read_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    with archive.open(info) as file:
-        start = io.BytesIO(file.read(_MAX_HEADER))
+def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    with stream:
+        start = io.BytesIO(stream.read(_MAX_HEADER))
     first = np.lib.format.read_magic(start) == (1, 0)
     read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
     shape, _, dtype = read_header(start)
     return shape, dtype
+
+
+def read_matrices(path: Path) -> np.ndarray | None:
+    """Read finite matrices ``[c,4,4]`` from a ``.npy``; None if it holds none."""
+    with suppress(Exception):  # whatever a damaged file makes the library raise
+        size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
+        if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:
+            matrices = np.load(path, allow_pickle=False).astype(np.float64)
+            return matrices if np.isfinite(matrices).all() else None
+    return None

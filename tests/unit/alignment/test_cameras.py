@@ -6,9 +6,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import motions
 import numpy as np
 import pytest
+import scenes
 from messages import names, noted, refuses
 from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
@@ -17,7 +19,8 @@ from gsmerge import compact_tensors
 from gsmerge.alignment.cameras import max_pixels, move_cameras
 from gsmerge.alignment.score import sample_pixels
 from gsmerge.errors import SceneError
-from gsmerge.geometry import pose_changes
+from gsmerge.geometry import pose_changes, project_points
+from gsmerge.io import write_gaussians
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -75,6 +78,20 @@ def test_intrinsics_that_are_off_are_no_poses_that_are(factor: float, shift: flo
         move_cameras(pairs, replace(cameras, Ks=Ks), NAMES)
 
 
+def test_principal_points_in_the_middle_are_assumed(large: Tiny) -> None:
+    """Formats such as INRIA's store none."""
+    Ks = cameras_of(large).Ks
+    Ks[:, :2, 2] = large.width / 2, large.height / 2
+    true = Ks + np.array([[0, 0, 4], [0, 0, -2], [0, 0, 0]])
+    points = sample_pixels(large.gaussians, cameras_of(large), np.ones(len(large.gaussians), bool))
+    pixels = [project_points(point[None], large.w2c[view], true[view])[0][0]
+              for point, view in zip(points.points, points.views, strict=True)]  # fmt: skip
+    moved = move_cameras(replace(points, pixels=np.array(pixels)), replace(cameras_of(large), Ks=Ks), NAMES)
+    assert np.allclose(moved.cameras.Ks, true, atol=0.05)
+    assert "(4.0, -2.0) px from the middle" in moved.note
+    np.testing.assert_array_equal(moved.cameras.viewmats, large.w2c)
+
+
 def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tmp_path: Path) -> None:
     cameras = cameras_of(large)
     cameras.Ks[:, 0, 2] += 4
@@ -103,6 +120,24 @@ def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path:
     assert pose_changes(large.w2c, load.scene.cameras.viewmats)[0].max() < 0.05
     assert sum(names(note, "cameras", "median") for note in load.notes) == 1
     assert len(load.moves) == 3
+
+
+@pytest.mark.parametrize("wrong", ["cameras", "Gaussians"])
+def test_photos_tell_whether_cameras_or_gaussians_are_off(wrong: str, tmp_path: Path) -> None:
+    """Cameras and the Gaussians of each view have different poses; photos agree under one of the two."""
+    right = scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120))
+    moved = motions.disagreeing(right, 1.5, 0.02)
+    rows, poses = (right, moved) if wrong == "cameras" else (moved, right)
+    write_gaussians(tmp_path / "scene.ply", rows.gaussians)
+    write_transforms(tmp_path / "transforms.json", poses.cameras, right.names)
+    for name, image in zip(right.names, right.images, strict=True):
+        cv2.imwrite(str(tmp_path / name), (255 * image[..., ::-1]).round())
+    loaded = load_scene(tmp_path)
+    assert noted(loaded.notes, f"the {wrong} are off")
+    assert len(loaded.moves) == (3 if wrong == "cameras" else 0)
+    for cameras in (loaded.scene.cameras, loaded.views.cameras):
+        assert pose_changes(right.cameras.viewmats, cameras.viewmats)[0].max() < 0.1
+    assert np.abs(loaded.scene.gaussians.means - right.gaussians.means).max() < 0.02
 
 
 def test_tensors_whose_cameras_are_off(large: Tiny) -> None:

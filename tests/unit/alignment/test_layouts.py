@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from exports import Smooth, export_rows, save_export, smooth_scene, turned
+from exports import Smooth, export_rows, home, save_export, smooth_scene, turned, with_intrinsics
 from messages import names, noted, refuses
 from sweeps import sweep
-from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_npz
+from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_images, write_npz
 
 from gsmerge.alignment.layouts import grids_of_count, patch_grids
 from gsmerge.errors import SceneError
@@ -186,6 +186,32 @@ def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     assert noted(loaded.notes, "resized", "504 x 28")
 
 
+@pytest.mark.parametrize("size", [(256, 192), (256, 211)], ids=["four times the grid", "stretched"])
+def test_resplat_s_grids(size: tuple[int, int], tmp_path: Path) -> None:
+    """A quarter of what photos were stretched to, in the middle camera; grids of other sizes, trimmed, fit as well."""
+    tiny = smooth_scene(64, 48)
+    middle = np.linalg.inv(tiny.c2w[1])
+    save_export(tmp_path, tiny, turned(export_rows(tiny, rest=45), middle[:3, :3], shift=middle[:3, 3]), cameras=False)
+    K, photos = original(tiny, resize_to(size, (64, 48)), size)
+    write_photos(tmp_path, tiny, photos)
+    write_cameras(tmp_path, tiny, K, size)
+    scene = load_scene(tmp_path).pixel_scene()
+    assert (scene.cameras.width, scene.cameras.height) == (64, 48)
+    assert home(scene, tiny) == 1
+
+
+def test_photos_of_depth_maps_without_images_are_resized(tmp_path: Path) -> None:
+    """Grey rows do not tell whether photos were cropped."""
+    tiny = smooth_scene(112, 84)
+    write_npz(tmp_path / "exports/mini_npz/results.npz", tiny, image=None, depth=tiny.depths)
+    size = (240, 176)
+    photos = np.stack(original(tiny, resize_to(size, (112, 84)), size)[1])
+    photos[:, :, [0, 1, 2, -3, -2, -1]] = 255  # which is far from grey
+    write_photos(tmp_path, tiny, list(photos))
+    loaded = load_scene(tmp_path, images=tmp_path / "images")
+    assert noted(loaded.notes, "photos of 240 x 176 are resized to 112 x 84")
+
+
 def test_mappings_move_a_point_and_its_photo_alike() -> None:
     photo = np.zeros((60, 100, 3), np.uint8)
     photo[24:36, 64:72] = 255
@@ -205,6 +231,9 @@ def test_sizes_that_the_number_of_rows_allows() -> None:
     assert (64, 48) in actual
     assert list(grids_of_count(2 * 97 * 89, 2, (640, 480))) == []
     assert (256, 256) in [(m.width, m.height) for m in grids_of_count(3 * 256 * 256, 3, (640, 360))]
+    for height in (160, 161):  # half of 320, and of 322, the next multiple of 14
+        bordered = 7 * (224 - 2 * 7) * (height - 2 * 5)
+        assert (224, height) in [(m.width, m.height) for m in grids_of_count(bordered, 7, (448, 320))]
 
 
 def test_sizes_of_patches() -> None:
@@ -215,6 +244,28 @@ def test_sizes_of_patches() -> None:
     crop = next(m for m in patch_grids((1920, 1080)) if m.top)
     assert (crop.width, crop.height, crop.top) == (504, 280, 2)
     assert list(patch_grids((400, 300))) == []
+
+
+def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> None:
+    """They may be a pixel off; intrinsics stay those of the photos."""
+    folder = tiny.save(tmp_path / "scene")
+    write_cameras(folder, tiny, tiny.K, (tiny.width + 1, tiny.height))
+    loaded = load_scene(folder)
+    assert np.allclose(loaded.pixel_scene().cameras.Ks, tiny.K)
+    assert not noted(loaded.notes, "scaled")
+
+
+def test_sizes_that_are_twice_a_principal_point_out_of_the_middle(tmp_path: Path) -> None:
+    """Those of Lyra 2, whose Gaussians are of half the photos' size, show that intrinsics are those of the photos."""
+    K = np.array([[110, 0, 49], [0, 110, 36], [0, 0, 1.0]])
+    scene = with_intrinsics(smooth_scene(96, 72), K)
+    save_export(tmp_path, scene, export_rows(scene), cameras=False)
+    larger = replace(scene, K=K * [[2], [2], [1]], width=192, height=144, images=scene.images.repeat(2, 1).repeat(2, 2))
+    write_cameras(tmp_path, larger, larger.K, (196, 144))
+    write_images(tmp_path / "images", larger)
+    loaded = load_scene(tmp_path)
+    assert np.allclose(loaded.pixel_scene().cameras.Ks, K)
+    assert noted(loaded.notes, "192 x 144", "96 x 72")
 
 
 def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:

@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, with_intrinsics
-from messages import noted, refuses
+from messages import noted
 from sweeps import sweep
 
-from gsmerge.errors import SceneError
 from gsmerge.scene.read import Loaded, load_scene
 
 WIDTH, HEIGHT = 96, 64
@@ -168,13 +167,15 @@ def test_photos_are_told_by_their_colors(tmp_path: Path) -> None:
     assert scene.names == ("0.png", "1.png", "2.png")
 
 
-def test_photos_of_another_scene_name_the_grid(tmp_path: Path) -> None:
+def test_photos_of_another_scene_are_not_used(tmp_path: Path) -> None:
     tiny = made()
     (tmp_path / "images").mkdir()
     for i, image in enumerate(np.random.default_rng(0).integers(0, 256, (3, 90, 120, 3), np.uint8)):
         cv2.imwrite(str(tmp_path / "images" / f"{i}.png"), image)
-    with refuses(SceneError, "images", 3, WIDTH, HEIGHT):
-        read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians)))
+    loaded = read_bare(tmp_path, tiny, np.arange(len(tiny.gaussians)))
+    assert loaded.scene.aligned
+    assert loaded.scene.images is None
+    assert noted(loaded.notes, "images", "not used", f"3 views of {WIDTH} x {HEIGHT}")
 
 
 def test_other_pictures_beside_the_file_are_no_photos(tmp_path: Path) -> None:

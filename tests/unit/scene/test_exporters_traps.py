@@ -20,12 +20,14 @@ from exports import (
     with_intrinsics,
     with_surface_rotations,
 )
+from messages import refuses
 from PIL import Image
 from plyfile import PlyData
 from sharp_files import write_elements
 from sweeps import sweep
-from tiny_scene import rotation, write_colmap_text, write_inria, write_npz
+from tiny_scene import rotation, save_json, write_colmap_text, write_images, write_inria, write_npz
 
+from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.types import SH_C0
@@ -351,6 +353,43 @@ def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -
     assert np.array_equal((scene.images * 255).round(), named.images[order])
     assert np.allclose(scene.cameras.viewmats, named.w2c[order])
     assert (scene.cameras.width, scene.cameras.height) == (48, 36)
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_photos_that_a_model_cropped_for_rows_without_pixels(tmp_path: Path, shown: bool) -> None:
+    """WorldMirror and its relatives crop upright photos to squares; the colours confirm it."""
+    K = np.array([[60.0, 0, 24], [0, 60, 24], [0, 0, 1]])
+    named = replace(smooth_scene(48, 48, K), names=tuple(f"image_{i:04d}.png" for i in range(3)))
+    some = np.random.default_rng(0).permutation(3 * 48 * 48)[:3000]
+    save_export(tmp_path, named, export_rows(named, some), cameras=False)
+    images = named.images if shown else np.random.default_rng(1).integers(0, 256, named.images.shape, np.uint8)
+    upright = replace(named, images=np.pad(images, ((0, 0), (16, 16), (0, 0), (0, 0))))
+    write_images(tmp_path / "images", upright)
+    matrices = {"extrinsics": named.c2w, "intrinsics": np.tile(K, (3, 1, 1))}
+    lists = {key: [{"camera_id": i, "matrix": m[i].tolist()} for i in range(3)] for key, m in matrices.items()}
+    save_json(tmp_path / "camera_params.json", lists)
+    if shown:
+        assert np.array_equal((load_scene(tmp_path).scene.images * 255).round(), named.images)
+    else:
+        with refuses(SceneError, "scene.ply", "as far from the photos"):
+            load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_principal_points_of_world_mirror_beside_the_middle(tmp_path: Path, factor: int) -> None:
+    """They show the processed size, multiples of 14, where photos have clearly another."""
+    K = np.array([[60.0, 0, 28.4], [0, 61, 20.7], [0, 0, 1]])
+    named = replace(smooth_scene(56, 42, K), names=tuple(f"image_{i:04d}.png" for i in range(3)))
+    some = np.random.default_rng(0).permutation(3 * 56 * 42)[:3000]
+    save_export(tmp_path, named, export_rows(named, some), cameras=False)
+    larger = [cv2.resize(image, None, fx=factor, fy=factor) for image in named.images]
+    write_images(tmp_path / "images", replace(named, images=np.stack(larger)))
+    matrices = {"extrinsics": named.c2w, "intrinsics": np.tile(K, (3, 1, 1))}
+    lists = {key: [{"camera_id": i, "matrix": m[i].tolist()} for i in range(3)] for key, m in matrices.items()}
+    save_json(tmp_path / "camera_params.json", lists)
+    cameras = load_scene(tmp_path).scene.cameras
+    assert (cameras.width, cameras.height) == (56 * factor, 42 * factor)
+    assert np.allclose(cameras.Ks, K * np.array([[factor], [factor], [1]]))
 
 
 @sweep("factor", [0, 1, 2, 3])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from messages import refuses
+from messages import noted, refuses
 from model_files import MODELS
 from model_rows import Export, check_cameras, check_pixels
 
@@ -74,9 +75,11 @@ def test_photos_beside_the_gaussians_under_names_of_the_scene(tmp_path: Path) ->
 
 
 def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
-    """Voxels and no cameras: the message names the photos and the option that brings cameras."""
-    with refuses(SceneError, "", "images", "--cameras"):
-        load("VolSplat without cameras", tmp_path)
+    """Voxels and no cameras: the scene is that of the rows alone, and a note names the photos."""
+    loaded, _ = load("VolSplat without cameras", tmp_path)
+    alone = load_scene(shutil.copy(loaded.files.ply, tmp_path / "alone.ply"))
+    np.testing.assert_array_equal(loaded.scene.gaussians.means, alone.scene.gaussians.means)
+    assert sum(noted([text], "images", "not used", "no cameras") for text in loaded.notes) == 1
 
 
 # Folders

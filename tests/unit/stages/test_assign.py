@@ -26,7 +26,7 @@ from gsmerge.stages.assign import (
     owner_pixels,
 )
 from gsmerge.stages.encode import encode, member_rows
-from gsmerge.stages.segment import superpixels_per_view
+from gsmerge.stages.segment import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups
 
@@ -127,6 +127,16 @@ def test_density_is_of_the_gaussians_where_those_are_fewer(room: Scene) -> None:
     sizes = [whole, room, *(replace(whole, gaussians=room.gaussians[rows]) for rows in (slice(0, None, 2), slice(1)))]
     assert [superpixels_per_view(measure_size(scene), options) for scene in sizes] == [76, 76, 38, 1]
     assert superpixels_per_view(measure_size(whole), SegmentOptions(superpixels=50)) == 50
+
+
+def test_few_gaussians_are_as_many_as_of_pixels(room: Scene) -> None:
+    """A share of tokens is too few to show the photos; half of them are the most."""
+    tokens = replace(measure_size(unaligned_scenes.without_order(room)), photos=True)
+    sizes = [replace(tokens, num_gaussians=count) for count in (1151, 200)]
+    assert [superpixels_per_view(size, SegmentOptions(superpixels="10%")) for size in sizes] == [76, 33]
+    large = replace(tokens, height=1000, width=1000)
+    sizes = [replace(large, num_gaussians=count) for count in (30_000, FEW_PIXELS // 2, FEW_PIXELS)]
+    assert [superpixels_per_view(size, SegmentOptions()) for size in sizes] == [3844, 1922, 3844]
 
 
 def test_unknown_cameras_are_placed(room: Scene) -> None:

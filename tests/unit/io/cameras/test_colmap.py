@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,17 @@ def test_colmap_by_one_of_its_files(tmp_path: Path, tiny: Tiny) -> None:
     (tmp_path / "cameras.bin").unlink()
     with refuses(SceneError, "images.bin", "COLMAP", "pair"):
         read_cameras(tmp_path / "images.bin")
+
+
+@pytest.mark.parametrize(("centre", "size"), [((20, 14), (40, 28)), ((20, 24), (80, 56)), ((20.3, 14.2), (80, 56))])
+def test_sizes_that_are_the_photos_not_those_of_intrinsics(
+    tmp_path: Path, tiny: Tiny, centre: tuple[float, float], size: tuple[int, int]
+) -> None:
+    """As WorldMirror 1 writes them: whole numbers, off alike in both directions."""
+    K = np.array([[30, 0, centre[0]], [0, 30, centre[1]], [0, 0, 1.0]])
+    write_colmap_text(tmp_path, replace(tiny, K=K, width=80, height=56))
+    cameras = read_cameras(tmp_path)
+    assert (cameras.widths[0], cameras.heights[0]) == size
 
 
 def test_colmap_models_without_distortion(tmp_path: Path, tiny: Tiny) -> None:

@@ -250,3 +250,21 @@ def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
     (tmp_path / "dataparser_transforms.json").write_text(text)
     with refuses(SceneError, "dataparser_transforms.json", found):
         load_scene(tmp_path)
+
+
+def test_poses_that_instantsplat_optimised(tmp_path: Path, tiny: Tiny) -> None:
+    write_inria(tmp_path / "cameras.json", tiny)
+    turn = np.eye(4)
+    turn[:3, :3] = rotation(0.02, 0.01, 0)
+    optimised = replace(tiny, c2w=tiny.c2w @ turn)
+    for name, steps, poses in (("org", 1000, tiny), ("optimized", 1000, optimised), ("org", 900, tiny)):
+        folder = tmp_path / f"pose/ours_{steps}"
+        folder.mkdir(parents=True, exist_ok=True)
+        np.save(folder / f"pose_{name}.npy", poses.w2c.astype(np.float32))
+    np.save(folder / "pose_optimized.npy", tiny.w2c)  # of fewer steps
+    assert np.allclose(read_cameras(tmp_path).viewmats, optimised.w2c, atol=1e-5)
+    path = tmp_path / "pose/ours_1000/pose_org.npy"
+    damaged = path.read_bytes()[:-8]
+    for other in (optimised.w2c, tiny.w2c[:2], np.zeros((3, 4, 4)), damaged):
+        path.write_bytes(other) if isinstance(other, bytes) else np.save(path, other)
+        assert np.allclose(read_cameras(tmp_path).viewmats, tiny.w2c)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from messages import refuses
 from tiny_scene import (
     Tiny,
     assert_same,
+    write_colmap_binary,
+    write_colmap_text,
     write_npz,
 )
 
@@ -46,6 +49,33 @@ def test_npz_intrinsics_of_another_size_are_scaled(tmp_path: Path, tiny: Tiny) -
     normalised = centred / np.array([[20], [14], [1]])
     write_npz(tmp_path / "b.npz", tiny, intrinsics=np.tile(normalised, (3, 1, 1)))
     assert_same(read_cameras(tmp_path / "b.npz"), tiny, K=centred, atol=1e-6)
+
+
+def test_npz_intrinsics_of_a_colmap_export_of_the_same_call_are_scaled_back(tmp_path: Path, tiny: Tiny) -> None:
+    """Older versions of Depth Anything 3 scale them in place, to the photos' sizes."""
+    photos = replace(tiny, K=tiny.K * np.array([[1.1], [1.5], [1]]), width=22, height=21)
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, intrinsics=np.tile(photos.K, (3, 1, 1)).astype(np.float32))
+    for write in (write_colmap_text, write_colmap_binary):
+        write(tmp_path, photos)
+        assert_same(read_cameras(tmp_path / "exports/npz"), tiny, atol=1e-6)
+    photos.K[0, 0] += 1
+    write_colmap_binary(tmp_path, photos)
+    (tmp_path / "cameras.txt").unlink()
+    assert not np.allclose(read_cameras(tmp_path / "exports/npz").Ks, tiny.K)
+
+
+def test_npz_with_points_have_the_poses_that_the_points_show(tmp_path: Path, tiny: Tiny) -> None:
+    """MapAnything writes camera-to-world under the name that VGGT has for world-to-camera."""
+    y, x = np.mgrid[: tiny.height, : tiny.width] + 0.5
+    depths = np.random.default_rng(0).uniform(1, 3, (3, tiny.height, tiny.width))
+    local = depths[..., None] * (np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(tiny.K).T)
+    points = np.einsum("vij,vhwj->vhwi", tiny.c2w[:, :3, :3], local) + tiny.c2w[:, None, None, :3, 3]
+    for poses in (tiny.w2c, tiny.c2w):
+        arrays = {"extrinsic": poses, "intrinsic": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images}
+        np.savez(tmp_path / "predictions.npz", **arrays, depth=depths[..., None], world_points=points)
+        assert_same(read_cameras(tmp_path / "predictions.npz"), tiny)
+    np.savez(tmp_path / "other.npz", **arrays, depth=depths[:2], world_points=points[:2])
+    assert np.allclose(read_cameras(tmp_path / "other.npz").viewmats, tiny.c2w)
 
 
 def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
