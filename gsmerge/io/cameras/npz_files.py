@@ -82,14 +82,17 @@ def read_da3(source: CameraSource) -> StoredCameras:
 def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
     """Return whether the stored points of the pixels lie at the depths of the maps if poses are camera-to-world."""
     points, depths = read_arrays(path, (_POINTS,))[_POINTS], read_depths(path)
-    if depths is None or len(depths) != len(poses) or points.shape != (*depths.shape, 3) or not points.size:
+    fits = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
+    if depths is None or not fits or points.dtype.kind not in "fiu":
         return False
     few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLES))
     z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
     rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
-    found = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
-    as_w2c, as_c2w = (float(np.median(np.abs(depth - z[..., 0]))) for depth in found)
-    return as_c2w < as_w2c
+    with np.errstate(all="ignore"):
+        found = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
+        errors = np.abs(np.array(found) - z[..., 0])
+    as_w2c, as_c2w = errors[:, np.isfinite(errors).all(0)]
+    return len(as_w2c) > 0 and bool(np.median(as_c2w) < np.median(as_w2c))
 
 
 def read_dump(source: CameraSource) -> StoredCameras:

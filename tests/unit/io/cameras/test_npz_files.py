@@ -74,8 +74,12 @@ def test_npz_with_points_have_the_poses_that_the_points_show(tmp_path: Path, tin
         arrays = {"extrinsic": poses, "intrinsic": np.tile(tiny.K, (3, 1, 1)), "images": tiny.images}
         np.savez(tmp_path / "predictions.npz", **arrays, depth=depths[..., None], world_points=points)
         assert_same(read_cameras(tmp_path / "predictions.npz"), tiny)
-    np.savez(tmp_path / "other.npz", **arrays, depth=depths[:2], world_points=points[:2])
-    assert np.allclose(read_cameras(tmp_path / "other.npz").viewmats, tiny.c2w)
+    depths[:, 0] = np.nan  # a mask
+    np.savez(tmp_path / "predictions.npz", **arrays, depth=depths, world_points=points)
+    assert_same(read_cameras(tmp_path / "predictions.npz"), tiny)
+    for maps, other in ((depths[:2], points[:2]), (depths, points.astype("U8")), (depths, points * np.nan)):
+        np.savez(tmp_path / "predictions.npz", **arrays, depth=maps, world_points=other)
+        assert np.allclose(read_cameras(tmp_path / "predictions.npz").viewmats, tiny.c2w)
 
 
 def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
