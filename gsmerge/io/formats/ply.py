@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 import warnings
 from bisect import bisect_right
@@ -133,6 +134,8 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
 def open_ply(path: Path) -> PlyData:
     """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
 
+    They are read on Windows, where a file that is mapped cannot be replaced by a result.
+
     SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
     """
     budget = read_budget(path)
@@ -147,8 +150,9 @@ def open_ply(path: Path) -> PlyData:
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
             data = PlyData.read(file, mmap="r")
         for element in data.elements:
-            if isinstance(element.data, np.memmap) and (element.name != "vertex" or "chunk" in data):
-                with open_rows(path, element.data) as read:  # small, or packed
+            is_small = element.name != "vertex" or "chunk" in data
+            if isinstance(element.data, np.memmap) and (is_small or sys.platform == "win32"):
+                with open_rows(path, element.data) as read:
                     element.data = read(slice(None))
         return data
     except OSError as error:

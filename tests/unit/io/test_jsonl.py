@@ -41,13 +41,6 @@ def test_lines_can_be_read_from_the_middle(tmp_path: Path) -> None:
     assert ends[-1] == path.stat().st_size
 
 
-def test_lines_are_written_where_files_cannot_be_locked(tmp_path: Path) -> None:
-    """As on Windows, which has no fcntl."""
-    path = tmp_path / "lines.jsonl"
-    subprocess.run([sys.executable, "-c", f"import sys; sys.modules['fcntl'] = None{APPEND}", path, "a"], check=True)
-    assert [value["number"] for _, value in each_line(path) if value is not None] == list(range(25))
-
-
 def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     """A full disk takes the first part of a line: stood in for by the largest size of a file."""
     path = tmp_path / "lines.jsonl"
