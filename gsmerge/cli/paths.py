@@ -191,7 +191,7 @@ def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
 
     with atomic_outputs(overwrite=overwrite) as add:
         for path, text in texts.items():
-            add(path).write_text(text, encoding="utf-8", errors="replace")
+            add(path).write_bytes(text.encode(errors="replace"))
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
