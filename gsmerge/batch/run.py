@@ -116,8 +116,8 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         document, written = job.call.run(files, out, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
     made = [
-        {"path": os.path.relpath(path, run.folder), "sha256": file_sha256(path), "bytes": path.stat().st_size}
-        for path in written
+        {"path": name.as_posix(), "sha256": file_sha256(run.folder / name), "bytes": (run.folder / name).stat().st_size}
+        for name in (Path(os.path.relpath(path, run.folder)) for path in written)
     ]
     return record(DONE, job.scene, job.output, key=key, files=made, report=finite(document))
 

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import groupby, takewhile
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Protocol
 
 from gsmerge.errors import SceneError
@@ -35,6 +35,10 @@ _STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose proc
 _SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # a right and an error of Windows
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
+_RESERVED = re.compile(
+    r"(con|prn|aux|nul|com\d|lpt\d|conin\$|conout\$) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]",
+    re.DOTALL | re.IGNORECASE,
+)
 
 _written: set[str] = set()  # the temporary files of this process
 
@@ -225,8 +229,16 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         return False
 
 
+def reserved_part(path: PurePath) -> str | None:
+    """Return the first folder or name in a path that Windows takes for a device or a stream, or changes."""
+    return next((part for part in path.parts[bool(path.anchor) :] if _RESERVED.fullmatch(part)), None)
+
+
 def _refuse(path: Path, overwrite: bool) -> None:
     """Raise a SceneError for an output that cannot be written or may not be replaced."""
+    if sys.platform == "win32" and (part := reserved_part(path)) is not None:
+        problem = f"expected names that Windows can keep, found {part!r}"
+        raise SceneError(path, problem, 'choose one without : * ? " < > |, no device such as aux, no end . or blank')
     try:
         status = os.stat(path)
     except FileNotFoundError:

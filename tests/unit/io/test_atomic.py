@@ -8,7 +8,7 @@ import stat
 import subprocess
 import sys
 from contextlib import nullcontext
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ from messages import refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
-from gsmerge.io.atomic import link_file, remove_stale, temporary_path
+from gsmerge.io.atomic import link_file, remove_stale, reserved_part, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -144,6 +144,14 @@ def test_what_a_process_left_is_removed_before_its_parent_knows_of_its_end(tmp_p
         left.touch()
         remove_stale(tmp_path)
         assert not left.exists()
+
+
+def test_names_that_windows_does_not_keep() -> None:
+    kept = ["C:\\a\\con_\\scene.ply", "..\\.\\b.ply", "auxiliary.ply", "\\\\host\\share\\.hidden", "com.ply", "C:b.ply"]
+    assert [reserved_part(PureWindowsPath(path)) for path in kept] == [None] * len(kept)
+    for part in ("aux.ply", "CON", "nul .tar.gz", "com1.ply", "a?.ply", "scene.ply.", "scene ", "a\nb"):
+        assert reserved_part(PureWindowsPath("C:\\scenes", part, "out.ply")) == part
+    assert reserved_part(PureWindowsPath("scenes", "two:b.ply")) == "two:b.ply"
 
 
 def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
