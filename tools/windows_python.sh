@@ -34,10 +34,12 @@ SH
 
 cat >python <<'SH'
 #!/usr/bin/env bash
-# The streams of Wine's Python have to be pipes
+# The streams of Wine's Python have to be pipes; paths of this system mean nothing to it
+set -o pipefail
 home=$(cd "$(dirname "$0")" && pwd)
 export WINEPREFIX="$home/prefix" WINEDEBUG=-all
-wine "$home/py/python.exe" "$@" </dev/null > >(cat) 2> >(cat >&2)
+unset PYTHONPATH PYTHONHOME
+{ wine "$home/py/python.exe" "$@" </dev/null 2>&1 >&3 3>&- | cat >&2; } 3>&1 | cat
 SH
 chmod +x install python
 
@@ -79,7 +81,9 @@ tar -C "$library" --exclude=./dist-packages --exclude=./site-packages --exclude=
   --exclude=__pycache__ -c . | tar -C py/Lib -x
 requirements=$(tools/bin/python - "$root/pyproject.toml" <<'PY'
 import sys, tomllib
-print("\n".join(tomllib.load(open(sys.argv[1], "rb"))["project"]["dependencies"]))
+project = tomllib.load(open(sys.argv[1], "rb"))["project"]
+extras = project["optional-dependencies"]
+print("\n".join([*project["dependencies"], *extras["spz4"], *extras["usd"]]))
 PY
 )
 mapfile -t requirements <<<"$requirements"

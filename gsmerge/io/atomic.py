@@ -108,7 +108,8 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
         if not made or (error.errno not in _DISK_ERRORS and error.filename not in made):
             raise
         path = made.get(str(error.filename), next(iter(made.values())))[0]
-        raise SceneError(path, f"could not be written ({error.strerror})") from error
+        remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
+        raise SceneError(path, f"could not be written ({error.strerror})", remedy) from error
     finally:
         for temporary in made:
             with suppress(OSError):
