@@ -124,7 +124,7 @@ def link_file(source: Path, target: Path) -> None:
     """Make an empty file a link to another file, hard or symbolic, or a copy where neither can be."""
     os.unlink(target)
     real = os.path.realpath(source)
-    for make in (os.link, os.symlink):
+    for make in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):  # few may make the latter there
         with suppress(OSError, NotImplementedError):
             make(real, target)
             return
@@ -164,8 +164,9 @@ def _flush_names(folder: Path) -> None:
 
 def _flush(path: str | Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
-    access = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY  # Windows flushes what may be written
-    descriptor = os.open(path, access)
+    if sys.platform == "win32" and not os.access(path, os.W_OK):
+        return  # a link to somebody's file: Windows flushes only what may be written
+    descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:

@@ -43,6 +43,7 @@ def test_lines_can_be_read_from_the_middle(tmp_path: Path) -> None:
 
 def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     """A full disk takes the first part of a line: stood in for by the largest size of a file."""
+    pytest.importorskip("resource")
     path = tmp_path / "lines.jsonl"
     append_line(path, {"number": 0})
     whole = path.read_bytes()
@@ -103,7 +104,7 @@ def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) ->
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with refuses(SceneError, "lines.jsonl", "File exists", "--output"):
+    with refuses(SceneError, "lines.jsonl", "exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})
 
 
