@@ -173,11 +173,5 @@ def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | Non
     it is to ``wait`` for that.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
-    path = folder / f".batch-{name}.lock"
-    with ExitStack() as stack:
-        try:
-            is_ours = stack.enter_context(lock_file(path, wait=wait))
-        except OSError as error:
-            problem = f"cannot be written ({error.strerror})"
-            raise SceneError(path, problem, "name another folder with --output") from error
-        yield path.with_suffix(".begun") if is_ours else None
+    with lock_file(folder / f".batch-{name}.lock", wait=wait) as is_ours:
+        yield folder / f".batch-{name}.begun" if is_ours else None

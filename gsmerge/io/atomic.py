@@ -35,10 +35,7 @@ _STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose proc
 _SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # a right and an error of Windows
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
-_RESERVED = re.compile(
-    r"(con|prn|aux|nul|com\d|lpt\d|conin\$|conout\$) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]",
-    re.DOTALL | re.IGNORECASE,
-)
+_RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
 _written: set[str] = set()  # the temporary files of this process
 
@@ -214,7 +211,7 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
     if sys.platform == "win32":  # where a signal 0 would end the process
         kernel = ctypes.WinDLL("kernel32", use_last_error=True)
-        process = kernel.OpenProcess(_SYNCHRONIZE, False, pid)
+        process = kernel.OpenProcess(_SYNCHRONIZE, False, ctypes.c_uint32(pid))
         has_ended = kernel.WaitForSingleObject(process, 0) == 0 if process else ctypes.get_last_error() == _NO_PROCESS
         kernel.CloseHandle(process)
         return has_ended

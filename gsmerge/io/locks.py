@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
+from gsmerge.errors import SceneError
+
 
 @contextmanager
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     """Let one process at a time into the block, and make a file for that; yield whether it is this one's turn.
 
-    ``wait``: wait for that turn. OSError if the file cannot be made.
+    ``wait``: wait for that turn. SceneError if the file cannot be made.
     """
     from filelock import FileLock, Timeout  # most commands need none
 
@@ -21,6 +23,8 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     except Timeout:
         yield False
         return
+    except OSError as error:
+        raise SceneError(path, f"cannot be written ({error.strerror})", "choose another folder") from error
     try:
         yield True
     finally:

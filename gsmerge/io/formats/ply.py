@@ -134,8 +134,6 @@ def _bytes_by_attribute(row: np.dtype[Any], count: int) -> dict[str, int]:
 def open_ply(path: Path) -> PlyData:
     """Open a PLY file; its binary vertices, unless packed, are mapped for :func:`open_rows`.
 
-    They are read on Windows, where a file that is mapped cannot be replaced by a result.
-
     SceneError if it is no PLY file, is truncated or damaged, or its header promises more than it has.
     """
     budget = read_budget(path)
@@ -149,9 +147,9 @@ def open_ply(path: Path) -> PlyData:
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
             data = PlyData.read(file, mmap="r")
+        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # no result replaces it on Windows
         for element in data.elements:
-            is_small = element.name != "vertex" or "chunk" in data
-            if isinstance(element.data, np.memmap) and (is_small or sys.platform == "win32"):
+            if isinstance(element.data, np.memmap) and element.name not in mapped:
                 with open_rows(path, element.data) as read:
                     element.data = read(slice(None))
         return data
