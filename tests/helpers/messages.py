@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 ERROR = "gsmerge: error: "  # at the start of the command line's error lines
+NO_FOLDER = () if os.name == "nt" else ("Not a directory",)  # what systems say of a file as a folder
 
 
 def names(text: str, *values: object) -> bool:

@@ -12,13 +12,11 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import pytest
-from messages import refuses
+from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
 from gsmerge.io.atomic import link_file, remove_stale, reserved_part, temporary_path
-
-NO_FOLDER = () if sys.platform == "win32" else ("Not a directory",)  # what the system says of a file as a folder
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
