@@ -134,9 +134,11 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    from gsmerge.io.atomic import check_name
     from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
+    check_name(output)
     try:
         os.lstat(output)
     except FileNotFoundError:

@@ -228,16 +228,17 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         return False
 
 
-def reserved_part(path: PurePath) -> str | None:
-    """Return the first folder or name in a path that Windows takes for a device or a stream, or changes."""
-    return next((part for part in path.parts[bool(path.anchor) :] if _RESERVED.fullmatch(part)), None)
+def check_name(path: PurePath, system: str = sys.platform) -> None:
+    """Raise SceneError for an output in whose path Windows takes a name for a device or a stream, or changes it."""
+    for part in path.parts[bool(path.anchor) :] if system == "win32" else ():
+        if _RESERVED.fullmatch(part):
+            remedy = 'choose one without : * ? " < > |, no device such as aux, no dot or blank at its end'
+            raise SceneError(path, f"expected a name that Windows can keep, found {part!r}", remedy)
 
 
 def _refuse(path: Path, overwrite: bool) -> None:
     """Raise a SceneError for an output that cannot be written or may not be replaced."""
-    if sys.platform == "win32" and (part := reserved_part(path)) is not None:
-        problem = f"expected names that Windows can keep, found {part!r}"
-        raise SceneError(path, problem, 'choose one without : * ? " < > |, no device such as aux, no end . or blank')
+    check_name(path)
     try:
         status = os.stat(path)
     except FileNotFoundError:

@@ -3,12 +3,13 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import re
 import signal
 import stat
 import subprocess
 import sys
 from contextlib import nullcontext
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic, atomic_output, atomic_outputs
-from gsmerge.io.atomic import link_file, remove_stale, reserved_part, temporary_path
+from gsmerge.io.atomic import check_name, link_file, remove_stale, temporary_path
 
 
 def write_half_and_fail(path: Path, error: BaseException) -> None:
@@ -151,10 +152,13 @@ def test_what_a_process_left_is_removed_before_its_parent_knows_of_its_end(tmp_p
 
 def test_names_that_windows_does_not_keep() -> None:
     kept = ["C:\\a\\con_\\scene.ply", "..\\.\\b.ply", "auxiliary.ply", "\\\\host\\share\\.hidden", "com.ply", "C:b.ply"]
-    assert [reserved_part(PureWindowsPath(path)) for path in kept] == [None] * len(kept)
-    for part in ("aux.ply", "CON", "nul .tar.gz", "com1.ply", "a?.ply", "scene.ply.", "scene ", "a\nb"):
-        assert reserved_part(PureWindowsPath("C:\\scenes", part, "out.ply")) == part
-    assert reserved_part(PureWindowsPath("scenes", "two:b.ply")) == "two:b.ply"
+    for path in kept:
+        check_name(PureWindowsPath(path), "win32")
+    for name in ("aux.ply", "CON", "nul .tar.gz", "com1.ply", "a?.ply", "two:b.ply", "scene.ply.", "scene ", "a\nb"):
+        for path in (PureWindowsPath("C:\\scenes", name), PureWindowsPath("scenes", name, "out.ply")):
+            with pytest.raises(SceneError, match=re.escape(f"found {name!r}")):
+                check_name(path, "win32")
+        check_name(PurePosixPath("/scenes", name), "linux")
 
 
 def write_both(folder: Path, second: str, *, fail: bool = False) -> None:
