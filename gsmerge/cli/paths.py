@@ -170,6 +170,8 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
         raise SceneError(output, f"cannot be read ({error.strerror})", "name another output") from error
+    except StopIteration:  # of a Windows that has no such drive
+        raise SceneError(output, f"found no drive {folder.absolute().drive}", "name another output") from None
     if not nearest.is_dir():
         raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another output")
     if not os.access(nearest, os.W_OK | os.X_OK):
