@@ -14,7 +14,6 @@ import numpy as np
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
-from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -248,7 +247,7 @@ def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: floa
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away)[..., None].astype(np.float32)
-    image = blur(develop(linear), noise.blur)
+    image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
 
