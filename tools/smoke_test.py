@@ -24,7 +24,8 @@ def main(archive: Path, options: list[str]) -> None:
     """Install, compare the version with the file's name, and run all of the README's block but its installation."""
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     with TemporaryDirectory() as folder:
-        work, bin_folder = Path(folder), Path(folder, ".venv", "bin")
+        bin_name = "Scripts" if os.name == "nt" else "bin"
+        work, bin_folder = Path(folder), Path(folder, ".venv", bin_name)
         subprocess.run([sys.executable, "-m", "venv", str(work / ".venv")], env=env, check=True)
         install = [str(bin_folder / "python"), "-m", "pip", "install", "-q", *options, str(archive)]
         subprocess.run(install, env=env, check=True)
@@ -37,7 +38,7 @@ def main(archive: Path, options: list[str]) -> None:
             sys.exit(f"expected version {expected}, as in {archive.name}, found {version.strip()!r}")
 
         lines = find_block("examples/01_make_scene.py").splitlines()
-        job = "\n".join(line for line in lines if "pip install" not in line)
+        job = "\n".join(line for line in lines if "pip install" not in line).replace("/bin/", f"/{bin_name}/")
         subprocess.run(["bash", "-euxo", "pipefail", "-c", job], cwd=work, env=env, check=True)
         missing = [name for name in RESULTS if not (work / "demo" / name).exists()]
         if missing:

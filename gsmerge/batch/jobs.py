@@ -157,8 +157,8 @@ def find_jobs(
             continue
         inputs.add(real)
         first = output_name(options, scene, len(jobs))
-        outputs = (first, *(str(level_output(Path(first), i)) for i in range(1, options.settings.budget.levels)))
-        for name in outputs:
+        outputs = (first, *(level_output(Path(first), i).as_posix() for i in range(1, options.settings.budget.levels)))
+        for name in map(os.path.normcase, outputs):  # on Windows A.ply is a.ply
             if name in owners:
                 raise UsageError(
                     f"{out / name}: expected a file of its own for each scene, would be that of {owners[name]} and of"
@@ -181,6 +181,6 @@ def output_name(options: BatchOptions, scene: Path, index: int) -> str:
     k = decode.k if decode.k != AUTO else decode.max_k
     values = {"stem": stem, "parent": whole.parent.name, "index": index, "k": k}
     try:
-        return os.path.normpath(options.output.format(**values))
+        return Path(os.path.normpath(options.output.format(**values))).as_posix()
     except ValueError as error:  # a format that fits numbers only
         raise UsageError(f"--name: {options.output!r} does not fit {values}: {error}") from error

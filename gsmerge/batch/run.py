@@ -16,14 +16,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from gsmerge.batch.jobs import BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, check_folder, record
 from gsmerge.batch.workload import choose_concurrency
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
+from gsmerge.io.locks import lock_file
 from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, Pool, RayPool
@@ -117,8 +116,8 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
         document, written = job.call.run(files, out, run.threads)
     document["notes"] += list(dict.fromkeys(str(warning.message) for warning in caught))
     made = [
-        {"path": os.path.relpath(path, run.folder), "sha256": file_sha256(path), "bytes": path.stat().st_size}
-        for path in written
+        {"path": name.as_posix(), "sha256": file_sha256(run.folder / name), "bytes": (run.folder / name).stat().st_size}
+        for name in (Path(os.path.relpath(path, run.folder)) for path in written)
     ]
     return record(DONE, job.scene, job.output, key=key, files=made, report=finite(document))
 
@@ -174,18 +173,5 @@ def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | Non
     it is to ``wait`` for that.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
-    path = folder / f".batch-{name}.lock"
-    lock = FileLock(path)
-    try:
-        lock.acquire(timeout=-1 if wait else 0)
-    except Timeout:
-        yield None
-        return
-    except OSError as error:
-        raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
-    try:
-        yield path.with_suffix(".begun")
-    finally:
-        with suppress(OSError):  # Windows removes no open file
-            path.unlink()  # before the release: who waits for it sees that it is nobody's any more
-        lock.release()
+    with lock_file(folder / f".batch-{name}.lock", wait=wait) as is_ours:
+        yield folder / f".batch-{name}.begun" if is_ours else None

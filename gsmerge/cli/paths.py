@@ -134,9 +134,11 @@ def check_outputs(outputs: Sequence[Path | None], inputs: Sequence[Path | None],
 
 
 def _check_output(output: Path, inputs: set[str], *, overwrite: bool) -> None:
+    from gsmerge.io.atomic import check_name
     from gsmerge.io.formats.table import MODEL_NAMES
     from gsmerge.io.image_names import IMAGE_SUFFIXES
 
+    check_name(output)
     try:
         os.lstat(output)
     except FileNotFoundError:
@@ -168,6 +170,8 @@ def _check_place(folder: Path, output: Path, expected: str) -> None:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
         raise SceneError(output, f"cannot be read ({error.strerror})", "name another output") from error
+    except StopIteration:  # of a Windows that has no such drive
+        raise SceneError(output, f"found no drive {folder.absolute().drive}", "name another output") from None
     if not nearest.is_dir():
         raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another output")
     if not os.access(nearest, os.W_OK | os.X_OK):
@@ -191,7 +195,7 @@ def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:
 
     with atomic_outputs(overwrite=overwrite) as add:
         for path, text in texts.items():
-            add(path).write_text(text, encoding="utf-8", errors="replace")
+            add(path).write_bytes(text.encode(errors="replace"))
 
 
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:

@@ -83,7 +83,7 @@ def add_views(add: AddOutput, path: Path, cameras: Cameras, names: Sequence[str]
     A file with these cameras, to within rounding, is left as it is: results in several formats share it.
     """
     if overwrite or not path.exists():
-        add(path).write_text(viewer_cameras(cameras, names), encoding="utf-8")
+        add(path).write_bytes(viewer_cameras(cameras, names).encode())
     elif not _has_cameras(path, cameras, names):
         raise other_cameras(path)
 

@@ -2,7 +2,6 @@
 
 from gsmerge.io.atomic import atomic_output as atomic_output
 from gsmerge.io.atomic import atomic_outputs as atomic_outputs
-from gsmerge.io.atomic import lock_folder as lock_folder
 from gsmerge.io.bounds import read_json as read_json
 from gsmerge.io.cameras.camera_file import CameraFile as CameraFile
 from gsmerge.io.cameras.camera_file import to_cameras as to_cameras
@@ -18,4 +17,5 @@ from gsmerge.io.formats.table import output_format as output_format
 from gsmerge.io.formats.write import lost_harmonics as lost_harmonics
 from gsmerge.io.formats.write import write_gaussians as write_gaussians
 from gsmerge.io.formats.write import write_ply as write_ply
+from gsmerge.io.locks import lock_folder as lock_folder
 from gsmerge.io.photo_files import read_images as read_images

@@ -1,4 +1,4 @@
-"""Archives of zip that are read: what they unpack to is bounded by what they promise."""
+"""Archives of zip: what those that are read unpack to is bounded by what they promise."""
 
 from __future__ import annotations
 
@@ -26,6 +26,13 @@ def open_archive(path: StrPath, methods: Collection[int] = tuple(_METHODS)) -> I
                 problem = f"{info.filename!r:.80}: expected a member that is {allowed}, found one packed"
                 raise SceneError(path, f"{problem} by method {info.compress_type}", "pack it again")
         yield archive
+
+
+def new_member(name: str) -> zipfile.ZipInfo:
+    """Return a member to write, of 1980 and of Unix: the same bytes at any time and on any system."""
+    member = zipfile.ZipInfo(name)
+    member.create_system = 3
+    return member
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:

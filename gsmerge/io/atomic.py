@@ -6,6 +6,7 @@ name has the process that writes the file and its machine, so that a later one c
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import re
@@ -13,6 +14,7 @@ import secrets
 import shutil
 import socket
 import stat
+import sys
 import time
 import uuid
 import zlib
@@ -20,23 +22,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import groupby, takewhile
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Protocol
 
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps: names end at 255
 _STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose processes nobody here sees, is stale
+_SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # a right and an error of Windows
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
+_RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
 _written: set[str] = set()  # the temporary files of this process
 
@@ -106,7 +105,8 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
         if not made or (error.errno not in _DISK_ERRORS and error.filename not in made):
             raise
         path = made.get(str(error.filename), next(iter(made.values())))[0]
-        raise SceneError(path, f"could not be written ({error.strerror})") from error
+        remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
+        raise SceneError(path, f"could not be written ({error.strerror})", remedy) from error
     finally:
         for temporary in made:
             with suppress(OSError):
@@ -121,7 +121,7 @@ def link_file(source: Path, target: Path) -> None:
     """Make an empty file a link to another file, hard or symbolic, or a copy where neither can be."""
     os.unlink(target)
     real = os.path.realpath(source)
-    for make in (os.link, os.symlink):
+    for make in (os.link,) if sys.platform == "win32" else (os.link, os.symlink):  # few may make the latter there
         with suppress(OSError, NotImplementedError):
             make(real, target)
             return
@@ -153,21 +153,6 @@ def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
         raise
 
 
-@contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Let one process at a time into the block for a folder; other processes wait, if the system can lock folders."""
-    descriptor = None
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-    try:
-        yield
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
-
-
 def _flush_names(folder: Path) -> None:
     """Wait until the names in a folder are on the disk; not every system can."""
     with suppress(OSError):
@@ -176,7 +161,9 @@ def _flush_names(folder: Path) -> None:
 
 def _flush(path: str | Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    if sys.platform == "win32" and not os.access(path, os.W_OK):
+        return  # a link to somebody's file: Windows flushes only what may be written
+    descriptor = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     except OSError as error:
@@ -220,8 +207,14 @@ _remove_stale_once = cache(remove_stale)  # by folder and process: with many fil
 
 
 def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
-    if place != _place() or os.name == "nt":
+    if place != _place():
         return time.time() - entry.stat(follow_symlinks=False).st_mtime > _STALE_SECONDS
+    if sys.platform == "win32":  # where a signal 0 would end the process
+        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+        process = kernel.OpenProcess(_SYNCHRONIZE, False, ctypes.c_uint32(pid))
+        has_ended = kernel.WaitForSingleObject(process, 0) == 0 if process else ctypes.get_last_error() == _NO_PROCESS
+        kernel.CloseHandle(process)
+        return has_ended
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -235,8 +228,17 @@ def _is_stale(entry: os.DirEntry[str], place: str, pid: int) -> bool:
         return False
 
 
+def check_name(path: PurePath, system: str = sys.platform) -> None:
+    """Raise SceneError for an output in whose path Windows takes a name for a device or a stream, or changes it."""
+    for part in path.parts[bool(path.anchor) :] if system == "win32" else ():
+        if _RESERVED.fullmatch(part):
+            remedy = 'choose one without : * ? " < > |, no device such as aux, no dot or blank at its end'
+            raise SceneError(path, f"expected a name that Windows can keep, found {part!r}", remedy)
+
+
 def _refuse(path: Path, overwrite: bool) -> None:
     """Raise a SceneError for an output that cannot be written or may not be replaced."""
+    check_name(path)
     try:
         status = os.stat(path)
     except FileNotFoundError:

@@ -7,13 +7,13 @@ import json
 import mmap
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
+from gsmerge.io.locks import lock_folder
 
 
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
@@ -52,8 +52,7 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with FileIO(path, "a+b") as file:
-            _lock(file)
+        with lock_folder(path.parent), FileIO(path, "a+b") as file:
             end = _end_of_lines(file)
             file.truncate(end)
             if file.write(line) != len(line):  # a full disk takes the first part without an error
@@ -62,14 +61,6 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
-
-
-def _lock(file: FileIO) -> None:
-    """Keep other processes from appending until the file is closed, where the system has such locks."""
-    with suppress(ImportError):  # Windows has none
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX)
 
 
 def _end_of_lines(file: FileIO) -> int:

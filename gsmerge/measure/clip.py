@@ -19,6 +19,7 @@ from PIL import Image
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
+from gsmerge.kernels.elementary import sin
 from gsmerge.measure.preview import FACE, Picture, shorten_text
 from gsmerge.types import StrPath
 
@@ -89,7 +90,7 @@ def swipe_places(count: int, frames: int, fps: float, width: int) -> list[list[i
     They begin evenly spread, and move together to the right, to the left, and back.
     """
     rounds = max(1, round(frames / fps / SWIPE_SECONDS))
-    sways = SWAY * np.sin(2 * np.pi * rounds * np.arange(frames) / frames)
+    sways = SWAY * sin(2 * np.pi * rounds * np.arange(frames) / frames)
     places = (np.arange(count + 1) + sways[:, None]) * width / count
     places[:, 0], places[:, -1] = 0, width
     return [list(map(int, row)) for row in places.round()]

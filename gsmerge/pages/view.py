@@ -47,7 +47,7 @@ class Page:
     def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
         """Write the page as an ``.html`` file that opens anywhere; return its path."""
         with atomic_output(path, overwrite=overwrite) as temporary:
-            temporary.write_text(self.text, encoding="utf-8")
+            temporary.write_bytes(self.text.encode())
         return Path(path)
 
     def open(self) -> None:

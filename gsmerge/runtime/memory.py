@@ -21,18 +21,22 @@ _own_pages: WeakSet[mmap.mmap] = WeakSet()  # pages of others may be private, an
 
 
 def peak_memory() -> int:
-    """Return the peak resident memory of this process in bytes; 0 if unknown."""
-    try:
-        import resource
-    except ImportError:
-        return 0
+    """Return the peak resident memory of this process in bytes."""
+    if sys.platform == "win32":
+        counters = (ctypes.c_uint64 * 9)(72)  # PROCESS_MEMORY_COUNTERS, which begins with its size
+        ctypes.windll.kernel32.K32GetProcessMemoryInfo(ctypes.c_void_p(-1), counters, 72)
+        return counters[1]
+    import resource
+
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def machine_memory() -> int | None:
     """Return the memory of this machine, or the limit of its control group, in bytes; None if unknown."""
+    if sys.platform == "win32":
+        return _memory_status()[1]
     limits = []
-    with suppress(AttributeError, OSError, ValueError):
+    with suppress(OSError, ValueError):
         limits.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
     for path in LIMITS:
         with suppress(OSError, ValueError):  # "max": there is none
@@ -42,10 +46,20 @@ def machine_memory() -> int | None:
 
 def free_memory() -> int | None:
     """Return the bytes of memory that new processes can take; None if unknown."""
+    if sys.platform == "win32":
+        return _memory_status()[2]
     with suppress(OSError, KeyError, ValueError), open("/proc/meminfo", encoding="ascii") as file:
         values = dict(line.split(":", 1) for line in file)
         return int(values["MemAvailable"].split()[0]) * 1024
     return machine_memory()
+
+
+def _memory_status() -> list[int]:
+    """Return the numbers of Windows' MEMORYSTATUSEX: the second is its memory, the third what is free of it."""
+    status = (ctypes.c_uint64 * 8)(64)  # it begins with its size
+    if sys.platform == "win32":
+        ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
+    return list(status)
 
 
 def release_memory() -> None:

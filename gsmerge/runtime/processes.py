@@ -99,7 +99,7 @@ def _describe_exit(process: BaseProcess) -> str:
         name = signal.Signals(-code).name
     except ValueError:
         name = str(-code)
-    hint = "; perhaps out of memory, fewer --jobs help" if -code == signal.SIGKILL else ""
+    hint = "; perhaps out of memory, fewer --jobs help" if name == "SIGKILL" else ""
     return f"its process was killed ({name}{hint})"
 
 

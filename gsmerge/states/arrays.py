@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
 from gsmerge.io import atomic_output
+from gsmerge.io.archives import new_member
 from gsmerge.pooling import feature_to_gaussians
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
@@ -57,8 +59,10 @@ def convert_state(path: Path, out: Path, *, overwrite: bool = False) -> dict[str
     """
     state = load_state(path)
     arrays = feature_arrays(state)
-    with atomic_output(out, overwrite=overwrite) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(new_member(f"{name}.npy"), "w", force_zip64=True) as file:
+                np.save(file, array, allow_pickle=False)
     before = {"path": str(path), "bytes": path.stat().st_size, "num_gaussians": state.settings.num_input}
     after = {"path": str(out), "bytes": out.stat().st_size, "num_groups": len(state), "format": ENDING}
     after["arrays"] = {name: list(array.shape) for name, array in arrays.items()}

@@ -322,7 +322,6 @@ def test_a_state_that_another_process_makes_meanwhile(
     assert state.read_bytes() == states[1].read_bytes()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="folders are locked by POSIX")
 @pytest.mark.parametrize("exists", [False, True])
 def test_two_that_end_together_lose_no_batch(
     exists: bool, state: Path, walks: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

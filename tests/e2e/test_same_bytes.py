@@ -40,9 +40,8 @@ sys.exit(max(main(call) for call in calls))
 
 def plain() -> dict[str, str]:
     """Settings of the libraries that take all that only some processors have from them."""
-    core = np._core if hasattr(np, "_core") else np.core
     return {
-        "NPY_DISABLE_CPU_FEATURES": " ".join(core._multiarray_umath.__cpu_dispatch__),
+        "NPY_DISABLE_CPU_FEATURES": " ".join(np._core._multiarray_umath.__cpu_dispatch__),
         "OPENBLAS_CORETYPE": "Sandybridge",
         "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FP16",
         "OPENCV_IPP": "disabled",

@@ -6,6 +6,7 @@ values, which are numbers, names and options, or one word that tells it from oth
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from typing import Any
 import pytest
 
 ERROR = "gsmerge: error: "  # at the start of the command line's error lines
+NO_FOLDER = () if os.name == "nt" else ("Not a directory",)  # what systems say of a file as a folder
 
 
 def names(text: str, *values: object) -> bool:
@@ -27,7 +29,11 @@ def says(text: str, place: object, *values: object) -> bool:
     Of a path its end suffices; ``view.ply: rows`` is a place in a place. An empty place is none. What the parser of
     the command line refuses reads ``Invalid value for '--k': ...``.
     """
-    start = re.match(rf"(?:[^:]*/|Invalid value for ')?{re.escape(str(place))}'?: " if str(place) else "", text)
+    if os.name == "nt":
+        text, place = text.replace("\\", "/"), str(place).replace("\\", "/")
+        values = tuple(str(value).replace("\\", "/") for value in values)
+    before = "(?:(?:[A-Z]:)?[^:]*/|Invalid value for ')?"
+    start = re.match(rf"{before}{re.escape(str(place))}'?: " if str(place) else "", text)
     return start is not None and names(text[start.end() :], *values)
 
 

@@ -120,7 +120,7 @@ def in_parts(change: Callable[[Path], object]) -> Spoil:
 
 def pipe(path: Path) -> None:
     """A pipe in the place of a file."""
-    path.unlink()
+    path.unlink(missing_ok=True)
     os.mkfifo(path)
 
 
@@ -132,7 +132,7 @@ def many_images(folder: Path) -> None:
 NAMES = {
     "spaces": " a scene  of mine ", "Unicode": "Szene \u00e4\u6f22\u0440 \U0001f600", "a dash": "-scene",
     "line breaks": "a\nb\rc", "an escape sequence": "a\x1b[2Jb", "quotes": "a'b\"c", "percent signs": "%s%n{0}",
-    "brackets": "[red]*?", "255 letters": "x" * 255, "no UTF-8": os.fsdecode(b"a\xff\xfeb"),
+    "brackets": "[red]*?", "255 letters": "x" * 255, "no UTF-8": "a\udcff\udcfeb",
     "right to left": "a\u202eb", "dots": "..scene..", "a ply's suffix": "scene.ply",
 }  # fmt: skip
 
@@ -143,7 +143,7 @@ CASES |= {
     f"images with {word}": Case(images_named(name), READ)
     for word, name in {"spaces": "a b  %d", "Unicode": "\u00e4\u6f22 %d", "many digits": "1" * 200 + "%d"}.items()
 }
-for thing, make in {"loop": loop, "pipe": os.mkfifo}.items():
+for thing, make in {"loop": loop, "pipe": pipe}.items():
     CASES[f"scene.ply as a {thing}"] = Case(replaced("scene.ply", make))
     CASES[f"transforms.json as a {thing}"] = Case(replaced("transforms.json", make), EITHER)
     CASES[f"images as a {thing}"] = Case(replaced("images", make), EITHER)

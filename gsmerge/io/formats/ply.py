@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import threading
 import warnings
 from bisect import bisect_right
@@ -177,9 +178,10 @@ def open_ply(path: Path) -> PlyData:
         with _stream(path, end, text=text) as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty list, a number beyond the column's type
             data = PlyData.read(file, mmap="r")
+        mapped = () if "chunk" in data or sys.platform == "win32" else ("vertex",)  # no result replaces it on Windows
         for element in data.elements:
-            if isinstance(element.data, np.memmap) and (element.name != "vertex" or "chunk" in data):
-                with open_rows(path, element.data) as read:  # small, or packed
+            if isinstance(element.data, np.memmap) and element.name not in mapped:
+                with open_rows(path, element.data) as read:
                     element.data = read(slice(None))
         return data
     except OSError as error:

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.archives import open_archive, read_member
+from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.kernels.elementary import expm1, log1p
@@ -244,7 +244,7 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         for name, data in sog_files(columns, mip=arrays.MIP_COMMENT in comments).items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # of 1980: the same bytes at any time
+            archive.writestr(new_member(name), data)
     return content.getvalue()
 
 

@@ -354,12 +354,12 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
     Each chunk comes with its number of Gaussians if the index has it.
     """
-    root, seen = os.path.realpath(path.parent), set[str]()
+    root, seen = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
     num_bytes, total, num_higher = check_file(path), 0, 0
     for chunk, count in chunks.items():
-        place = os.path.realpath(chunk)
-        if os.path.commonpath([root, place]) != root or place in seen:
+        place = Path(os.path.realpath(chunk))
+        if not place.is_relative_to(root) or place in seen:
             problem = f"{chunk}: expected a file of its own inside the folder, found a link to another"
             raise SceneError(path, problem, "export it again")
         seen.add(place)

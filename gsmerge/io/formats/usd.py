@@ -13,11 +13,12 @@ from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile, ZipInfo
+from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.io.archives import new_member
 from gsmerge.io.formats.arrays import Columns, to_columns, turn_half
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Gaussians
@@ -27,7 +28,7 @@ PRIM, LAYER = "Gaussians", "scene.usdc"
 # As the extra asks for; the second works beside a wheel and in a checkout
 INSTALL = 'install gsmerge[usd], or pip install "usd-core>=26.3,<27"'
 # USDZ: contents begin at multiples of 64 bytes, behind an extra field of this kind; a file's header has 30 bytes
-_ALIGNMENT, _PADDING, _ZIP_HEADER, _UNIX, _EXTRA = 64, 0x1986, 30, 3, struct.Struct("<HH")
+_ALIGNMENT, _PADDING, _ZIP_HEADER, _EXTRA = 64, 0x1986, 30, struct.Struct("<HH")
 _REACH = 3.0  # standard deviations about a centre that the extent holds
 
 
@@ -51,9 +52,9 @@ def usdz_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 
     The archive is written here, since USD's own writer puts the time of day into it.
     """
-    package, layer = BytesIO(), ZipInfo(LAYER)  # at the first time that the format knows
+    package, layer = BytesIO(), new_member(LAYER)
     padding = -(_ZIP_HEADER + len(layer.filename) + _EXTRA.size) % _ALIGNMENT
-    layer.extra, layer.create_system = _EXTRA.pack(_PADDING, padding) + bytes(padding), _UNIX
+    layer.extra = _EXTRA.pack(_PADDING, padding) + bytes(padding)
     with ZipFile(package, "w", ZIP_STORED) as archive:
         archive.writestr(layer, usdc_bytes(gaussians))
     return package.getvalue()

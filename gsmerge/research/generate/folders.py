@@ -74,7 +74,7 @@ def generate_scene(
             _write_views(temporary, scene.cameras, scene.images)
             _write_views(temporary / "targets", scene.targets, scene.target_images)
             write_ply(temporary / "scene.ply", scene.gaussians)
-            (temporary / RECORD).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            (temporary / RECORD).write_bytes(json.dumps(record, indent=1).encode() + b"\n")
     return folder
 
 
@@ -177,4 +177,4 @@ def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> Non
     K = cameras.Ks[0]
     shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}
     document = {"camera_model": "PINHOLE", **shared, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (folder / "transforms.json").write_bytes(json.dumps(document, indent=1).encode() + b"\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields, make_dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -94,7 +93,7 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
     for name in RANGES:
         low, high = getattr(options, name)
         spread = name in SPREAD
-        drawn[name] = math.exp(rng.uniform(math.log(low), math.log(high))) if spread else rng.uniform(low, high)
+        drawn[name] = float(exp(rng.uniform(log(low), log(high)))) if spread else rng.uniform(low, high)
     for name in ERRORS:
         drawn[name] *= factor
     for name in ("bleed", "patches", "floaters", "oversized"):
@@ -119,7 +118,7 @@ def smooth_noise(rng: np.random.Generator, height: int, width: int, cells: int) 
     """Draw smooth noise ``[height,width]`` of standard deviation 1, with ``cells`` cells along the longer side."""
     side = max(height, width)
     field = enlarge(rng.normal(0, 1, (cells, cells)), side)[:height, :width]
-    return field / max(float(field.std()), 1e-3)
+    return field / max(float(field.std(dtype=np.float64)), 1e-3)
 
 
 def edge_mask(depth: Array) -> Float:
@@ -158,7 +157,7 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     worse = 1 + noise.blank * blank + 3 * beyond
     drift = noise.drift * smooth_noise(rng, height, width, int(rng.integers(3, 7)))
     field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
-    limit = np.quantile(field, 1 - noise.patches)
+    limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
     patch = np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
     wrong = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
     grain = noise.grain * rng.normal(0, 1, depth.shape)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.kernels.elementary import cos, sin
 from gsmerge.research.generate.photograph import Light, Stage
 from gsmerge.research.generate.shapes import (
     LYING,
@@ -270,7 +271,7 @@ def _shell(shapes: list[Shape], *, glow: bool = False) -> list[Shape]:
 def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
     """Draw a sun or a lamp above and in front of the scene, warm or cool."""
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
-    towards = np.array([np.sin(side), -up, -np.cos(side)])
+    towards = np.array([sin(side), -up, -cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
     ambient = rng.uniform(0.5, 1.1) * (1 + (0.3 * color(rng, hue=(0.5, 0.7), strength=(0, 0.3), light=(0.9, 1)) - 0.3))
     return Light(towards / norm(towards), lamp_at, key, ambient, rng.uniform(0.02, 0.2))
@@ -364,7 +365,7 @@ def garden(pal: Palette) -> Stage:
     crown = pal.material("crown", repeat=2 / size, gloss=0.0)
     for angle in rng.uniform(0, 2 * np.pi, rng.integers(0, 25)):
         away, tall = size * rng.uniform(3, 12), size * rng.uniform(0.2, 0.9)
-        spot = away * np.sin(angle), -0.4 * tall, away * np.cos(angle)
+        spot = away * sin(angle), -0.4 * tall, away * cos(angle)
         shapes.append(blob(spot, (tall * rng.uniform(0.5, 2), tall, tall), crown, rng, 0.5))
     dome = ball((0, 0, 0), (30 * size, 18 * size, 30 * size), pal.material("sky", gloss=0.0))
     shapes = [*_shell(shapes), *_shell([dome], glow=True)]

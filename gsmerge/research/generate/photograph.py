@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
-from gsmerge.kernels.elementary import arctan2, power
+from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.research.generate.shapes import (
     Array,
     Shape,
@@ -159,7 +159,7 @@ def light_stage(stage: Stage) -> LitStage:
     rotations = np.arange(AMBIENT_MAPS) + 0.5  # evenly over the sphere (Fibonacci)
     up, angle = 1 - 2 * rotations / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * rotations
     flat = np.sqrt(1 - up**2)
-    ambient = np.stack([flat * np.cos(angle), -up, flat * np.sin(angle)], 1)
+    ambient = np.stack([flat * cos(angle), -up, flat * sin(angle)], 1)
     axes = np.stack([_axes(towards) for towards in (*key, *ambient)])
     return LitStage(
         stage,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
+from gsmerge.kernels.elementary import cos, sin
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -69,8 +70,8 @@ def axis_rotation(axis: int, angle: float) -> Array:
     """Compute the rotation ``[3,3]`` about a coordinate axis, radians."""
     out = np.eye(3)
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
-    out[i, i] = out[j, j] = np.cos(angle)
-    out[i, j], out[j, i] = -np.sin(angle), np.sin(angle)
+    out[i, i] = out[j, j] = cos(angle)
+    out[i, j], out[j, i] = -sin(angle), sin(angle)
     return out
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.kernels.elementary import exp
+from gsmerge.geometry import quat_to_rotmat
+from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -54,8 +55,8 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     right /= norm(right)
     down = np.cross(forward, right)
     out = np.eye(4)
-    out[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
-    out[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
+    out[:3, 0] = cos(roll) * right + sin(roll) * down
+    out[:3, 1] = cos(roll) * down - sin(roll) * right
     out[:3, 2], out[:3, 3] = forward, eye
     return out
 
@@ -63,7 +64,7 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> Array:
     """Compute the position ``[3]`` at an angle (degrees, 0 towards -z), a distance from the focus and a height."""
     x, _, z = stage.focus
-    return np.array([x + distance * np.sin(np.deg2rad(angle)), -height, z - distance * np.cos(np.deg2rad(angle))])
+    return np.array([x + distance * sin(np.deg2rad(angle)), -height, z - distance * cos(np.deg2rad(angle))])
 
 
 def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high: float) -> Pose:
@@ -76,8 +77,8 @@ def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
-        eye = _orbit_point(stage, start + span * s, distance * (1 + closer * s), height + swing * np.sin(6 * s + phase))
-        return look_at(eye, stage.focus, 0.03 * np.sin(5 * s + phase))
+        eye = _orbit_point(stage, start + span * s, distance * (1 + closer * s), height + swing * sin(6 * s + phase))
+        return look_at(eye, stage.focus, 0.03 * sin(5 * s + phase))
 
     return pose
 
@@ -90,9 +91,9 @@ def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
     sways, turn = rng.integers(2, 4), rng.normal(0, 0.03, 3)
 
     def pose(s: float) -> Array:
-        across, down = reach * np.sin(2 * np.pi * sways * s), reach * (s - 0.5)
+        across, down = reach * sin(2 * np.pi * sways * s), reach * (s - 0.5)
         place = eye + across * axes[:3, 0] + down * axes[:3, 1]
-        return look_at(place, stage.focus + place - eye + turn * np.sin(7 * s + np.arange(3)), 0.02 * np.sin(9 * s))
+        return look_at(place, stage.focus + place - eye + turn * sin(7 * s + np.arange(3)), 0.02 * sin(9 * s))
 
     return pose
 
@@ -106,7 +107,7 @@ def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
     phase = rng.uniform(0, 6.28, 3)
 
     def pose(s: float) -> Array:
-        return look_at(a + (b - a) * s, stage.focus + wander * np.sin(4 * s + phase), 0.03 * np.sin(6 * s + phase[0]))
+        return look_at(a + (b - a) * s, stage.focus + wander * sin(4 * s + phase), 0.03 * sin(6 * s + phase[0]))
 
     return pose
 
@@ -244,8 +245,8 @@ def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: floa
     linear = radiance(scene, pose, lens, SAMPLES)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    away = np.hypot(x - lens.width / 2, y - lens.height / 2) / np.hypot(lens.width, lens.height)
-    linear = linear * gains.astype(np.float32) * (1 - 0.3 * away**2)[..., None].astype(np.float32)
+    away = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
+    linear = linear * gains.astype(np.float32) * (1 - 0.3 * away)[..., None].astype(np.float32)
     image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
@@ -253,9 +254,11 @@ def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: floa
 
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
     """Add the network's error to a pose; ``deviation [2,3]``: of rotation and position, in units of their strengths."""
-    turn, _ = cv2.Rodrigues(np.deg2rad(noise.turn) * deviation[0] / 3**0.5)
+    turn = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
+    angle = np.sqrt((turn * turn).sum())
+    quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * turn)])
     out = pose.copy()
-    out[:3, :3] = compose(pose[:3, :3], turn)
+    out[:3, :3] = compose(pose[:3, :3], quat_to_rotmat(quat))
     out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
     return out
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.kernels.elementary import power
+from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.research.generate.shapes import Material
 
 Picture: TypeAlias = NDArray[Any]  # float32
@@ -86,7 +86,7 @@ def cells(rng: np.random.Generator, size: int, count: int) -> tuple[Grey, Grey]:
         for j in (-1, 0, 1):
             centre = at[(row + i) % count, (column + j) % count]
             dx, dy = x - centre[..., 0], y - centre[..., 1]
-            d = np.hypot(dx - np.round(dx), dy - np.round(dy))
+            d = np.sqrt((dx - np.round(dx)) ** 2 + (dy - np.round(dy)) ** 2)
             tone = np.where(d < nearest, tones[(row + i) % count, (column + j) % count], tone)
             second = np.minimum(second, np.maximum(d, nearest))
             nearest = np.minimum(nearest, d)
@@ -170,7 +170,7 @@ def marble(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, color(rng, strength=(0, 0.3), light=(0.4, 0.9)), 0.5)
     bend = noise(rng, size, fade=0.55)
     x, y = grid(size)
-    veins = power(np.abs(np.sin(np.pi * (2 * x + 2 * y + 3 * bend))), 0.4)
+    veins = power(np.abs(sin(np.pi * (2 * x + 2 * y + 3 * bend))), 0.4)
     return mix(low, high, 0.8 * veins + 0.2 * noise(rng, size, first=16, fade=0.8))
 
 
@@ -179,7 +179,7 @@ def wood(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, color(rng, hue=(0.04, 0.11), strength=(0.3, 0.7), light=(0.3, 0.8)), 0.45)
     planks = int(rng.integers(2, 7))
     tone, joint = courses(rng, size, planks, int(rng.integers(1, 3)), joint=rng.uniform(0.01, 0.03), offset=0.5)
-    rings = np.abs(np.sin(20 * noise(rng, size, first=16, fade=0.35, stretch=8) + 9 * tone))
+    rings = np.abs(sin(20 * noise(rng, size, first=16, fade=0.35, stretch=8) + 9 * tone))
     fibres = noise(rng, size, first=128, fade=0.8, stretch=32)
     out = mix(low, high, 0.35 * rings + 0.35 * fibres + 0.3 * tone)
     return (out * (1 - 0.7 * joint[..., None])).astype(np.float32)
@@ -225,7 +225,7 @@ def cloth(rng: np.random.Generator, size: int) -> Picture:
     kind = rng.integers(0, 3)
     amount = bands[0] if kind == 0 else 0.5 * bands[0] + 0.5 * bands[1] if kind == 1 else np.zeros_like(x)
     threads = 2 ** int(rng.integers(5, 8))
-    weave = 0.5 + 0.5 * np.sin(2 * np.pi * threads * x) * np.sin(2 * np.pi * threads * y)
+    weave = 0.5 + 0.5 * sin(2 * np.pi * threads * x) * sin(2 * np.pi * threads * y)
     shade = 0.75 + 0.15 * weave + 0.2 * (noise(rng, size, fade=0.7) - 0.5)
     return np.clip(mix(base, other, amount) * shade[..., None], 0, 1).astype(np.float32)
 
@@ -263,7 +263,7 @@ def foliage(rng: np.random.Generator, size: int) -> Picture:
     low, high = shades(rng, base, 0.45)
     x, y = grid(size)
     side = np.abs(x - 0.5)
-    veins = np.clip(1 - np.abs(np.sin(np.pi * 12 * (y - side))) * 5, 0, 1) * 0.5
+    veins = np.clip(1 - np.abs(sin(np.pi * 12 * (y - side))) * 5, 0, 1) * 0.5
     rib = np.clip(1 - side * 30, 0, 1)
     return mix(low, high, np.clip(0.35 * noise(rng, size, fade=0.7) + np.maximum(veins, rib) + 0.4 * (1 - y), 0, 1))
 
@@ -280,7 +280,7 @@ def crown(rng: np.random.Generator, size: int) -> Picture:
 def gradient(rng: np.random.Generator, size: int) -> Picture:
     """Fade from one colour into another and back."""
     _, y = grid(size)
-    return mix(color(rng), color(rng), 0.5 - 0.5 * np.cos(2 * np.pi * y))
+    return mix(color(rng), color(rng), 0.5 - 0.5 * cos(2 * np.pi * y))
 
 
 def printed(rng: np.random.Generator, size: int) -> Picture:
@@ -334,7 +334,7 @@ def spines(rng: np.random.Generator, size: int) -> Picture:
         if book.shape[1] > size // 40:
             line = text_line(rng, letters, book.shape[1], size)
             book += (color(rng, strength=(0, 0.3), light=(0.8, 1)) - book) * line.T[:, : book.shape[1], None] * 0.8
-        book *= np.sqrt(np.sin(np.linspace(0.5, 2.6, book.shape[1])))[None, :, None]
+        book *= np.sqrt(sin(np.linspace(0.5, 2.6, book.shape[1])))[None, :, None]
         book[: int(rng.uniform(0, 0.2) * size)] *= 0.12
         x += width
     return page

@@ -222,7 +222,7 @@ def _save(out: Path, state: TrainingState, rows: Sequence[Row], head: Mapping[st
     save_checkpoint(out / "last.safetensors", networks.weights(), training)
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
+        temporary.write_bytes("\n".join([*lines, ""]).encode())
     save_state(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **head})
 
 

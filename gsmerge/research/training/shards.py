@@ -101,7 +101,7 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Repo
     if hashes is None:
         hashes = _make_shards(scene, options, folder / key[:32], report)
         with atomic_output(record, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(hashes, indent=1) + "\n")
+            temporary.write_bytes(json.dumps(hashes, indent=1).encode() + b"\n")
     return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
 
 

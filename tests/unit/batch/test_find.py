@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("inside")
 
 
 def actual(*given: str, out: Path = OUT) -> list[str]:
-    return [str(scene) for scene in find_scenes(given, out)]
+    return [scene.as_posix() for scene in find_scenes(given, out)]
 
 
 def test_folders_are_searched() -> None:
@@ -107,6 +107,7 @@ def test_a_link_to_itself_is_passed_by() -> None:
     assert actual("all") == ["all/a.ply"]
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
 def test_a_folder_of_too_many_others_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.batch.find.MAX_FOLDERS", 3)
     touch("system/1/2/3/4.txt", "all/a.ply", *(f"many/{i}/scene.ply" for i in range(9)))

@@ -43,7 +43,8 @@ def test_templates_that_make_no_sense_are_refused(template: str) -> None:
 
 
 def outputs(*arguments: str, options: BatchOptions | None = None, results: Collection[str] = ()) -> dict[str, str]:
-    return {job.output: job.scene for job in find_jobs(arguments, OUT, options or BatchOptions(), results)}
+    jobs = find_jobs(arguments, OUT, options or BatchOptions(), results)
+    return {job.output: Path(job.scene).as_posix() for job in jobs}
 
 
 def test_results_of_former_runs_are_no_scenes() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from messages import refuses
+from messages import NO_FOLDER, refuses
 
 from gsmerge.batch.records import DONE, FAILED, RECORDS, RecordIndex, Result, check_folder, record
 from gsmerge.errors import SceneError
@@ -104,7 +104,7 @@ def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with refuses(SceneError, "out", "Not a directory", "--output"):
+    with refuses(SceneError, "out", *NO_FOLDER, "--output"):
         check_folder(tmp_path / "file" / "out")
     assert check_folder(tmp_path / "new" / "out") == 0
     assert (tmp_path / "new" / "out" / RECORDS).exists()

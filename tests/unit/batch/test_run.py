@@ -44,7 +44,7 @@ def test_a_mark_that_is_left_says_that_a_process_has_begun(tmp_path: Path) -> No
 
 
 def test_a_lock_that_cannot_be_removed_is_used_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on Windows, which removes no open file."""
+    """As on Windows, which removes no open file: the release does it there."""
 
     def refuse(path: Path, *_: Any, **__: Any) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
@@ -53,7 +53,7 @@ def test_a_lock_that_cannot_be_removed_is_used_again(tmp_path: Path, monkeypatch
     for _ in range(2):
         with lock_result(tmp_path, "room.ply", wait=False) as begun:
             assert begun is not None
-    assert [path.suffix for path in tmp_path.iterdir()] == [".lock"]
+    assert [path.suffix for path in tmp_path.iterdir()] == ([] if sys.platform == "win32" else [".lock"])
 
 
 def test_a_full_disk_is_named(small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,7 +95,7 @@ def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> No
 def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with (
-        pytest.raises(SceneError, match="File exists"),
+        pytest.raises(SceneError, match="exists"),
         lock_result(tmp_path / "file", "a.ply", wait=False),
     ):
         pass
@@ -289,6 +289,7 @@ KILLS = {
 }
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals as POSIX has them")
 @pytest.mark.parametrize(
     "moment", [pytest.param(name, marks=[] if name == "before the record" else [pytest.mark.slow]) for name in KILLS]
 )

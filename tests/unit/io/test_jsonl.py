@@ -41,15 +41,9 @@ def test_lines_can_be_read_from_the_middle(tmp_path: Path) -> None:
     assert ends[-1] == path.stat().st_size
 
 
-def test_lines_are_written_where_files_cannot_be_locked(tmp_path: Path) -> None:
-    """As on Windows, which has no fcntl."""
-    path = tmp_path / "lines.jsonl"
-    subprocess.run([sys.executable, "-c", f"import sys; sys.modules['fcntl'] = None{APPEND}", path, "a"], check=True)
-    assert [value["number"] for _, value in each_line(path) if value is not None] == list(range(25))
-
-
 def test_a_line_that_does_not_fit_leaves_the_file_as_it_was(tmp_path: Path) -> None:
     """A full disk takes the first part of a line: stood in for by the largest size of a file."""
+    pytest.importorskip("resource")
     path = tmp_path / "lines.jsonl"
     append_line(path, {"number": 0})
     whole = path.read_bytes()
@@ -110,7 +104,7 @@ def test_what_is_no_json_is_refused_and_leaves_the_file_alone(tmp_path: Path) ->
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with refuses(SceneError, "lines.jsonl", "File exists", "--output"):
+    with refuses(SceneError, "lines.jsonl", "exists", "--output"):
         append_line(tmp_path / "file" / "lines.jsonl", {})
 
 

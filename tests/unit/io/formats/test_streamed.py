@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
-from messages import refuses
+from messages import NO_FOLDER, refuses
 from slow_readers import corners, drawn
 
 from gsmerge import Gaussians, Scene
@@ -227,7 +227,7 @@ def test_extremes_and_single_gaussians(tmp_path: Path) -> None:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_same_levels_give_the_same_bytes(tmp_path: Path, small: None) -> None:
@@ -251,7 +251,7 @@ def test_failures_leave_existing_files_and_nothing_else(tmp_path: Path) -> None:
     with refuses(ValueError, "", "finite", 1):
         write_levels(index, [bad], overwrite=True)
     assert content(tmp_path) == before
-    with refuses(SceneError, "scene", "Not a directory"):
+    with refuses(SceneError, "scene", *NO_FOLDER):
         write_levels(index / "scene" / "lod-meta.json", [corners()])
     with refuses(UsageError, "levels.json", "lod-meta.json"):
         write_levels(tmp_path / "levels.json", [corners()])

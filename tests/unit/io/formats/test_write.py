@@ -236,7 +236,7 @@ def test_the_layout_is_inrias(tmp_path: Path, tiny: Tiny) -> None:
     assert not vertex["nx"].any()
 
 
-def test_tensors_are_written_alike(tmp_path: Path, tiny: Tiny) -> None:
+def test_tensors_are_written_alike(tmp_path: Path, tiny: Tiny, torch: object) -> None:
     write_ply(tmp_path / "a.ply", tiny.gaussians)
     tensors = tiny.gaussians.to("cpu")
     write_ply(tmp_path / "b.ply", replace(tensors, means=tensors.means.clone().requires_grad_()))
