@@ -207,8 +207,8 @@ def _with_optimised_poses(views: list[View], folder: Path) -> list[View]:
     """Return views with the poses that InstantSplat optimised, where it wrote them with those that it began from."""
     from gsmerge.io.cameras.npz_files import read_matrices  # few folders need it
 
-    found = max(folder.glob("ours_*/pose_optimized.npy"), key=lambda path: natural_key(path.parent.name), default=None)
-    before, after = (None, None) if found is None else map(read_matrices, (found.with_name("pose_org.npy"), found))
+    last = max(folder.glob("ours_*/pose_optimized.npy"), key=lambda path: natural_key(path.parent.name), default=None)
+    before, after = (None, None) if last is None else map(read_matrices, (last.with_name("pose_org.npy"), last))
     if before is None or after is None or not len(before) == len(after) == len(views):
         return views
     try:

@@ -89,8 +89,8 @@ def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
     z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
     rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
     with np.errstate(all="ignore"):
-        found = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
-        errors = np.abs(np.array(found) - z[..., 0])
+        each = (xyz * rotations[..., 2, :]).sum(-1) + shifts[..., 2], ((xyz - shifts) * rotations[..., 2]).sum(-1)
+        errors = np.abs(np.array(each) - z[..., 0])
     as_w2c, as_c2w = errors[:, np.isfinite(errors).all(0)]
     return len(as_w2c) > 0 and bool(np.median(as_c2w) < np.median(as_w2c))
 
