@@ -24,12 +24,13 @@ _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
 _ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
 _SIMILAR, _SLACK = 0.3, 0.08  # share that have it about as far, and by how much that may differ
-_SEEDS, _TRIED, _AS_NEAR = 12, 200, 1.3  # series of lines: looked at first, solved; times their least distance: good
+_SEEDS, _TRIED, _AS_NEAR = 12, 200, 1.15  # series of lines: looked at first, solved; times their least distance: good
 _AGAIN = 3  # rounds of placing all rows of a view that lack pixels here and there
 _MARGIN = 0.2  # of the length of lines that lack pixels: columns that those of a seed may lack on both sides
 _ROUGH, _ROUNDS = 0.03, 12  # of a line: median error of rows that are spread evenly over it; rounds from there
 _SLANT, _SLANTS = 4.0, 32  # columns by which lines may slant in all, and how many slants each way are tried
 _FULL = 0.75  # share of the lines that lack more pixels than those whose rows are spread evenly at first
+_OBLONG = 0.05  # by which pixels may be oblong, where rows do not show it clearly
 _CLOSER = 0.99  # times the distance: another round is worth it
 _COMMON, _RARE = 0.5, 0.05  # of the lines that a column has, in a few whole ones and in a view
 _OUTSIDE = 1e6  # pixels
@@ -37,9 +38,11 @@ _WRAP, _BELOW = 8.0, 0.25  # times the usual step: back to the left; share of it
 _MOST_JUMPS = 100  # in a line; more are rows in no order
 _MIN_LINES = 6  # whole lines in a row
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
-_MAX_PX = 0.6  # median distance of rows from their pixels
-_RISE = 0.75  # of a step to the next pixel of a line, at most, pixels
-_RUN = 3  # rows from pixel to pixel that are no chance
+_MAX_PX = 1.0  # median distance of rows from their pixels
+_GAP, _RISE = 4.0, 2.0  # pixels that a piece of a line may lack at once, and of a step to another line, at most
+_CROOKED = 0.8  # mean distance of rows from their line, pixels
+_AROUND = 3  # rows before and after
+_RUN = 8  # rows from pixel to pixel that are no chance
 _SAME = 2  # pixels by which the principal point may be off
 _AHEAD, _MIN_AHEAD = 0.3, 2  # lines that a camera is trusted beyond those it is solved from, as a share, and at least
 _MAX_MIXED = 16  # views whose rows lie side by side
@@ -199,40 +202,55 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _View | None:
     x = np.rint((rows - np.repeat(starts[:-1], lengths)) * (longest / np.repeat(lengths, lengths))).astype(np.int64)
     view = _View(rows, x, y, np.empty(0))
     full = np.repeat(lengths >= np.quantile(lengths, _FULL), lengths)
-    rough = _solve(points, _View(rows[full], x[full], y[full], np.empty(0)), _ROUGH * longest)
-    if rough is None:
+    if lengths.min() == longest:
+        view = _solve(points, view)
+        return view if view.px <= _MAX_PX else None
+    rough = _solve(points, _View(rows[full], x[full], y[full], np.empty(0)))
+    if rough.px > _ROUGH * longest:
         return None
     view = replace(view, camera=rough.camera)
+    lines = pieces = starts[:-1] - starts[0]
     for turn in range(_ROUNDS):
         u, _ = _project(points[rows], view.camera)
-        begins = starts[:-1] - starts[0]
         if turn == 0:
-            u /= _column_step(u, begins, lengths)
+            u /= _column_step(u, lines, lengths, _oblongness(view.camera))
         else:  # gaps are known well enough now
-            begins = np.union1d(begins, np.flatnonzero(np.abs(np.diff(u) - 1) > 0.5) + 1)
-        nearer = _solve(points, replace(view, x=_whole_columns(u, y, begins)), _ROUGH * longest)
-        if nearer is None or nearer.px > _CLOSER * view.px:
+            pieces = np.union1d(lines, np.flatnonzero(np.abs(np.diff(u) - 1) > 0.5) + 1)
+        u, whole = _whole_columns(u, y, pieces)
+        tries = [replace(view, x=x) for x in (whole, _smooth_columns(u, lines, lengths))]
+        nearer = min((_solve(points, each) for each in tries), key=lambda each: each.px)
+        if not nearer.px <= min(_CLOSER * view.px, _ROUGH * longest):
             break
         view = nearer
     return _common_columns(view, _COMMON) if view.px <= _MAX_PX else None
 
 
-def _column_step(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> float:
-    """Return how far apart neighbouring columns lie in ``u [n]``, if most pixels have their neighbour."""
+def _column_step(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray, square: float) -> float:
+    """Return how far apart neighbouring columns lie in ``u [n]``, if most pixels have their neighbour.
+
+    ``square``: the same if pixels are square, which is near the truth and counts where Gaussians lie anywhere in their
+    pixels.
+    """
     steps = np.diff(u)
-    usual = float(np.median(steps))
-    near = steps[np.abs(steps - usual) < abs(usual) / 2]
-    if usual <= 0 or not len(near):
-        return 1.0
-    columns, _ = _count_columns(u / near.mean(), starts)
+    near = steps[np.abs(steps - square) < square / 2]
+    columns, _ = _count_columns(u / (near.mean() if len(near) else square), starts)
     across = columns - np.repeat(np.add.reduceat(columns, starts) / lengths, lengths)
-    return float((across * u).sum() / (across * across).sum()) or 1.0
+    step = float((across * u).sum() / max(1.0, (across * across).sum()))
+    return step if abs(step / square - 1) < _OBLONG else square
 
 
-def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarray:
+def _oblongness(camera: np.ndarray) -> float:
+    """Return the ratio of the focal lengths of a projective camera (Hartley and Zisserman 2004, section 6.2)."""
+    forward = camera[2, :3] / np.linalg.norm(camera[2, :3])
+    x, y = (np.linalg.norm(axis - (axis * forward).sum() * forward) for axis in camera[:2, :3])
+    return float(x / y)
+
+
+def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Round the columns ``u [n]`` of rows in lines ``y [n]``, that are known up to a shift and a slant.
 
-    Those of a piece, which begin at ``starts``, are rounded together. Columns are counted from anywhere.
+    Those of a piece, which begin at ``starts``, are rounded together. First returns ``u`` without shift and slant.
+    Columns are counted from anywhere.
     """
     columns, places = _count_columns(u, starts)
     slants = np.linspace(-_SLANT, _SLANT, 2 * _SLANTS + 1) / max(1, y[-1])
@@ -242,8 +260,8 @@ def _whole_columns(u: np.ndarray, y: np.ndarray, starts: np.ndarray) -> np.ndarr
     size = np.sqrt(real * real + imaginary * imaginary)
     best = size.argmax()
     turn = np.sign(imaginary[best]) * arccos((real[best] / max(size[best], 1e-300)).clip(-1, 1))
-    places -= slants[best] * y[starts] + turn / (2 * np.pi)
-    return columns + np.repeat(np.rint(places).astype(np.int64), lengths)
+    away = slants[best] * y + turn / (2 * np.pi)
+    return u - away, columns + np.repeat(np.rint(places - away[starts]).astype(np.int64), lengths)
 
 
 def _common_columns(view: _View, share: float) -> _View:
@@ -299,7 +317,7 @@ def _grow(points: np.ndarray, free: np.ndarray, view: _View, width: int) -> _Vie
         x = np.concatenate([width - 1 - before[1][::-1], view.x, after[1]])
         y = np.concatenate([-1 - before[2][::-1], view.y, after[2]])
         grown = _solve(points, _View(rows, x, y, view.camera))
-        if grown is None:
+        if grown.px > _MAX_PX:
             return view
         view = grown
 
@@ -313,8 +331,8 @@ def _place_again(points: np.ndarray, view: _View, width: int) -> _View:
     """Place all rows of a view by its camera."""
     first, lines = int(view.rows[0]), int(np.ptp(view.y)) + 1
     rows, x, y = _walk(points[first : view.rows[-1] + 1], view.camera, (-1, int(view.y[0])), width, lines)
-    again = _solve(points, _View(first + rows, x, y, view.camera)) if len(rows) else None
-    return view if again is None else again
+    again = _solve(points, _View(first + rows, x, y, view.camera)) if len(rows) else view
+    return again if again.px <= _MAX_PX else view
 
 
 def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
@@ -323,12 +341,12 @@ def _free_range(free: np.ndarray, rows: np.ndarray) -> tuple[int, int]:
     return int(before[-1]) + 1 if len(before) else 0, int(rows[-1] + after[0]) if len(after) else len(free)
 
 
-def _solve(points: np.ndarray, view: _View, max_px: float = _MAX_PX) -> _View | None:
-    """Solve for the camera of a view; None if its rows lie farther from their pixels."""
+def _solve(points: np.ndarray, view: _View) -> _View:
+    """Solve for the camera of a view."""
     chosen = np.linspace(0, len(view.rows) - 1, min(_SOLVED_FROM, len(view.rows))).astype(int)
     pixels = np.stack([view.x[chosen], view.y[chosen]], 1) + 0.5
     camera, px = projective_camera(points[view.rows[chosen]], pixels)
-    return replace(view, camera=camera, px=px) if px <= max_px else None
+    return replace(view, camera=camera, px=px)
 
 
 def _walk(
@@ -343,16 +361,18 @@ def _walk(
     if not len(points):
         return (np.empty(0, np.int64),) * 3
     u, v = _project(points, camera)
-    gaps = (np.abs(np.diff(u) - 1) > 0.5) | (np.abs(np.diff(v)) > _RISE)
-    starts = np.flatnonzero(np.concatenate([[True], gaps]))
+    cuts = (np.abs(np.diff(u) - 1) > _GAP) | (np.abs(np.diff(v)) > _RISE)
+    starts = np.flatnonzero(np.concatenate([[True], cuts]))
     lengths = np.diff(np.append(starts, len(u)))
-    x, places = _count_columns(u, starts)
-    x += np.repeat(np.rint(places), lengths).astype(np.int64)
-    y = np.rint(np.add.reduceat(v, starts) / lengths).astype(np.int64)
+    x = _smooth_columns(u, starts, lengths).clip(0, width - 1)
+    middles = np.add.reduceat(v, starts) / lengths
+    y = np.rint(middles).astype(np.int64)
+    straight = np.add.reduceat(np.abs(v - np.repeat(y, lengths)), starts) <= _CROOKED * lengths
     firsts, lasts = x[starts], x[starts + lengths - 1]
+    ends = u[starts], u[starts + lengths - 1]
     after, line, lost, end = last[1] * width + last[0], last[1], 0, 0
     follows = np.zeros(len(starts), bool)
-    inside = (firsts >= 0) & (lasts < width) & (y <= last[1] + reach)
+    inside = straight & (ends[0] >= -1.5) & (ends[1] < width + 0.5) & (y <= last[1] + reach)
     pieces = zip(y.tolist(), firsts.tolist(), lasts.tolist(), lengths.tolist(), strict=True)
     for i, (height, first_x, last_x, length) in enumerate(pieces):
         if inside[i] and height * width + first_x > after:
@@ -366,6 +386,19 @@ def _walk(
     follows[end:] = False
     placed = np.flatnonzero(np.repeat(follows, lengths))
     return placed, x[placed], np.repeat(y, lengths)[placed]
+
+
+def _smooth_columns(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Round the columns ``u [n]`` of rows in pieces of a line that begin at ``starts [p]``.
+
+    Gaussians lie anywhere in their pixels. So the number of pixels that a piece lacks so far is the median over some
+    rows before and after, which is exact for numbers that only grow.
+    """
+    every = np.arange(len(u))
+    first, last = np.repeat(starts, lengths), np.repeat(starts + lengths - 1, lengths)
+    lacking = u - every
+    around = np.stack([lacking[np.clip(every + k, first, last)] for k in range(-_AROUND, _AROUND + 1)])
+    return (every + np.rint(np.median(around, 0))).astype(np.int64)
 
 
 def _find_mixed(points: np.ndarray) -> list[_View]:
@@ -393,9 +426,10 @@ def _solve_mixed(points: np.ndarray, begins: np.ndarray, count: int, width: int)
     first = int((begins[0] + np.arange(count) - count * begun).min())
     number = np.arange(width * (len(begins) - 1))
     y, x = np.divmod(number, width)
-    seeds = [_solve(points, _View(first + view + count * number, x, y, np.empty(0))) for view in range(count)]
-    views = [seed for seed in seeds if seed is not None]
-    return views if first >= 0 and len(views) == count else []
+    if first < 0:
+        return []
+    views = [_solve(points, _View(first + view + count * number, x, y, np.empty(0))) for view in range(count)]
+    return views if max(view.px for view in views) <= _MAX_PX else []
 
 
 def _grow_mixed(points: np.ndarray, views: list[_View], width: int) -> list[_View]:
@@ -415,12 +449,12 @@ def _grow_mixed(points: np.ndarray, views: list[_View], width: int) -> list[_Vie
             return views
         rows = np.concatenate([rows[0] - 1 - before[0][::-1], rows, rows[-1] + 1 + after[0]])
         keys = np.concatenate([-1 - before[1][::-1], keys, after[1]])
-        grown: list[_View] = []
+        grown = []
         for view in range(count):
             own = keys % count == view
             y, x = np.divmod(keys[own] // count, width)
-            grown += filter(None, [_solve(points, _View(rows[own], x, y, np.empty(0)))])
-        if len(grown) < count:
+            grown.append(_solve(points, _View(rows[own], x, y, np.empty(0))))
+        if max(view.px for view in grown) > _MAX_PX:
             return views
         views = grown
 

@@ -43,7 +43,7 @@ def test_nearly_every_row_comes_to_its_pixel(tmp_path: Path, smooth: Smooth, dro
 
 
 @sweep("size", [(96, 72), (64, 48)])
-@pytest.mark.parametrize("dropped", [0.1, 0.3, "faint", "far"])
+@pytest.mark.parametrize("dropped", [0.1, 0.2, "faint", "far"])
 @sweep("nested", [0.4, 1.0, 1.3])
 def test_dropped_pixels(tmp_path: Path, nested: float, dropped: float | str, size: tuple[int, int]) -> None:
     """At random, or by a rule; in the frame of the cameras, or in another scale, which can put rows near to others."""
@@ -84,6 +84,27 @@ def test_rows_alone(tmp_path: Path, order: str, dropped: float | str) -> None:
     assert scene.num_gaussians >= 0.99 * len(kept)
     assert np.allclose(scene.cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.02)
     assert np.allclose(scene.cameras.centres, tiny.c2w[:, :3, 3], atol=0.05)
+
+
+def test_gaussians_anywhere_in_their_pixels() -> None:
+    """Half a pixel to each side: rows that follow each other may even come in the wrong order."""
+    tiny, rng = smooth_scene(96, 72), np.random.default_rng(1)
+    views = np.arange(len(tiny.gaussians)) // (96 * 72)
+    points = tiny.gaussians.means.astype(np.float64)
+    depths = ((points - tiny.c2w[views, :3, 3]) * tiny.c2w[views, :3, 2]).sum(1)
+    steps = rng.uniform(-0.4, 0.4, (len(points), 2)) * depths[:, None] / tiny.K[0, 0]
+    points += (tiny.c2w[views, :3, :2] * steps[:, None]).sum(2)
+    kept = da3_rows(tiny)
+    grid = find_dropped_grid(points[kept].astype(np.float32), np.ones(len(kept), bool))
+    assert grid is not None
+    layout, calibration = grid
+    assert (layout.width, layout.height) == (90, 68)
+    rows, pixels = np.concatenate(layout.rows), np.concatenate(layout.pixels)
+    y, x = np.divmod(pixels, layout.width)
+    true_y, true_x = np.divmod(kept[rows] % (96 * 72), 96)
+    assert len(rows) >= 0.99 * len(kept)
+    assert np.mean((x + 3 == true_x) & (y + 2 == true_y)) > 0.99
+    assert np.allclose(calibration.cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.03)
 
 
 @pytest.mark.parametrize("index", ["shuffled", "sorted", "voxels"])
