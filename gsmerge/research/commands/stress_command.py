@@ -48,7 +48,7 @@ def stress(args: opt.Args) -> None:
     say_notes(notes, quiet=args.silent)
     names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]
     with stage_progress(quiet=args.silent) as progress:
-        outcomes = stress_scene(load, settings, targets=held_out, cases=names, progress=progress)
+        outcomes = stress_scene(load.scene, settings, targets=held_out, cases=names, progress=progress)
     document = {
         **document_head(),
         "input": str(load.files.ply),
