@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.compact import CHECKPOINTS
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
@@ -92,13 +91,6 @@ def model_files(output: Path) -> tuple[Path, ...]:
     return files_beside(output)
 
 
-def is_index(output: Path) -> bool:
-    """Return whether an output is the index of a Streamed SOG; its folder is made if missing."""
-    from gsmerge.io.formats.table import INDEX
-
-    return output.name == INDEX
-
-
 def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
     """Raise UsageError if an output's format cannot be written, or does not fit the options.
 
@@ -178,11 +170,6 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that reading the scene uses."""
     paths = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
     return (*paths, *(path for scene_files in files.more for path in input_files(scene_files)))
-
-
-def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
-    """Return the file of a checkpoint; empty if ``checkpoint`` names a checkpoint of the package."""
-    return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:

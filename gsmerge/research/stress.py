@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -196,16 +196,11 @@ class StressOutcome:
     """Outcome of one case."""
 
     case: str  # its name
-    change: str  # how the scene was changed, in words
-    expected: str  # the property that must hold
-    passed: bool | None  # whether it does; None where the case does not apply to the scene
-    measured: str  # the figures, or why the case does not apply
+    words: str  # how the scene was changed
+    wanted: str  # the property that must hold
+    held: bool | None  # whether it does; None where the case does not apply to the scene
+    found: str  # the figures, or why the case does not apply
     seconds: float  # wall time
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the outcome under the keys of the report."""
-        keys = ("case", "words", "wanted", "held", "found", "seconds")
-        return dict(zip(keys, vars(self).values(), strict=True))
 
 
 @dataclass(frozen=True)

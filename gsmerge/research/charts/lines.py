@@ -93,11 +93,6 @@ def mean_interval(values: Sequence[float]) -> Interval:
     return Interval(mean, mean - half, mean + half, len(array))
 
 
-def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
-    """Compute the mean difference over scenes that both have, so that the difficulty of scenes cancels out."""
-    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
-
-
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 

@@ -108,23 +108,23 @@ def test_every_case_on_a_scene_with_held_out_views(load: Loaded, made_scene: Pat
         progress=lambda *step: steps.append(step),
     )
     assert [outcome.case for outcome in actual] == list(CASES)
-    failed = {o.case: o.measured for o in actual if o.passed is False}
+    failed = {o.case: o.found for o in actual if o.held is False}
     assert failed == {}
-    assert [o.case for o in actual if o.passed is None] == []
+    assert [o.case for o in actual if o.held is None] == []
     assert steps[-1] == ("done", len(CASES), len(CASES))
 
 
 def test_a_scene_in_no_order_skips_what_needs_pixels(load: Loaded) -> None:
     unaligned = Scene(load.scene.gaussians, load.scene.cameras, load.scene.images, None, load.scene.names)
     actual = stress(unaligned, FAST, cases=["order", "views-3", "large"])
-    assert [outcome.passed for outcome in actual] == [None, None, True]
+    assert [outcome.held for outcome in actual] == [None, None, True]
 
 
 def test_without_photos(load: Loaded) -> None:
     bare = replace(load.scene, images=None)
     actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
-    assert [outcome.passed for outcome in actual] == [True, None, True]
-    assert "its input" in actual[0].measured  # by the colours of the pixels
+    assert [outcome.held for outcome in actual] == [True, None, True]
+    assert "its input" in actual[0].found  # by the colours of the pixels
 
 
 def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
@@ -154,13 +154,13 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
 def test_what_does_not_hold_is_noticed(change: Any, words: str, load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, change)
     outcome = stress(load.scene, FAST, cases=["large"])[0]
-    assert outcome.passed is False
-    assert words in outcome.measured
+    assert outcome.held is False
+    assert words in outcome.found
 
 
 def test_threads_that_change_a_bit_are_noticed(load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
-    assert stress(load.scene, FAST, cases=["threads"])[0].passed is False
+    assert stress(load.scene, FAST, cases=["threads"])[0].held is False
 
 
 def test_an_error_is_an_outcome(load: Loaded, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +169,7 @@ def test_an_error_is_an_outcome(load: Loaded, monkeypatch: pytest.MonkeyPatch) -
 
     spoilt(monkeypatch, broken)
     outcome = stress(load.scene, FAST, cases=["views-3"])[0]
-    assert (outcome.passed, outcome.measured) == (False, "ended with: scene.ply: expected mercy")
+    assert (outcome.held, outcome.found) == (False, "ended with: scene.ply: expected mercy")
 
 
 def test_bad_arguments(load: Loaded) -> None:
