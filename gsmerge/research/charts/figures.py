@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,14 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn
-MAX_TICKS, SAME_SIZE = 8, 1.15  # ticks at sizes; factor between the costs of results of one size
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 KEY_WIDTH, KEY_LINE = 2.3, 0.135  # of the key: inches, inches per line
@@ -212,7 +210,13 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
             axes.axhline(panel.reference, **{**styles[INPUT], "marker": ""})
         arrow = " ↑" if panel.higher else " ↓"
         axes.set(xlabel=figure.x_label + ", log scale" * figure.log, ylabel=panel.y_label + arrow)
-        _set_ticks(axes, _size_ticks(panel), log=figure.log)
+        if figure.log:
+            axes.set(xscale="log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
+            axes.xaxis.set_minor_locator(NullLocator())
+        else:  # numbers of views
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         if figure.labelled:
             _label_sizes(axes, panel)
     drawing.legend(
@@ -220,26 +224,6 @@ def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
         loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
     )  # fmt: skip
     return drawing
-
-
-def _set_ticks(axes: Axes, sizes: Sequence[float], *, log: bool) -> None:
-    """Put ticks at the sizes if there are few, otherwise at round numbers of a logarithmic axis."""
-    if log:
-        axes.set(xscale="log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
-        axes.xaxis.set_minor_locator(NullLocator())
-    if 0 < len(sizes) <= MAX_TICKS:
-        axes.set_xticks(sizes, [f"{size:.2g}" if size < 100 else f"{size:,.0f}" for size in sizes])
-
-
-def _size_ticks(panel: Panel) -> list[float]:
-    """Return the mean cost of each size; none where the costs of a size differ."""
-    costs = dict[str, list[float]]()
-    for point in (point for line in panel.lines for point in line.points):
-        costs.setdefault(point.label, []).append(point.x)
-    same = all(max(each) < SAME_SIZE * min(each) for each in costs.values())
-    return sorted(math.exp(float(np.mean(np.log(each)))) for each in costs.values()) if same else []
 
 
 def _label_sizes(axes: Axes, panel: Panel) -> None:

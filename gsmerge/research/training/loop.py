@@ -244,8 +244,12 @@ def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, 
     def work(crop: int) -> Tensor:
         rng = np.random.default_rng([options.seed, step, crop])
         example = streams.draw(step, crop, rng)
+        example = draw_views(example, options, rng)
+        if options.recolor:
+            example = recolor(example, rng)
+        window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
         with torch.enable_grad():
-            loss = _loss(state.networks, example, options, step, rng)
+            loss = window_loss(state.networks, window, options, step, rng)
             parts = [torch.zeros_like(parameter) for parameter in parameters]
             if loss.requires_grad:
                 parts = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
@@ -265,15 +269,6 @@ def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, 
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
     return loss[0].cpu()
-
-
-def _loss(networks: Networks, example: Example, options: TrainOptions, step: int, rng: np.random.Generator) -> Tensor:
-    """Compute the loss of a random window of an example."""
-    example = draw_views(example, options, rng)
-    if options.recolor:
-        example = recolor(example, rng)
-    window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
-    return window_loss(networks, window, options, step, rng)
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:

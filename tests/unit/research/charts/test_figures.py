@@ -102,7 +102,7 @@ def axes_of(figure: Figure) -> Axes:
     return drawing.axes[0]
 
 
-def test_ticks_are_at_the_sizes_and_a_logarithmic_axis_says_so() -> None:
+def test_ticks_are_round_and_a_logarithmic_axis_says_so() -> None:
     """Over time, where each method has costs of its own, ours has the sizes at its points."""
     sizes = ("1%", "4%", "10%")
     records = [
@@ -112,7 +112,7 @@ def test_ticks_are_at_the_sizes_and_a_logarithmic_axis_says_so() -> None:
         for size in sizes
     ]
     seconds, ratio = (f for f in figures_of(records) if f.name in ("quality-seconds", "quality-ratio"))
-    assert [text.get_text() for text in axes_of(ratio).get_xticklabels()] == ["1", "4", "10"]
+    assert {"1", "2", "5", "10"} <= {text.get_text() for text in axes_of(ratio).get_xticklabels()}
     assert [text.get_text() for text in axes_of(seconds).texts] == list(sizes)
     assert not list(axes_of(ratio).texts)
     for figure in (seconds, ratio):
