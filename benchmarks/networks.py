@@ -29,7 +29,7 @@ from gsmerge.facts.views import even_views, subset
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.networks.checkpoint import SHIPPED, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
-from gsmerge.research.charts.lines import Interval, mean_interval, paired_difference
+from gsmerge.research.charts.lines import Interval, mean_interval
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Views
 
@@ -188,8 +188,8 @@ def table(folders: list[Path], conditions: tuple[Condition, ...], args: argparse
     for condition in conditions:
         pairs = {folder.name: at_equal_count(folder, condition, args) for folder in folders}
         before, after = ({scene: pair[i] for scene, pair in pairs.items()} for i in (0, 1))
-        gain = paired_difference(pick(after, "psnr"), pick(before, "psnr"))
-        worst = min(after[s]["psnr"] - before[s]["psnr"] for s in after)
+        gains = [after[s]["psnr"] - before[s]["psnr"] for s in after]
+        gain, worst = mean_interval(gains), min(gains)
         lpips = [run["lpips_vgg"] - before[s]["lpips_vgg"] for s, run in after.items() if "lpips_vgg" in run]
         lpips_gain = "" if not lpips else f"{mean_interval(lpips).mean:+.3f}"
         first = summary(before) if False in condition.learned else "(whole, no fit) " + summary(before)

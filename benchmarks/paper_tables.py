@@ -46,7 +46,7 @@ from shared_scenes import scene_folders
 
 from gsmerge.measure.lpips import INSTALL, lpips_available
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
-from gsmerge.research.charts.lines import Interval, paired_difference
+from gsmerge.research.charts.lines import Interval, mean_interval
 
 TITLE = "## The paper's own method"
 
@@ -69,7 +69,7 @@ def compared(runs: Runs, whole: Runs) -> str:
 def difference(runs: Runs, whole: Runs) -> Interval:
     """PSNR of some runs less that of others, paired by scene."""
     mine, theirs = ({scene: run["seen"][0] for scene, run in some.items()} for some in (runs, whole))
-    return paired_difference(mine, theirs)
+    return mean_interval([mine[scene] - theirs[scene] for scene in mine if scene in theirs])
 
 
 def plus_minus(interval: Interval) -> str:

@@ -29,7 +29,7 @@ import numpy as np
 from quality import setting
 
 import gsmerge
-from gsmerge.facts.views import context_views
+from gsmerge.facts.views import even_views, midpoint_views
 from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.measure.evaluate import Quality
 from gsmerge.research.captures import Capture, find_capture, list_captures
@@ -60,8 +60,11 @@ def read_lists(path: Path) -> dict[str, Entry]:
 def make_lists(captures: Sequence[Capture], count: int) -> dict[str, Entry]:
     """The entries of captures by the paper's rule, where they leave views for targets."""
     sizes = {capture.name: len(capture.read_cameras()) for capture in captures}
-    views = {name: context_views(size, count) for name, size in sizes.items() if size > count > 1}
-    return {name: {"context": context, "target": targets} for name, (context, targets) in views.items()}
+    contexts = {name: even_views(size, count) for name, size in sizes.items() if size > count > 1}
+    return {
+        name: {"context": context, "target": midpoint_views(context, range(sizes[name]))}
+        for name, context in contexts.items()
+    }
 
 
 def read_targets(load: Loaded, capture: Capture, entry: Entry, size: tuple[int, int] | None) -> Views:

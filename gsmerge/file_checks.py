@@ -66,7 +66,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
     try:
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read(path)
     except SceneError as error:
-        return FileCheck(str(path), "", problems=(_problem(error, path),))
+        return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
     problems = (*file_check.problems, *damage(path))
     size = 0 if path.is_dir() else path.stat().st_size
     return replace(file_check, file_bytes=file_check.file_bytes or size, problems=problems)
@@ -88,11 +88,6 @@ def damage(path: Path) -> list[str]:
     found = damaged_member(path) if suffix in ARCHIVES else spz.problem_at_end(path) if suffix == ".spz" else None
     left = ply.bytes_after_rows(path) if suffix == ".ply" else 0
     return [found] if found else [f"{left:,} bytes after the last row, which nothing reads"] if left else []
-
-
-def _problem(error: SceneError, path: Path) -> str:
-    """Describe an error, with the name of its file unless that is ``path``."""
-    return str(error).removeprefix(f"{path}: ")
 
 
 def _read(path: Path) -> FileCheck:

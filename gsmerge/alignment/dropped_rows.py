@@ -41,6 +41,7 @@ _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # median distance of rows from their pixels
 _GAP, _RISE = 4.0, 2.0  # pixels that a piece of a line may lack at once, and of a step to another line, at most
 _CROOKED = 0.8  # mean distance of rows from their line, pixels
+_SPARSE = 1.8  # pixels of a piece for each of its rows, at most
 _AROUND = 3  # rows before and after
 _RUN = 8  # rows from pixel to pixel that are no chance
 _SAME = 2  # pixels by which the principal point may be off
@@ -372,7 +373,8 @@ def _walk(
     ends = u[starts], u[starts + lengths - 1]
     after, line, lost, end = last[1] * width + last[0], last[1], 0, 0
     follows = np.zeros(len(starts), bool)
-    inside = straight & (ends[0] >= -1.5) & (ends[1] < width + 0.5) & (y <= last[1] + reach)
+    dense = lasts - firsts < _SPARSE * lengths
+    inside = straight & dense & (ends[0] >= -1.5) & (ends[1] < width + 0.5) & (y <= last[1] + reach)
     pieces = zip(y.tolist(), firsts.tolist(), lasts.tolist(), lengths.tolist(), strict=True)
     for i, (height, first_x, last_x, length) in enumerate(pieces):
         if inside[i] and height * width + first_x > after:

@@ -25,15 +25,13 @@ from gsmerge.cli.paths import (
     FileOptions,
     check_format,
     check_outputs,
-    checkpoint_files,
     default_output,
     input_files,
-    is_index,
     model_files,
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.stages import Engine
 
@@ -100,7 +98,7 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import COLMAP
+    from gsmerge.io.formats.table import COLMAP, INDEX
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -112,7 +110,7 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
     files = args.files(*args.scenes)
     default = default_output(files.base)
     out = output_file(args.output or default, default.name)
-    streamed, model = is_index(out), model_files(out)
+    streamed, model = out.name == INDEX, model_files(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     if model and settings.budget.levels > 1:
@@ -121,7 +119,8 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
         raise UsageError(f"{out}: expected a --budget in Gaussians for a COLMAP model")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
-    inputs = (*input_files(files), *checkpoint_files(settings.checkpoint))
+    networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
+    inputs = (*input_files(files), *networks)
     beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
     named = (out, *model, *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
@@ -151,11 +150,11 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run; TargetError if a target is missed. Unless a page is ``shown``, say how to look."""
-    from gsmerge.compaction.report import result_table, summary_lines
+    from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
     from gsmerge.io.formats.table import PLY, SITE
 
     say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
-    lines = summary_lines(document)
+    lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) and not shown else []
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look

@@ -62,17 +62,13 @@ def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
 
 
 def say_warning(text: str, *, quiet: bool = False) -> None:
-    """Print a warning on stderr unless ``quiet``, in red where it is a terminal with colours."""
-    colored = not quiet and _has_colors(sys.stderr)
+    """Print a warning on stderr unless ``quiet``, in red on terminals or with ``FORCE_COLOR``, without ``NO_COLOR``."""
+    wanted = sys.stderr.isatty() or os.environ.get("FORCE_COLOR")
+    colored = not quiet and bool(wanted) and not os.environ.get("NO_COLOR")
     with suppress(OSError):
         print("\033[31m" * colored, end="", file=sys.stderr)
         say(f"gsmerge: warning: {text}", quiet=quiet)
         print("\033[0m" * colored, end="", file=sys.stderr, flush=True)
-
-
-def _has_colors(stream: Any) -> bool:
-    """Return whether to use colours: on terminals, or with ``FORCE_COLOR``, unless ``NO_COLOR`` is set."""
-    return not os.environ.get("NO_COLOR") and bool(stream.isatty() or os.environ.get("FORCE_COLOR"))
 
 
 def terminal_columns(stream: Any) -> int | None:

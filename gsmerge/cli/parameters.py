@@ -250,15 +250,11 @@ def panel(title: str, *parameters: Parameter) -> tuple[Parameter, ...]:
 
 def changed(name: str, default: Any = None, **changes: Any) -> Parameter:
     """Copy a declared option with changes for one command: default, ``help``, ``show_default``, ``hidden``, ..."""
-    return _change(OPTIONS[name], **changes).replace(default=default)
-
-
-def _change(parameter: Parameter, **changes: Any) -> Parameter:
-    kind, info = get_args(parameter.annotation)
+    kind, info = get_args(OPTIONS[name].annotation)
     info = copy(info)
     for attribute, value in changes.items():
         setattr(info, attribute, value)
-    return parameter.replace(annotation=Annotated[kind, info])
+    return OPTIONS[name].replace(default=default, annotation=Annotated[kind, info])
 
 
 def _escape(help: str) -> str:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.settings.compact import CHECKPOINTS
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
@@ -90,13 +89,6 @@ def model_files(output: Path) -> tuple[Path, ...]:
     from gsmerge.io.cameras.colmap_model import files_beside
 
     return files_beside(output)
-
-
-def is_index(output: Path) -> bool:
-    """Return whether an output is the index of a Streamed SOG; its folder is made if missing."""
-    from gsmerge.io.formats.table import INDEX
-
-    return output.name == INDEX
 
 
 def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
@@ -182,11 +174,6 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
     """List the files of Gaussians, cameras and photos that reading the scene uses."""
     paths = tuple(path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None)
     return (*paths, *(path for scene_files in files.more for path in input_files(scene_files)))
-
-
-def checkpoint_files(checkpoint: str) -> tuple[Path, ...]:
-    """Return the file of a checkpoint; empty if ``checkpoint`` names a checkpoint of the package."""
-    return () if checkpoint in CHECKPOINTS else (Path(checkpoint),)
 
 
 def write_texts(texts: Mapping[Path, str], *, overwrite: bool) -> None:

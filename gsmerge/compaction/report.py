@@ -175,11 +175,6 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Pa
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
-def summary_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return the closing lines of ``compact``: the result, each coarser level, and the curve if it was measured."""
-    return [summary_line(document), *level_lines(document), *curve_lines(document)]
-
-
 def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
     """Return the closing table of ``compact`` in a terminal, ``columns`` wide, with a ``next_step`` if any.
 

@@ -53,12 +53,6 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
     return chosen
 
 
-def context_views(num_frames: int, count: int) -> tuple[list[int], list[int]]:
-    """Return ``count`` frames at equal intervals, and the frame midway between each two (paper, supplement A)."""
-    context = even_views(num_frames, count)
-    return context, midpoint_views(context, range(num_frames))
-
-
 def camera_kinds(cameras: Cameras) -> np.ndarray:
     """Number the cameras ``[c]`` from 0, with equal numbers for equal poses and intrinsics."""
     rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)

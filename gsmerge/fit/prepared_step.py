@@ -30,11 +30,6 @@ def is_prepared(state: State) -> bool:
     return len(state.x) > 0 and state.splats.shN.shape[1] == 0 and not state.fixed.any()
 
 
-def call_it(call: Callable[[], None]) -> None:
-    """Call a function without arguments."""
-    call()
-
-
 @dataclass(eq=False)
 class StepTables:
     """Buffers for the steps of a state, with a filled table for each size of the photos."""
@@ -112,4 +107,4 @@ class StepTables:
     def _run(self, size: tuple[int, int], phases: tuple[str, ...]) -> None:
         calls = self.tables[size][1]
         for phase in phases:
-            parallel_map(call_it, [calls[PHASES.index(phase)]] * self.threads)
+            parallel_map(lambda call: call(), [calls[PHASES.index(phase)]] * self.threads)

@@ -7,8 +7,7 @@ same blending weights. The conventions are gsplat's: 0.3 px dilation, alpha clam
 contributions below 1/255 cut, a pixel stops before its transmittance would reach 1e-4, pixel
 centres at +0.5.
 
-:func:`render` can be differentiated. Training loops that need no autograd take gradients from
-:mod:`gsmerge.raster.gradient`.
+:func:`render` can be differentiated; the fit takes gradients from :mod:`gsmerge.raster.gradient`.
 
 Results do not depend on the number of threads: every Gaussian is projected and every tile blended
 alone, and what is summed over tiles is summed in the order of the tiles.

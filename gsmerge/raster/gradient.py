@@ -1,12 +1,5 @@
 """Gradients of a loss on the image of a view with respect to its Gaussians.
 
-For training loops, on arrays and without autograd::
-
-    tiled = tile_view(splats, viewmat, K, width, height)
-    image, transmittance = composite(tiled, colors, background)
-    wanted = view_gradients(tiled, grad_image, image=image, transmittance=transmittance, colors=colors)
-    means[wanted.ids] -= rate * wanted.means
-
 :func:`gsmerge.render` is differentiable with the same kernels. Results do not depend on the number of threads.
 """
 
@@ -21,7 +14,6 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import sh
 from gsmerge.kernels.raster.blend import blend_backward, gather_slots
 from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
-from gsmerge.raster.composite import view_colors
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 
@@ -56,12 +48,6 @@ class ColorGradients:
     means: Array  # [m,3] float32, through the viewing direction alone
 
 
-def _expect(name: str, array: Array, shape: tuple[int, ...]) -> Array:
-    if array.shape != shape:
-        raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
-    return np.ascontiguousarray(array, np.float32)
-
-
 def _blocks(count: int, threads: int) -> list[tuple[int, int]]:
     """Return ranges of Gaussians, each of whole blocks of the kernels."""
     num_blocks = -(-count // BLOCK)
@@ -79,7 +65,13 @@ def gradients_of(
     grad_left: Array | None,
     with_viewmat: bool,
 ) -> Gradients:
-    """Return the gradients of :func:`view_gradients`, given contiguous float32 arrays that are not checked."""
+    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
+
+    All arrays are float32 and contiguous. ``grad_image [h,w,3]`` and ``grad_left [h,w]`` (None: zero) are those of the
+    loss by the image and by the transmittance; ``image [h,w,3]``, with its background, and ``transmittance [h,w]`` are
+    what ``composite`` returned, ``colors [m,3]`` those of the view's Gaussians. Gradients are zero where alpha is
+    clamped at 0.99, and through what decides which weights are drawn at all.
+    """
     m, splats = len(tiled.ids), tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
@@ -111,45 +103,17 @@ def gradients_of(
     return Gradients(tiled.ids, means, quats, scales, opacities, tints, viewmat)
 
 
-def view_gradients(
-    tiled: TiledView,
-    grad_image: Array,
-    grad_transmittance: Array | None = None,
-    *,
-    image: Array,
-    transmittance: Array,
-    colors: Array | None = None,
-    with_viewmat: bool = False,
-) -> Gradients:
-    """Return the gradients of a loss on the image that :func:`gsmerge.raster.composite` made of a view.
-
-    ``grad_image [h,w,3]`` and ``grad_transmittance [h,w]`` (None: zero) are those of the loss;
-    ``image``, with its background, and ``transmittance`` are what ``composite`` returned,
-    ``colors`` what it was given. ``with_viewmat`` asks for the gradient of the world-to-camera
-    matrix as well. Gradients are zero where alpha is clamped at 0.99, and through what decides
-    which weights are drawn at all. Raises ValueError if an array has another shape.
-    """
-    size = tiled.height, tiled.width
-    grad_image, image = _expect("grad_image", grad_image, (*size, 3)), _expect("image", image, (*size, 3))
-    transmittance = _expect("transmittance", transmittance, size)
-    left = None if grad_transmittance is None else _expect("grad_transmittance", grad_transmittance, size)
-    drawn = view_colors(tiled) if colors is None else _expect("colors", colors, (len(tiled.splats), 3))[tiled.ids]
-    return gradients_of(tiled, drawn, image, transmittance, grad_image, left, with_viewmat)
-
-
 def color_gradients(
-    tiled: TiledView, grad_colors: Array, colors: Array | None = None, *, used: ColorGradients | None = None
+    tiled: TiledView, grad_colors: Array, colors: Array, *, used: ColorGradients | None = None
 ) -> ColorGradients:
     """Return the gradients of a loss through the spherical harmonics of the Gaussians of a view.
 
-    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours, if computed
-    already; no gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
+    ``grad_colors [m,3]`` are such as :attr:`Gradients.colors`. ``colors [m,3]`` float32 are the colours; no
+    gradient passes where they are clipped at 0. ``used``: a result with as many coefficients that is no
     longer needed, whose memory is reused if large enough, since new memory costs a quarter of the time or more. The
     gradient of the eye is minus the sum of those of the means.
     """
     m, splats = len(tiled.ids), tiled.splats
-    grad_colors = _expect("grad_colors", grad_colors, (m, 3))
-    colors = view_colors(tiled) if colors is None else _expect("colors", colors, (m, 3))
     rest = splats.shN.shape[1:]
     if used is not None and len(used.ids) >= m and used.shN.shape[1:] == rest:
         sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]

@@ -11,27 +11,23 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from gsmerge.compaction.compact import compact
-from gsmerge.errors import GsmergeError, SceneError, UsageError
+from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
 from gsmerge.geometry import move_views
-from gsmerge.io.cameras.camera_file import CONVENTIONS, CameraFile, from_viewmats, to_viewmats
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
-from gsmerge.scene.exporters import AUTO
-from gsmerge.scene.read import Loaded, align_scene, read_rows
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import SH_C0, Cameras, Gaussians, Scene, Views, grid_ids
 
-Needs = Literal["anything", "pixels", "photos", "file", "pixel-file"]
-Check = Literal["better", "same", "near", "once", "bits", "again", "convention", "moved", "refused"]
+Needs = Literal["anything", "pixels", "photos"]
+Check = Literal["better", "same", "near", "once", "bits", "again"]
 
 UTM = (4.0e5, 5.0e6, 100.0)  # metres, as in map coordinates
 
@@ -42,9 +38,6 @@ PROPERTIES: dict[Check, str] = {
     "once": "at most 1.05 times the Gaussians, not more than {same:g} dB below the unchanged scene",
     "bits": "the same result, bit for bit",
     "again": "compacted again to the same count, not more than {same:g} dB below",
-    "convention": "recognised, with every Gaussian at its pixel, or refused in one line",
-    "moved": "read with cameras moved to where every view's Gaussians lie in their pixels",
-    "refused": "refused in one line",
 }
 SEED = 7  # of all random choices
 FAR_SHARE = 2.5e-5  # share of the Gaussians that are moved far away
@@ -92,9 +85,11 @@ def _move_cameras(cameras: Cameras, factor: float, offset: np.ndarray) -> Camera
 
 def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
     """Rotate every view with its Gaussians about the camera centre, by a random axis."""
-    scene = setup.scene
-    viewmats = turn_cameras(scene.cameras.viewmats.astype(np.float64), degrees, slice(None))
-    return replace(setup, scene=move_views(scene, viewmats))
+    viewmats, rng = setup.scene.cameras.viewmats.astype(np.float64), np.random.default_rng(SEED)
+    for viewmat in viewmats:
+        axis = rng.normal(size=3)
+        viewmat[:3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0] @ viewmat[:3]
+    return replace(setup, scene=move_views(setup.scene, viewmats))
 
 
 def move_view(setup: StressScene, share: float) -> StressScene:
@@ -104,15 +99,6 @@ def move_view(setup: StressScene, share: float) -> StressScene:
     step = viewmats[view, 0, :3] * share * scene_frame(scene).unit
     viewmats[view, :3, 3] -= viewmats[view, :3, :3] @ step
     return replace(setup, scene=move_views(scene, viewmats))
-
-
-def turn_cameras(viewmats: np.ndarray, degrees: float, views: slice) -> np.ndarray:
-    """Rotate some cameras, but not their Gaussians, about their centres by random axes."""
-    turned, rng = viewmats.copy(), np.random.default_rng(SEED)
-    for view in range(len(viewmats))[views]:
-        axis = rng.normal(size=3)
-        turned[view, :3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0] @ viewmats[view, :3]
-    return turned
 
 
 def change_exposure(setup: StressScene, share: float) -> StressScene:
@@ -169,20 +155,10 @@ class Case:
     name: str  # on the command line
     words: str  # the change in words
     check: Check  # which property must hold, see ``PROPERTIES``
-    # "pixels": one Gaussian per pixel; "photos": that and photos; "file": a scene with cameras in a file; "pixel-file":
-    # that and one Gaussian per pixel
-    needs: Needs = "anything"
+    needs: Needs = "anything"  # "pixels": one Gaussian per pixel; "photos": that and photos
     # returns the changed scene; None: the scene stays, the run differs
     change: Callable[[StressScene], StressScene] | None = None
     threads: int | None = None  # threads of the run; None: as in the options
-    convention: tuple[str, str] | None = None  # pose convention to write, in the terms of camera files
-    cameras: Callable[[np.ndarray], np.ndarray] | None = None  # changes the viewmats of the camera file alone
-
-
-def _rewrite_poses(direction: str, axes: str) -> Case:
-    """Make a case of poses in another convention, such as "c2w-opencv" of "camera-to-world" and "OpenCV"."""
-    name = direction[0] + "2" + direction.split("-")[2][0] + "-" + axes.lower()
-    return Case(name, f"poses written {direction}, {axes} axes", "convention", "file", convention=(direction, axes))
 
 
 CASES: dict[str, Case] = {
@@ -202,10 +178,6 @@ CASES: dict[str, Case] = {
         Case("poses-1", "poses 1 degree off", "better", "photos", partial(perturb_poses, degrees=1.0)),
         Case("poses-5", "poses 5 degrees off", "better", "photos", partial(perturb_poses, degrees=5.0)),
         Case("view-moved", "one view 2 % of the depth aside", "near", "photos", partial(move_view, share=0.02)),
-        Case("cameras-0.5", "cameras 0.5 degrees off, not their Gaussians", "moved", "pixel-file",
-             cameras=partial(turn_cameras, degrees=0.5, views=slice(None))),
-        Case("camera-far", "one camera 15 degrees off", "refused", "pixel-file",
-             cameras=partial(turn_cameras, degrees=15.0, views=slice(1))),
         Case("exposure", "exposure +-20 % by turns", "better", "photos", partial(change_exposure, share=0.2)),
         Case("utm", "moved to map coordinates", "same", "anything", partial(move, factor=1.0, shift=UTM)),
         Case("small", "scaled by 1e-4", "same", "anything", partial(move, factor=1e-4, shift=(0, 0, 0))),
@@ -215,7 +187,6 @@ CASES: dict[str, Case] = {
         Case("oversized", "1 % of the Gaussians 8 times as large", "near", "anything", enlarge),
         Case("threads", "one thread", "bits", threads=1),
         Case("again", "the result compacted once more", "again"),
-        *(_rewrite_poses(*convention) for convention in CONVENTIONS),
     )
 }  # fmt: skip
 
@@ -225,16 +196,11 @@ class StressOutcome:
     """Outcome of one case."""
 
     case: str  # its name
-    change: str  # how the scene was changed, in words
-    expected: str  # the property that must hold
-    passed: bool | None  # whether it does; None where the case does not apply to the scene
-    measured: str  # the figures, or why the case does not apply
+    words: str  # how the scene was changed
+    wanted: str  # the property that must hold
+    held: bool | None  # whether it does; None where the case does not apply to the scene
+    found: str  # the figures, or why the case does not apply
     seconds: float  # wall time
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the outcome under the keys of the report."""
-        keys = ("case", "words", "wanted", "held", "found", "seconds")
-        return dict(zip(keys, vars(self).values(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -247,7 +213,7 @@ class _Result:
 
 
 def stress(
-    load: Loaded,
+    scene: Scene,
     options: CompactOptions | None = None,
     *,
     targets: Views | None = None,
@@ -266,36 +232,30 @@ def stress(
     unknown = next((name for name in names if name not in CASES), None)
     if unknown is not None:
         raise UsageError(f"cases: expected some of {', '.join(CASES)}, got {unknown!r}")
-    if len(load.scene) == 0:
+    if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
     report, slack = progress or (lambda *_: None), _slack(options)
     limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
-    setup = StressScene(load.scene, targets)
-    base = _run(setup, options) if any(CASES[name].needs not in ("file", "pixel-file") for name in names) else None
+    setup = StressScene(scene, targets)
+    base = _run(setup, options)
     out = []
     for i, name in enumerate(names):
         case, start = CASES[name], time.perf_counter()
         report(case.words, i, len(names))
-        passed, measured = _check_case(case, load, setup, base, options)
+        passed, measured = _check_case(case, setup, base, options)
         seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
         out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
     report("done", len(names), len(names))
     return tuple(out)
 
 
-def _check_case(
-    case: Case, load: Loaded, setup: StressScene, base: _Result | None, options: CompactOptions
-) -> tuple[bool | None, str]:
+def _check_case(case: Case, setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool | None, str]:
     """Check whether the property of a case holds; return the answer with the figures."""
-    problem = _inapplicable(case, load)
-    if problem is not None:
-        return None, problem
-    if case.check == "convention":
-        return _check_convention(case, load)
-    if case.cameras is not None:
-        return _check_cameras(case, load)
-    assert base is not None
+    if case.needs != "anything" and not setup.scene.aligned:
+        return None, "needs a Gaussian for each pixel"
+    if case.needs == "photos" and setup.scene.images is None:
+        return None, "needs photos"
     try:
         if case.check == "again":
             return _check_again(setup, base, options)
@@ -306,21 +266,6 @@ def _check_case(
         return False, f"ended with: {error}"
     defect = _find_defect(result.gaussians, changed.scene)
     return (False, defect) if defect else _check_result(case, base, result, _slack(options))
-
-
-def _inapplicable(case: Case, load: Loaded) -> str | None:
-    """Return why a case does not apply to a scene; None if it does."""
-    scene = load.scene
-    if case.needs in ("pixels", "photos", "pixel-file") and not scene.aligned:
-        return "needs a Gaussian for each pixel"
-    if case.needs == "photos" and scene.images is None:
-        return "needs photos"
-    if case.needs in ("file", "pixel-file"):
-        if load.cameras is None:
-            return "needs cameras from a file"
-        if case.convention == load.cameras.convention:
-            return "is how the cameras' format has them"
-    return None
 
 
 def _run(setup: StressScene, options: CompactOptions) -> _Result:
@@ -366,42 +311,6 @@ def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> 
     once = replace(options, budget=BudgetOptions(budget=len(base.gaussians)), decode=replace(options.decode, k=1))
     after = _quality(setup, compact(unaligned, once).gaussians)[1]
     return after >= base.after - MAX_SAME - _slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
-
-
-def _check_convention(case: Case, load: Loaded) -> tuple[bool, str]:
-    """Read the scene from cameras with poses in another convention than their format declares."""
-    assert load.cameras is not None
-    assert case.convention is not None
-    stored = from_viewmats(load.cameras.viewmats, case.convention)
-    wrong = replace(load.cameras, viewmats=to_viewmats(stored, load.cameras.convention))
-    try:
-        read = _read_again(load, wrong).scene
-    except SceneError as error:
-        return True, f"refused: {error.problem}"
-    expected, viewmats = load.scene.cameras.viewmats, read.cameras.viewmats
-    tolerance = 1e-3 * (1 + np.abs(expected).max())
-    same = expected.shape == viewmats.shape and np.allclose(expected, viewmats, atol=tolerance)
-    return bool(same), "recognised" if same else "taken for something else"
-
-
-def _check_cameras(case: Case, load: Loaded) -> tuple[bool, str]:
-    """Read the scene with wrong cameras and correct Gaussians."""
-    assert load.cameras is not None
-    assert case.cameras is not None
-    wrong = replace(load.cameras, viewmats=case.cameras(load.cameras.viewmats))
-    try:
-        read = _read_again(load, wrong)
-    except SceneError as error:
-        return case.check == "refused", f"refused: {error.problem}"
-    if read.alignment is None:
-        return False, "taken for an unaligned scene"
-    return case.check == "moved" and read.alignment.ok, f"{read.alignment.worst_px:.2f} px from the pixels"
-
-
-def _read_again(load: Loaded, cameras: CameraFile) -> Loaded:
-    """Read the scene's own file with other cameras."""
-    opacity: OpacityChoice = "raw" if load.info.opacity_encoding == "raw" else "logit"
-    return align_scene(read_rows(load.files, opacity=opacity, hints=AUTO), load.files, cameras)
 
 
 def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:

@@ -30,7 +30,7 @@ CELLS_PER_TASK = 256
 
 
 @dataclass(eq=False)
-class _Cloud:
+class Cloud:
     """Moments of n Gaussians, the form in which they are merged."""
 
     means: np.ndarray  # [n,3] float64
@@ -43,8 +43,8 @@ class _Cloud:
     def __len__(self) -> int:
         return len(self.means)
 
-    def __getitem__(self, rows: np.ndarray) -> _Cloud:
-        return _Cloud(**{name: column[rows] for name, column in vars(self).items()})
+    def __getitem__(self, rows: np.ndarray) -> Cloud:
+        return Cloud(**{name: column[rows] for name, column in vars(self).items()})
 
 
 @stage("reduce")
@@ -56,22 +56,23 @@ def merge_neighbors(gaussians: Gaussians, count: int) -> Gaussians:
     count = max(1, count)
     if len(gaussians) <= count:
         return gaussians
-    cloud = _cloud_of(gaussians)
+    cloud = cloud_of(gaussians)
     while len(cloud) > count:
         cloud = _merge_round(cloud, max(count, int(LEFT * len(cloud))))
-    return _gaussians_of(cloud, gaussians)
+    return gaussians_of(cloud, gaussians, WIDER)
 
 
-def _cloud_of(g: Gaussians) -> _Cloud:
+def cloud_of(g: Gaussians) -> Cloud:
+    """Compute the moments of Gaussians; flat ones get a little thickness."""
     count = len(g)
     covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
     quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
     gaussian_moments(quats, scales, g.opacities.astype(np.float32).clip(MIN_OPACITY, 1), FLATNESS, covars, masses)
     sh = np.concatenate([g.sh0, g.shN], 1, dtype=np.float32).reshape(count, -1)
-    return _Cloud(g.means.astype(np.float64), covars, masses, sh, np.ones(count, np.int32), np.arange(count))
+    return Cloud(g.means.astype(np.float64), covars, masses, sh, np.ones(count, np.int32), np.arange(count))
 
 
-def _merge_round(cloud: _Cloud, count: int) -> _Cloud:
+def _merge_round(cloud: Cloud, count: int) -> Cloud:
     """Merge the cheapest pairs of all cells until ``count`` Gaussians are left, or until no pairs are left."""
     order, starts = _divide(cloud.means)
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
@@ -88,9 +89,14 @@ def _merge_round(cloud: _Cloud, count: int) -> _Cloud:
     chosen = pairs[_cheapest(costs, len(cloud) - count)]
     if len(chosen) == 0:  # costs that are no numbers: what weighs most stays
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
-    merge_pairs(chosen, cloud.means, cloud.covars, cloud.masses, cloud.sh, cloud.sizes)
+    return merge_rows(cloud, chosen)
+
+
+def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
+    """Merge disjoint pairs of rows ``[m,2]`` int32, each into its first one, whose place it has."""
+    merge_pairs(pairs, cloud.means, cloud.covars, cloud.masses, cloud.sh, cloud.sizes)
     left = np.ones(len(cloud), bool)
-    left[chosen[:, 1]] = False
+    left[pairs[:, 1]] = False
     return cloud[left]
 
 
@@ -117,11 +123,11 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
     return np.sort(np.concatenate([below, equal[: count - len(below)]]))
 
 
-def _gaussians_of(cloud: _Cloud, source: Gaussians) -> Gaussians:
-    """Convert moments to Gaussians; Gaussians that were not merged stay unchanged."""
+def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
+    """Convert moments to Gaussians, by ``wider`` larger for each doubling; those that were not merged stay the same."""
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     opacities = np.minimum(cloud.masses / (scales[:, 1] * scales[:, 2]), MAX_OPACITY)
-    scales *= 1 + WIDER * log(cloud.sizes.astype(np.float64))[:, None] / float(log(2.0))
+    scales *= 1 + wider * log(cloud.sizes.astype(np.float64))[:, None] / float(log(2.0))
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     out = Gaussians(
         to_float32(cloud.means), to_float32(quats), to_float32(scales), to_float32(opacities), sh[:, :1], sh[:, 1:]

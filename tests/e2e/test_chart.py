@@ -87,7 +87,7 @@ def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
     assert page.count('<input type="range"') == 2
     assert len((charted_scene / "out" / "runs.csv").read_text().splitlines()) == 1 + 3
     names = {path.name for path in (charted_scene / "out" / "charts").iterdir()}
-    assert {"quality-ratio.png", "quality-ratio.svg", "break-even.svg", "stages.png"} <= names
+    assert {"quality-ratio.png", "quality-ratio.svg", "quality-seconds.svg", "quality-seconds.png"} <= names
     assert not any(name.startswith(".") for name in listing(charted_scene / "out"))
 
 

@@ -10,7 +10,7 @@ from messages import names
 
 from .conftest import Run
 
-FAST = ("--set", "fit=none", "--cases", "order, threads,w2c-opengl")
+FAST = ("--set", "fit=none", "--cases", "order, threads,large")
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
     options = TrainOptions(views=(2, 0), densities=(0.02,), levels=(1,))
 
     def examples(path: Path, options: TrainOptions) -> list[Example]:
-        return [make() for _, _, make in make_examples(path, options)]
+        return [make() for _, make in make_examples(path, options)]
 
     few, whole = examples(scene_copy, options)
     context, held_out = (

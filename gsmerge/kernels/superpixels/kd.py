@@ -24,33 +24,15 @@ def integral_image(pixels):
     return integral
 
 
-_cut_gain = declare(
+# Writes how much the best cut of a rectangle across one of its sides lowers the squared error, below 0 if there is
+# nothing to cut, and its place, 1 to side - 1. A rectangle of n pixels with colour sum t, whose side of length S is cut
+# at c into parts with sums s and t - s, loses |S s - c t|² / (n c (S - c)) of colour error and n c (S - c) / 4 of
+# position error, times the compactness. near and far are the places in the integral image of its first corner and of
+# the one at the other end of the side that is not cut; step is the distance of neighbours along the other side.
+cut_gain = declare(
     "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),
 )  # fmt: skip
-
-
-def cut_gain(integral, near, far, step, side, num_pixels, compactness):
-    """Find the best cut of a rectangle across one of its sides, and how much it lowers the squared error.
-
-    A rectangle of n pixels with colour sum t, whose side of length S is cut at c into parts with sums s and t - s,
-    loses ``|S s - c t|² / (n c (S - c))`` of colour error and ``n c (S - c) / 4`` of position error.
-
-    Args:
-        integral: From :func:`integral_image`.
-        near: Index of the rectangle's first corner in ``integral``.
-        far: Index of the corner at the other end of the side that is not cut.
-        step: Index distance of one pixel along the side that is cut.
-        side: Length of that side, pixels.
-        num_pixels: Pixels of the rectangle.
-        compactness: Weight of squared pixels against squared colours.
-
-    Returns:
-        (gain, cut): the cut lies between 1 and ``side - 1``; gain is below 0 if there is nothing to cut.
-    """
-    found = np.empty(2)
-    _cut_gain(integral, near, far, step, side, num_pixels, compactness, found)
-    return float(found[0]), int(found[1])
 
 
 # returns how many labels there are

@@ -33,17 +33,11 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-_merge_growth = declare(
+# Writes the growth of the error if u and v merge: of colour and depth, and of position times the compactness.
+merge_growth = declare(
     "merge_growth", rows=f8("capacity", ROW), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
 )  # fmt: skip
-
-
-def merge_growth(rows, u, v, depth_weight, compactness):
-    """Compute the growth of the error if u and v merge: of colour and depth, and of position times ``compactness``."""
-    growth = np.empty(2)
-    _merge_growth(rows, u, v, depth_weight, compactness, growth)
-    return tuple(growth.tolist())
 
 
 _merge_order = declare(

@@ -31,17 +31,11 @@ def adjacent_pairs(labels):
     return pairs[: _adjacent_pairs(labels, pairs)]
 
 
-_merge_costs = declare(
+# Writes the growth of the squared error if two regions merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|².
+merge_costs = declare(
     "merge_costs", rows=f4("capacity", ROW), pairs=i4("count", 2, least=0, below="capacity"),
     costs=f4("count", out=True),
 )  # fmt: skip
-
-
-def merge_cost(rows, u, v):
-    """Compute the growth of the squared error if u and v merge: n_u n_v / (n_u + n_v) |mean_u - mean_v|²."""
-    costs = np.empty(1, np.float32)
-    _merge_costs(rows, np.array([[u, v]], np.int32), costs)
-    return costs[0]
 
 
 def _first_ceiling(pairs, rows, share):
@@ -52,7 +46,7 @@ def _first_ceiling(pairs, rows, share):
     """
     step = max(1, len(pairs) // NUM_SAMPLES)
     costs = np.empty(len(pairs) // step, np.float32)
-    _merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
+    merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)
     return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * TIE_BREAK))
 

@@ -16,11 +16,11 @@ _baseline = partial(Method, prepare=partial(prepare, fill=False))  # the file's 
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs=("photos",), uses=FULL_FIT_SETTINGS)
-MOMENT_MATCHING = _baseline("moment-matching", simple.match_moments)
+MOMENT_MATCHING = _baseline("moment-matching", partial(simple.merge_superpixels, "bass-st", "paper"))
 VOXEL = _baseline("voxel", voxel.run)
 OPACITY = _baseline("opacity", simple.prune_by_opacity)
 CONTRIBUTION = _baseline("contribution", simple.prune_by_contribution)
 RANDOM = _baseline("random", simple.prune_at_random)
-BLOCKS = _baseline("blocks", simple.merge_blocks, needs=("pixels",))
+BLOCKS = _baseline("blocks", partial(simple.merge_superpixels, "grid", "depth"), needs=("pixels",))
 GREEDY = _baseline("greedy", greedy.run)
 SPLAT_TRANSFORM = _baseline("splat-transform", simple.splat_transform, check=simple.find_program)

@@ -1,27 +1,27 @@
 """Pairwise greedy merging, the idea of NanoGS (2026) and of splat-transform's decimation.
 
 Each round builds a graph of nearest neighbours, the cost of merging every two that are joined, disjoint pairs in the
-order of their cost, and replaces each pair by the Gaussian with its moments. Weights are opacity times the area of the
-ellipsoid, which adds up and so gives the opacity back in the end, at most 1 (as splat-transform has it). The cost is
-Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of weight, plus the squared distance of the
-harmonics: it knows no size, a far pair costs what a near one does.
+order of their cost, and replaces each pair by the Gaussian with its moments, as :mod:`gsmerge.stages.pair_merge` has
+them. Masses are opacity times the area of the ellipsoid, which adds up and so gives the opacity back in the end, at
+most 1 (as splat-transform has it). The cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of
+mass, plus the squared distance of the harmonics: it knows no size, a far pair costs what a near one does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.facts.prepare import Prepared
-from gsmerge.geometry import covariances
 from gsmerge.kernels.elementary import log, power
 from gsmerge.plan import Plan
-from gsmerge.pooling import MAX_OPACITY, principal_axes
+from gsmerge.pooling import MAX_OPACITY
 from gsmerge.research.baselines.simple import own_gaussians
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of, merge_rows
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]
@@ -29,30 +29,14 @@ Ints = NDArray[np.int64]
 
 NEIGHBORS = 10  # 16 bring 0.03 dB on a real capture and take half as long again
 COLOR_WEIGHT = 1.0  # of squared distances of harmonics against nats
-MIN_FLATNESS = 0.01  # of the smallest scale over the largest, so that the logarithm of the volume stays finite
-MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
 AREA_EXPONENT = 1.6075  # of Thomsen's formula for the area of an ellipsoid
 CHUNK = 65536  # Gaussians per piece of work
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
-    """Moments of n Gaussians, the form in which they are merged."""
-
-    means: Floats  # ``[n,3]``
-    covars: Floats  # ``[n,6]`` upper triangles: xx, xy, xz, yy, yz, zz
-    logdets: Floats  # ``[n]`` logarithms of their determinants
-    masses: Floats  # ``[n]`` opacity times area; what merging adds
-    sh: NDArray[np.float32]  # ``[n,3k]`` harmonics
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-
-def area(scales: Floats) -> Floats:
+def areas(scales: np.ndarray) -> Floats:
     """Compute the surface areas ``[n]`` of ellipsoids with half axes ``[n,3]``, within 1 % (Knud Thomsen's formula)."""
-    a, b, c = power(scales, AREA_EXPONENT).T
+    a, b, c = power(np.maximum(scales, FLATNESS * scales.max(1, keepdims=True)).astype(np.float64), AREA_EXPONENT).T
     return np.asarray(4 * np.pi * power((a * b + a * c + b * c) / 3, 1 / AREA_EXPONENT))
 
 
@@ -63,48 +47,15 @@ def log_determinants(covars: Floats) -> Floats:
     return np.asarray(log(np.maximum(values, 1e-300)))
 
 
-def cloud_of(gaussians: Gaussians) -> Cloud:
-    """Compute moments and masses of Gaussians; flat Gaussians get a little thickness."""
-    scales = gaussians.scales.astype(np.float64)
-    scales = np.maximum(scales, MIN_FLATNESS * scales.max(1, keepdims=True).clip(1e-12))
-    full = covariances(gaussians.quats.astype(np.float64), scales)
-    covars = np.stack([full[:, i, j] for i, j in UPPER], 1)
-    opacities = gaussians.opacities.astype(np.float64).clip(MIN_OPACITY, 1)
-    sh = np.concatenate([gaussians.sh0, gaussians.shN], 1, dtype=np.float32)
-    sh = sh.reshape(len(sh), 3 * sh.shape[1])
-    means = gaussians.means.astype(np.float64)
-    return Cloud(means, covars, log_determinants(covars), opacities * area(scales), sh)
-
-
-def gaussians_of(cloud: Cloud) -> Gaussians:
-    """Convert moments to Gaussians; opacity is mass over area, clipped below 1."""
-    scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
-    sh = cloud.sh.reshape(len(cloud), -1, 3)
-    return Gaussians(
-        means=cloud.means.astype(np.float32),
-        quats=quats.astype(np.float32),
-        scales=scales.astype(np.float32),
-        opacities=np.minimum(cloud.masses / area(scales), MAX_OPACITY).astype(np.float32),
-        sh0=sh[:, :1],
-        shN=sh[:, 1:],
-    )
-
-
-def merge_moments(cloud: Cloud, left: Ints, right: Ints) -> tuple[Floats, Floats, Floats]:
-    """Compute weights ``[m]`` of the left members, means ``[m,3]`` and covariances ``[m,6]`` of merged pairs."""
-    share = cloud.masses[left] / (cloud.masses[left] + cloud.masses[right])
-    p, q = share[:, None], 1 - share[:, None]
-    apart = cloud.means[left] - cloud.means[right]
-    outer = np.stack([apart[:, i] * apart[:, j] for i, j in UPPER], 1)
-    means = cloud.means[right] + p * apart
-    return share, means, p * cloud.covars[left] + q * cloud.covars[right] + p * q * outer
-
-
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per weight plus the distance of harmonics."""
-    share, _, covars = merge_moments(cloud, left, right)
-    lost = log_determinants(covars) - share * cloud.logdets[left] - (1 - share) * cloud.logdets[right]
-    return 0.5 * lost + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
+    masses, covars = cloud.masses.astype(np.float64), cloud.covars.astype(np.float64)
+    p = (masses[left] / (masses[left] + masses[right]))[:, None]
+    apart = cloud.means[left] - cloud.means[right]
+    outer = np.stack([apart[:, i] * apart[:, j] for i, j in UPPER], 1)
+    merged = p * covars[left] + (1 - p) * covars[right] + p * (1 - p) * outer
+    before = p[:, 0] * log_determinants(covars[left]) + (1 - p[:, 0]) * log_determinants(covars[right])
+    return 0.5 * (log_determinants(merged) - before) + COLOR_WEIGHT * ((cloud.sh[left] - cloud.sh[right]) ** 2).sum(1)
 
 
 def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
@@ -154,21 +105,6 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     return order[chosen]
 
 
-def merge_pairs(cloud: Cloud, left: Ints, right: Ints) -> Cloud:
-    """Merge pairs; put the results after the Gaussians in no pair, which keep their order."""
-    share, means, covars = merge_moments(cloud, left, right)
-    alone = np.ones(len(cloud), bool)
-    alone[left] = alone[right] = False
-    p = share[:, None].astype(np.float32)
-    return Cloud(
-        np.concatenate([cloud.means[alone], means]),
-        np.concatenate([cloud.covars[alone], covars]),
-        np.concatenate([cloud.logdets[alone], log_determinants(covars)]),
-        np.concatenate([cloud.masses[alone], cloud.masses[left] + cloud.masses[right]]),
-        np.concatenate([cloud.sh[alone], p * cloud.sh[left] + (1 - p) * cloud.sh[right]]),
-    )
-
-
 def reduce_to(cloud: Cloud, count: int) -> Cloud:
     """Merge pairs in rounds until at most ``count`` Gaussians are left.
 
@@ -178,8 +114,18 @@ def reduce_to(cloud: Cloud, count: int) -> Cloud:
     while len(cloud) > max(count, 1):
         left, right, costs = neighbor_pairs(cloud)
         chosen = cheapest_disjoint(left, right, costs, len(cloud) - count)
-        cloud = merge_pairs(cloud, left[chosen], right[chosen])
+        cloud = merge_rows(cloud, np.stack([left[chosen], right[chosen]], 1).astype(np.int32))
     return cloud
+
+
+def merge(gaussians: Gaussians, count: int) -> Gaussians:
+    """Merge pairs in rounds until at most ``count`` Gaussians are left."""
+    cloud = cloud_of(gaussians)
+    cloud.masses[:] = gaussians.opacities.clip(MIN_OPACITY, 1) * areas(gaussians.scales)
+    cloud = reduce_to(cloud, count)
+    merged = gaussians_of(cloud, gaussians)
+    opacities = np.minimum(cloud.masses / areas(merged.scales), MAX_OPACITY).astype(np.float32)
+    return replace(merged, opacities=opacities)
 
 
 def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -188,4 +134,4 @@ def run(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     if len(gaussians) <= count:
         return gaussians
     with stage("reduce"):
-        return gaussians_of(reduce_to(cloud_of(gaussians), count))
+        return merge(gaussians, count)

@@ -24,13 +24,12 @@ from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode
 from gsmerge.stages.encode import encode
-from gsmerge.stages.superpixels import grid_labels, superpixels
+from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Decoded, Gaussians, Groups, Scene
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
 MAX_OUTPUT = 300  # characters of the program's own output in an error
-PAPER_SUPERPIXELS = "bass-st"  # BASS from seeds drawn by the Shi-Tomasi response
 MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
 
 
@@ -55,14 +54,6 @@ def most_important(importance: np.ndarray, count: int) -> np.ndarray:
         raise ValueError(f"count: expected at least 0, got {count}")
     order = np.argsort(-np.nan_to_num(importance, nan=-np.inf, neginf=-np.inf), kind="stable")
     return np.sort(order[:count])
-
-
-def merge_groups(prepared: Prepared, groups: Groups, rule: Literal["depth", "paper"] = "depth") -> Gaussians:
-    """Merge each group into one Gaussian, without matching across views; empty groups are left out."""
-    members = assign(prepared.scene, groups)
-    features = encode(prepared.scene, members, groups, rule=rule)
-    with stage("decode"):
-        return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
@@ -118,32 +109,25 @@ def prune_at_random(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
         return gaussians[np.sort(rng.choice(len(gaussians), min(count, len(gaussians)), replace=False))]
 
 
-def merge_blocks(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge the Gaussians of rectangular pixel blocks, equally many per view.
+def merge_superpixels(
+    segmentation: str, rule: Literal["depth", "paper"], prepared: Prepared, plan: Plan, count: int
+) -> Gaussians:
+    """Merge superpixels, equally many per view, into a Gaussian each, without matching across views.
 
-    Blocks without a valid pixel are left out.
-    """
-    scene = prepared.scene
-    height, width = scene.cameras.height, scene.cameras.width
-    with stage("segment"):
-        counts = view_shares(count, len(scene), height * width)
-        labels = np.stack([grid_labels(height, width, view_count) for view_count in counts])
-    return merge_groups(prepared, Groups(labels, tuple(counts)))
-
-
-def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Merge superpixels by the paper's moment matching, its baseline without a network ("Mom. Match.").
-
-    One Gaussian for each superpixel: opacity-weighted mean and the spread of the members' means (eq. teacher_mean,
-    teacher_cov). The paper states no opacity; the members' mean is taken. Superpixels are the paper's, as many as
-    Gaussians, the same number in every view; empty ones are left out.
+    Empty superpixels are left out. By the ``rule`` "paper" Gaussians are those of its baseline without a network ("Mom.
+    Match."): opacity-weighted mean and the spread of the members' means (eq. teacher_mean, teacher_cov). The paper
+    states no opacity; the members' mean is taken.
     """
     scene = prepared.scene
     counts = view_shares(count, len(scene), scene.pixels_per_view)
     with stage("segment"):
         pictures, views = scene.images, range(len(scene))
-        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], PAPER_SUPERPIXELS), views)
-    return merge_groups(prepared, Groups(np.stack(labels), tuple(counts)), rule="paper")
+        labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], segmentation), views)
+    groups = Groups(np.stack(labels), tuple(counts))
+    members = assign(scene, groups)
+    features = encode(scene, members, groups, rule=rule)
+    with stage("decode"):
+        return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
 def find_program() -> str:

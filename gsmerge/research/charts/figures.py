@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from gsmerge.io import atomic_output
-from gsmerge.measure.speed import break_even
 from gsmerge.research.charts.lines import METRICS, MIN_SCENES, PARTS, Interval, Line, Results
-from gsmerge.research.charts.measure_run import INPUT, SCORING
-from gsmerge.runtime.record import STAGES
+from gsmerge.research.charts.measure_run import INPUT
 
 MAX_LINES = 12  # of a figure; of more, one for each method is drawn
-MIN_GAIN = 0.05  # share of the render time; smaller gains are noise
-MIN_STAGE = 0.03  # share of the longest bar; shorter stages are shown together
-MAX_TICKS, SAME_SIZE = 8, 1.15  # ticks at sizes; factor between the costs of results of one size
 
 PANEL_WIDTH, SINGLE_WIDTH, HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 KEY_WIDTH, KEY_LINE = 2.3, 0.135  # of the key: inches, inches per line
@@ -60,14 +54,14 @@ class Panel:
     """One pair of axes with lines."""
 
     y_label: str  # with unit
-    higher: bool | None  # whether higher is better; None: neither is
+    higher: bool  # whether higher is better
     lines: tuple[Line, ...]
     reference: float | None = None  # the level of the input
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A chart and its table: lines over a common x, or bars."""
+    """A chart and its table: lines over a common x."""
 
     name: str  # of its files
     title: str  # of the section
@@ -75,10 +69,9 @@ class Figure:
     x_label: str  # with unit
     head: tuple[str, ...]  # of the table of its numbers
     rows: tuple[tuple[str, ...], ...]  # of the same
-    panels: tuple[Panel, ...] = ()  # side by side
-    log: str = ""  # axis that is logarithmic: x, y or none
+    panels: tuple[Panel, ...]  # side by side
+    log: bool  # whether x is logarithmic
     labelled: bool = False  # whether the sizes stand at the points of our first line
-    bars: Mapping[str, Sequence[float]] = field(default_factory=dict)  # instead of panels: parts of each row's bar
 
 
 def make_figures(results: Results) -> list[Figure]:
@@ -88,12 +81,12 @@ def make_figures(results: Results) -> list[Figure]:
     figures = [
         _against(results, "seconds", "quality-seconds", time),
         _against(results, "percent", "quality-ratio", size),
+        _over_views(results),
     ]
-    figures += [_stages(results), _counts(results), _over_views(results), _break_even(results)]
     return [figure for figure in figures if figure is not None]
 
 
-def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[Panel], log: str = "") -> Figure | None:
+def _curves(name: str, title: str, caption: str, x_label: str, panels: Sequence[Panel], *, log: bool) -> Figure | None:
     """Make a figure of panels with a table of all their points; None without lines."""
     panels = [panel for panel in panels if panel.lines]
     if not panels:
@@ -151,42 +144,8 @@ def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]
     title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
     caption = f"Quality against {described}. Measured on {PARTS[results.part]}."
-    figure = _curves(name, title, caption, label, panels, "x")
+    figure = _curves(name, title, caption, label, panels, log=True)
     return figure and replace(figure, labelled=cost == "seconds")
-
-
-def _size_words(results: Results) -> str:
-    return f"Size: {results.size or 'the default superpixels'}."
-
-
-def _stages(results: Results) -> Figure | None:
-    """Show seconds by stage, stacked."""
-    rows = results.typical_runs()
-    if not rows:
-        return None
-    stages = {stage for group in rows.values() for record in group for stage in record.stages} - set(SCORING)
-    order = sorted(stages, key=lambda stage: (STAGES.index(stage) if stage in STAGES else len(STAGES), stage))
-    table = {
-        stage: [float(np.mean([record.stages.get(stage, 0.0) for record in group])) for group in rows.values()]
-        for stage in order
-    }
-    totals = np.sum(list(table.values()), 0) if table else np.zeros(len(rows))
-    bars = {stage: values for stage, values in table.items() if max(values) > MIN_STAGE * totals.max()}
-    remainder = totals - np.sum(list(bars.values()), 0) if bars else totals
-    bars |= {"other": remainder.tolist()} if remainder.max() > 1e-9 else {}
-    cells = [(name, *(f"{values[i]:.3g}" for values in bars.values())) for i, name in enumerate(rows)]
-    scenes = len({record.scene for group in rows.values() for record in group})
-    caption = f"Seconds by stage, scoring left out, means over {scenes} scene(s). {_size_words(results)}"
-    return Figure("stages", "Where the time goes", caption, "Seconds", ("Line", *bars), tuple(cells), bars=bars)
-
-
-def _counts(results: Results) -> Figure | None:
-    """Show Gaussians against the number of input views, of ours and of the input."""
-    lines = results.by_views("count")
-    lines = [line for line in lines if line.ours or line.name == INPUT]
-    panels = [Panel("Gaussians", None, tuple(lines))] if any(line.ours for line in lines) else []
-    caption = f"Gaussians against the number of input views. {_size_words(results)}"
-    return _curves("count-views", "Count against views", caption, "Input views", panels, "y")
 
 
 def _over_views(results: Results) -> Figure | None:
@@ -194,31 +153,10 @@ def _over_views(results: Results) -> Figure | None:
     panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
     caption = (
         "Quality against the number of input views, evenly spread; held-out views lie midway between them where their"
-        f" order is known. Measured on {PARTS[results.part]}. {_size_words(results)}"
+        f" order is known. Measured on {PARTS[results.part]}. Size:"
+        f" {results.size or 'the default superpixels'}."
     )
-    return _curves("quality-views", "Quality against views", caption, "Input views", panels)
-
-
-def _break_even(results: Results) -> Figure | None:
-    """Plot the number of frames after which merging has saved its own time."""
-    groups = results.typical_runs()
-    scenes = sorted({record.scene for group in groups.values() for record in group})
-    before = results.input_mean("render_ms", scenes)
-    if before is None or not groups:
-        return None
-    rows, frames = [], dict[str, int]()
-    for name, group in groups.items():
-        seconds = float(np.mean([record.seconds or 0.0 for record in group]))
-        after = float(np.mean([record.render_ms or before for record in group]))
-        even = break_even(seconds, before / 1000, after / 1000) if after < (1 - MIN_GAIN) * before else None
-        rows.append((name, f"{seconds:.2f}", f"{after:.1f}", "never" if even is None else f"{math.ceil(even):,}"))
-        frames |= {} if even is None else {name: math.ceil(even)}
-    caption = (
-        "Frames to render until merging has saved as much time as it took, on the processor that ran the grid; a method"
-        f" without a bar never saves any. {_size_words(results)} Means over {len(scenes)} scene(s)."
-    )
-    head, bars = ("Line", "Seconds", "ms/view", "Frames"), {"frames": [frames.get(name, 0) for name in groups]}
-    return Figure("break-even", "When merging pays", caption, "Frames", head, tuple(rows), bars=bars)
+    return _curves("quality-views", "Quality against views", caption, "Input views", panels, log=False)
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
@@ -233,7 +171,7 @@ def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
         with matplotlib.rc_context():
             matplotlib.rcdefaults()  # independent of the user's own settings
             matplotlib.rcParams.update(RC)
-            drawing = draw_bars(figure) if figure.bars else draw_curves(figure, styles)
+            drawing = draw_curves(figure, styles)
             for suffix, unknown in (("png", ("Software",)), ("svg", ("Date", "Creator", "Format", "Type"))):
                 data = io.BytesIO()
                 drawing.savefig(data, format=suffix, metadata=dict.fromkeys(unknown))
@@ -256,57 +194,36 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
     return styles
 
 
-def _subplots(num_panels: int, height: float = HEIGHT) -> tuple[Drawing, list[Axes]]:
-    width = SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels
-    drawing = Drawing(figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.08))
-    return drawing, list(np.atleast_1d(drawing.subplots(1, num_panels)))
-
-
 def draw_curves(figure: Figure, styles: Mapping[str, Style]) -> Drawing:
     """Draw a figure's panels side by side, with one legend beside them."""
-    drawing, all_axes = _subplots(len(figure.panels))
+    num_panels = len(figure.panels)
+    width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + KEY_WIDTH
+    names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
+    names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
+    size = width, max(HEIGHT, KEY_LINE * len(names))
+    drawing = Drawing(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08))
+    all_axes = np.atleast_1d(drawing.subplots(1, num_panels))
     for axes, panel in zip(all_axes, figure.panels, strict=True):
         for line in panel.lines:
             _draw_line(axes, line, styles[line.name])
         if panel.reference is not None:
             axes.axhline(panel.reference, **{**styles[INPUT], "marker": ""})
-        arrow = {True: " ↑", False: " ↓", None: ""}[panel.higher]
-        labels = {"x": figure.x_label, "y": panel.y_label + arrow}
-        axes.set(**{f"{axis}label": text + ", log scale" * (axis == figure.log) for axis, text in labels.items()})
-        _set_ticks(axes, _size_ticks(panel), figure.log)
+        arrow = " ↑" if panel.higher else " ↓"
+        axes.set(xlabel=figure.x_label + ", log scale" * figure.log, ylabel=panel.y_label + arrow)
+        if figure.log:
+            axes.set(xscale="log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
+            axes.xaxis.set_minor_locator(NullLocator())
+        else:  # numbers of views
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         if figure.labelled:
             _label_sizes(axes, panel)
-    names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
-    names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
-    width, height = drawing.get_size_inches()
-    drawing.set_size_inches(width + KEY_WIDTH, max(height, KEY_LINE * len(names)))
     drawing.legend(
         [Line2D([], [], markersize=4, **styles[name]) for name in names], [_plain(name) for name in names],
         loc="outside right center", handlelength=2.6, labelspacing=0.15, borderpad=0,
     )  # fmt: skip
     return drawing
-
-
-def _set_ticks(axes: Axes, sizes: Sequence[float], log: str) -> None:
-    """Put ticks at the sizes if there are few, otherwise at round numbers; ``log``: the logarithmic axis."""
-    few = 0 < len(sizes) <= MAX_TICKS
-    if log:
-        axes.set(**{f"{log}scale": "log"})
-        axis = axes.xaxis if log == "x" else axes.yaxis
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.9g}"))
-        axis.set_minor_locator(NullLocator())
-    if few:
-        axes.set_xticks(sizes, [f"{size:.2g}" if size < 100 else f"{size:,.0f}" for size in sizes])
-
-
-def _size_ticks(panel: Panel) -> list[float]:
-    """Return the mean cost of each size; none where the costs of a size differ."""
-    costs = dict[str, list[float]]()
-    for point in (point for line in panel.lines for point in line.points):
-        costs.setdefault(point.label, []).append(point.x)
-    same = all(max(each) < SAME_SIZE * min(each) for each in costs.values())
-    return sorted(math.exp(float(np.mean(np.log(each)))) for each in costs.values()) if same else []
 
 
 def _label_sizes(axes: Axes, panel: Panel) -> None:
@@ -332,23 +249,3 @@ def _draw_line(axes: Axes, line: Line, style: Style) -> None:
         else:
             axes.vlines(x, low, high, alpha=0.35, linewidth=2.5, **band)
     axes.plot(x, y, markersize=3.6, markeredgecolor="white", markeredgewidth=0.5, **style)
-
-
-def draw_bars(figure: Figure) -> Drawing:
-    """Draw one stacked bar per row of a figure."""
-    names = [row[0] for row in figure.rows]
-    drawing, (axes,) = _subplots(1, 0.75 + 0.3 * max(len(names), 2))
-    left = np.zeros(len(names))
-    for i, (part, values) in enumerate(figure.bars.items()):
-        color = "#bbbbbb" if part == "other" else COLORS[i % len(COLORS)]
-        axes.barh(range(len(names)), values, 0.62, left, color=color, edgecolor="white", linewidth=0.6, label=part)
-        left += np.array(values)
-    for row, total in enumerate(left):
-        axes.text(total, row, f" {total:,.3g}" if total else "", va="center")
-    axes.set_yticks(range(len(names)), [_plain(name) for name in names])
-    axes.invert_yaxis()
-    axes.grid(visible=False, axis="y")
-    axes.set(xlim=(0, 1.12 * left.max() or 1), xlabel=figure.x_label)
-    if len(figure.bars) > 1:
-        drawing.legend(loc="outside upper center", ncols=min(len(figure.bars), 7), handlelength=0.9, columnspacing=1.0)
-    return drawing

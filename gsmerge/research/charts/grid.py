@@ -109,9 +109,6 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
         options = CompactOptions().with_settings({**settings, **choice, "seed": seed})
     except ValueError as error:
         raise UsageError(str(error)) from error
-    except TypeError as error:  # text instead of a number
-        words = ", ".join(f"{name}={value}" for name, value in settings.items())
-        raise UsageError(f"{method}: expected settings that compact takes, got {words}") from error
     find_method(options)
     return options
 

@@ -93,11 +93,6 @@ def mean_interval(values: Sequence[float]) -> Interval:
     return Interval(mean, mean - half, mean + half, len(array))
 
 
-def paired_difference(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Interval:
-    """Compute the mean difference over scenes that both have, so that the difficulty of scenes cancels out."""
-    return mean_interval([ours[scene] - theirs[scene] for scene in ours if scene in theirs])
-
-
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute confidence intervals of the columns of ``values [scenes, conditions]``, with scene differences removed.
 
@@ -187,15 +182,6 @@ class Results:
     def is_typical(self, record: RunRecord) -> bool:
         """Return whether a run has the typical size, or its method only one size."""
         return record.method != INPUT and (size_label(record) == self.size or record.method in ONE_SIZE)
-
-    def typical_runs(self) -> dict[str, list[RunRecord]]:
-        """Group the runs of typical size and number of views by line, ours first, over common scenes."""
-        rows = dict[str, list[RunRecord]]()
-        for record in ours_first(self.runs):
-            if self.is_typical(record) and record.views_asked == self.views:
-                rows.setdefault(self.name(record), []).append(record)
-        kept = keep_common({name: {record.scene for record in group} for name, group in rows.items()}, MIN_SHARE)
-        return {name: [record for record in rows[name] if record.scene in scenes] for name, scenes in kept.items()}
 
     def by_size(self, x: str, y: str) -> list[Line]:
         """Make lines of value ``y`` against value ``x``, one point per size, at the typical number of views."""

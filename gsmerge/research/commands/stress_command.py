@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,18 +48,18 @@ def stress(args: opt.Args) -> None:
     say_notes(notes, quiet=args.silent)
     names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]
     with stage_progress(quiet=args.silent) as progress:
-        outcomes = stress_scene(load, settings, targets=held_out, cases=names, progress=progress)
+        outcomes = stress_scene(load.scene, settings, targets=held_out, cases=names, progress=progress)
     document = {
         **document_head(),
         "input": str(load.files.ply),
         "options": settings.to_dict(),
-        "cases": [outcome.to_dict() for outcome in outcomes],
-        "held": sum(outcome.passed is True for outcome in outcomes),
-        "failed": sum(outcome.passed is False for outcome in outcomes),
+        "cases": [asdict(outcome) for outcome in outcomes],
+        "held": sum(outcome.held is True for outcome in outcomes),
+        "failed": sum(outcome.held is False for outcome in outcomes),
         "notes": notes,
     }
     print_document(document, _lines(outcomes), as_json=args.json, quiet=args.quiet)
-    failed = [outcome.case for outcome in outcomes if outcome.passed is False]
+    failed = [outcome.case for outcome in outcomes if outcome.held is False]
     if failed:
         raise TargetError(f"{len(failed)} of {len(outcomes)} cases failed: {', '.join(failed)}")
 
@@ -67,8 +67,8 @@ def stress(args: opt.Args) -> None:
 def _lines(outcomes: Sequence[StressOutcome]) -> list[str]:
     """Write one line for each case, and the number of passed cases."""
     marks = {True: "held", False: "FAILED", None: "-"}
-    width = max((len(outcome.change) for outcome in outcomes), default=0)
-    lines = [f"{marks[o.passed]:<7} {o.change:<{width}}  {o.measured}" for o in outcomes]
-    lines += [f"        expected of '{o.change}': {o.expected}" for o in outcomes if o.passed is False]
-    tried = [outcome for outcome in outcomes if outcome.passed is not None]
-    return [*lines, f"{sum(o.passed is True for o in tried)} of {len(tried)} held"]
+    width = max((len(outcome.words) for outcome in outcomes), default=0)
+    lines = [f"{marks[o.held]:<7} {o.words:<{width}}  {o.found}" for o in outcomes]
+    lines += [f"        expected of '{o.words}': {o.wanted}" for o in outcomes if o.held is False]
+    tried = [outcome for outcome in outcomes if outcome.held is not None]
+    return [*lines, f"{sum(o.held is True for o in tried)} of {len(tried)} held"]

@@ -1,6 +1,6 @@
 """Synthetic scenes from random numbers alone, as a feed-forward network would export them, for training and tests."""
 
-from gsmerge.research.generate.folders import SceneFolder, generate, generate_scene, plan
+from gsmerge.research.generate.folders import SceneFolder, generate, generate_scene
 from gsmerge.research.generate.noise import NoiseOptions
 from gsmerge.research.generate.synthetic_scene import GenerateOptions, SyntheticScene, make_scene
 
@@ -12,5 +12,4 @@ __all__ = [
     "generate",
     "generate_scene",
     "make_scene",
-    "plan",
 ]

@@ -32,24 +32,6 @@ class SceneFolder:
     kept: bool
 
 
-def plan(
-    out: Path, count: int, options: GenerateOptions, *, seed: int = 0, overwrite: bool = False
-) -> list[SceneFolder]:
-    """List the folders that :func:`generate` would write, without writing.
-
-    A ValueError if ``count`` or ``seed`` is out of range, a UsageError if a folder holds something else.
-    """
-    if count < 1 or seed < 0:
-        raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
-    folders = []
-    for index in range(count):
-        folder = out / f"scene_{index:04d}"
-        folders.append(SceneFolder(folder, is_complete(folder, scene_key(seed, index, options))))
-        if not folders[-1].kept:
-            check_replaceable(folder, overwrite=overwrite)
-    return folders
-
-
 def generate_scene(
     folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0, overwrite: bool = False
 ) -> Path:
@@ -101,7 +83,14 @@ def generate(
         SceneError: If a folder cannot be written.
     """
     options = options or GenerateOptions()
-    planned = plan(out, count, options, seed=seed, overwrite=overwrite)
+    if count < 1 or seed < 0:
+        raise ValueError(f"expected at least 1 scene and a seed from 0, got {count} and {seed}")
+    planned = []
+    for index in range(count):
+        folder = out / f"scene_{index:04d}"
+        planned.append(SceneFolder(folder, is_complete(folder, scene_key(seed, index, options))))
+        if not planned[-1].kept:
+            check_replaceable(folder, overwrite=overwrite)
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:

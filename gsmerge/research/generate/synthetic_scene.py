@@ -221,16 +221,13 @@ def _shrink(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
-def _texture_size(lens: Pinhole) -> int:
-    return 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)
-
-
 def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
 ) -> tuple[LitStage, Pose]:
     """Draw a stage and a path through it on which all views are usable; after too many tries, return the last."""
+    side = 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)  # of the textures, pixels
     for _ in range(STAGE_TRIES):
-        scene = light_stage(STYLES[style](Palette(rng, _texture_size(lens))))
+        scene = light_stage(STYLES[style](Palette(rng, side)))
         for _ in range(PATH_TRIES):
             pose = PATHS[path](scene.stage, rng, num_views)
             poses = (pose(s) for s in np.linspace(0, 1, 2 * num_views - 1))

@@ -82,8 +82,8 @@ class Example:
         return [photo for photo in span if self.mask(photo).any()]
 
 
-def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, int, Callable[[], Example]]]:
-    """Yield (name, number of them in all, maker) of each example of a scene; see :func:`make_example`.
+def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Callable[[], Example]]]:
+    """Yield (name, maker) of each example of a scene; see :func:`make_example`.
 
     There is one for each number of views and every density of the ``options``. Photos of a folder ``targets`` next to
     the ``.ply``, with their cameras, are novel views. A SceneError if the scene cannot be read, is not one Gaussian per
@@ -97,13 +97,12 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, int,
         raise SceneError(ply, "expected photos to learn from, found none", "put them next to it in images/")
     targets = ply.parent / "targets"
     held_out = read_held_out(load, targets) if targets.is_dir() else None
-    subsets = view_subsets(len(scene), options.example_views)
-    for ids in subsets:
+    for ids in view_subsets(len(scene), options.example_views):
         training = make_training_scene(scene, ids, held_out)
         for density in options.densities:
             make = partial(make_example, training, options, density, scene_name(path))
             label = f"{len(ids)}-views-{share_text(density).rstrip('%')}"
-            yield label, len(subsets) * len(options.densities), make
+            yield label, make
 
 
 def scene_name(path: Path) -> str:

@@ -31,7 +31,7 @@ from gsmerge.networks.corrections import LOGIT
 from gsmerge.research.captures import Capture
 from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
-from gsmerge.research.training.losses import WindowLoss, render_window, window_loss, window_psnr
+from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example
 from gsmerge.research.training.train_options import TrainOptions
@@ -191,16 +191,14 @@ def _train(
     resumed = step
     with open_streams(shards, options) as streams:
         while step < options.steps:
-            loss, share = _step(state, streams, options, step)
-            losses.append(loss)
+            losses.append(_step(state, streams, options, step))
             step += 1
             if progress:
                 progress(step, options.steps, float(losses[-1]))
             if step % options.save_every == 0 or step == options.steps:
                 scores = validate(state.smooth, validation, options, out)
                 mean = float(torch.stack(losses).mean())
-                head_row = {"step": step, "rate": options.rate_at(step - 1), "loss": mean}
-                rows.append({**head_row, **({"diversity_share": share} if options.diversity_weight else {}), **scores})
+                rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
                 losses = []
                 _save(out, state, rows, head, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
@@ -238,33 +236,28 @@ def _resume(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[
     return int(facts["step"]), list(facts["rows"])
 
 
-def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> tuple[Tensor, float]:
-    """Do one step; return its loss, and the share of the gradient from the diversification of siblings, 0 to 1.
-
-    It is that norm over the sum of the norms of both parts, measured in validated steps, and 0 in others.
-    """
+def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, step: int) -> Tensor:
+    """Do one step; return its loss."""
     parameters = list(state.networks.parameters())
-    shares = (step + 1) % options.save_every == 0 or step + 1 == options.steps
     streams.move_to(step)
-
-    def differentiate(loss: Tensor, *, more: bool) -> list[Tensor]:
-        if not loss.requires_grad:
-            return [torch.zeros_like(parameter).flatten() for parameter in parameters]
-        parts = torch.autograd.grad(loss, parameters, materialize_grads=True, retain_graph=more)
-        return [part.flatten() for part in parts]
 
     def work(crop: int) -> Tensor:
         rng = np.random.default_rng([options.seed, step, crop])
         example = streams.draw(step, crop, rng)
+        example = draw_views(example, options, rng)
+        if options.recolor:
+            example = recolor(example, rng)
+        window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
         with torch.enable_grad():
-            loss = _loss(state.networks, example, options, step, rng)
-            apart = differentiate(loss.diversity, more=True) if shares else []
-            parts = differentiate(loss.total, more=False)
-        return torch.cat([*parts, loss.total.detach().to(parts[0])[None], *apart])  # which may be on a GPU
+            loss = window_loss(state.networks, window, options, step, rng)
+            parts = [torch.zeros_like(parameter) for parameter in parameters]
+            if loss.requires_grad:
+                parts = list(torch.autograd.grad(loss, parameters, materialize_grads=True))
+        return torch.cat([*(part.flatten() for part in parts), loss.detach().to(parts[0])[None]])  # maybe on a GPU
 
     mean = torch.stack(parallel_map(work, range(options.crops))).sum(0) / options.crops
     sizes = [parameter.numel() for parameter in parameters]
-    gradients, loss, apart = mean.split([sum(sizes), 1, len(mean) - sum(sizes) - 1])
+    gradients, loss = mean.split([sum(sizes), 1])
     for parameter, gradient in zip(parameters, gradients.split(sizes), strict=True):
         parameter.grad = gradient.view_as(parameter)
     torch.nn.utils.clip_grad_norm_(parameters, options.clip)
@@ -275,24 +268,7 @@ def _step(state: TrainingState, streams: ExampleStreams, options: TrainOptions, 
     with torch.no_grad():
         for _, parameter, smooth in state.pairs():
             smooth.lerp_(parameter, 1 - share)
-    return loss[0].cpu(), gradient_share(gradients, apart) if shares else 0.0
-
-
-def gradient_share(gradient: Tensor, part: Tensor) -> float:
-    """Compute the norm of a part of a gradient, as a share of the sum of its norm and that of the rest."""
-    own, rest = float(part.norm()), float((gradient - part).norm())
-    return own / max(own + rest, 1e-30)
-
-
-def _loss(
-    networks: Networks, example: Example, options: TrainOptions, step: int, rng: np.random.Generator
-) -> WindowLoss:
-    """Compute the loss of a random window of an example."""
-    example = draw_views(example, options, rng)
-    if options.recolor:
-        example = recolor(example, rng)
-    window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
-    return window_loss(networks, window, options, step, rng)
+    return loss[0].cpu()
 
 
 def save_state(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:

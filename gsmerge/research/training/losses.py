@@ -9,7 +9,6 @@ which are the paper's teacher, and siblings apart.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations, product
 
@@ -78,21 +77,13 @@ def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tenso
             yield (features / (lengths + float(EPSILON)))[0]
 
 
-@dataclass(frozen=True, eq=False)
-class WindowLoss:
-    """Loss of a window; ``diversity`` is the part that keeps siblings apart. Weights are included."""
-
-    total: Tensor
-    diversity: Tensor
-
-
 def window_loss(
     networks: Networks,
     window: Window,
     options: TrainOptions,
     step: int,
     rng: np.random.Generator,
-) -> WindowLoss:
+) -> Tensor:
     """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 
     It is the mean over all levels if they are trained jointly. The diversification is a share of the photometric loss:
@@ -101,17 +92,17 @@ def window_loss(
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
     teacher, diversity = options.regularizer_weights(step)
-    refined, total, apart = refine_crop(crop, networks, options, step), torch.zeros(()), torch.zeros(())
+    refined, total = refine_crop(crop, networks, options, step), torch.zeros(())
     for k in levels:
         prediction = decode_crop(refined, crop, k)
         loss = photometric_loss(draw_window(prediction.gaussians, window, background), window, options, step)
         if diversity and k > 1:
             spread = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
-            apart = apart + diversity * float(loss.detach()) * spread / len(levels)
+            loss = loss + diversity * float(loss.detach()) * spread
         if teacher:
             loss = loss + teacher * teacher_loss(prediction, crop.example.members)
         total = total + loss / len(levels)
-    return WindowLoss(total + apart, apart)
+    return total
 
 
 MAX_DB = 100.0  # PSNR of windows without an error

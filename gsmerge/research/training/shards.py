@@ -77,40 +77,27 @@ def prepare_shards(
         raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
-        shards += _scene_shards(scene, options, folder, _in_all(report, len(shards), len(scenes) - number))
+        if report:
+            report(f"examples: {scene_name(scene)}", number, len(scenes))
+        shards += _scene_shards(scene, options, folder)
     return shards
 
 
-def _in_all(report: Report | None, before: int, scenes: int) -> Report:
-    """Return a progress report for one scene's examples that counts the examples of all scenes.
-
-    ``before`` examples come first, and each scene has equally many.
-    """
-
-    def move(text: str, done: int, count: int) -> None:
-        if report:
-            report(f"examples: {text}", before + done, before + scenes * count)
-
-    return move
-
-
-def _scene_shards(scene: Path, options: TrainOptions, folder: Path, report: Report) -> list[Shard]:
+def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
     key, name = scene_key(scene, options), scene_name(scene)
     record = folder / f"{key[:32]}.json"
     hashes = _read_record(record)
     if hashes is None:
-        hashes = _make_shards(scene, options, folder / key[:32], report)
+        hashes = _make_shards(scene, options, folder / key[:32])
         with atomic_output(record, overwrite=True) as temporary:
             temporary.write_bytes(json.dumps(hashes, indent=1).encode() + b"\n")
     return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
 
 
-def _make_shards(scene: Path, options: TrainOptions, start: Path, report: Report) -> dict[str, str]:
+def _make_shards(scene: Path, options: TrainOptions, start: Path) -> dict[str, str]:
     """Write the missing examples of a scene to files that begin with ``start``; return the hash of each by name."""
-    hashes, name = dict[str, str](), scene_name(scene)
-    report(name, 0, 0)
-    for label, count, make in make_examples(scene, options):
-        report(name, len(hashes), count)
+    hashes = dict[str, str]()
+    for label, make in make_examples(scene, options):
         path = start.with_name(f"{start.name}-{label}.safetensors")
         hashes[path.name] = _content_hash(path) or write_shard(path, make())
     return hashes

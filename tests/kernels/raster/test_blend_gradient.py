@@ -8,18 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from messages import refuses
 from slow_renderer import BACKGROUND, HEIGHT, WIDTH, random_gaussians, render_reference, turned_cameras
 from sweeps import sweep
 from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge import Gaussians
 from gsmerge.raster import TiledView, composite, prepare, tile_view
-from gsmerge.raster.gradient import (
-    Gradients,
-    color_gradients,
-    view_gradients,
-)
+from gsmerge.raster.composite import view_colors
+from gsmerge.raster.gradient import Gradients, color_gradients, gradients_of
 from gsmerge.runtime.threads import use_threads
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
@@ -29,10 +25,9 @@ FIELDS = ("means", "quats", "scales", "opacities", "colors")
 
 def gradients_of_view(tiled: TiledView, colors: np.ndarray, grad_left: np.ndarray | None) -> Gradients:
     image, transmittance = composite(tiled, colors, BACKGROUND)
-    return view_gradients(
-        tiled, normal(HEIGHT, WIDTH, 3), grad_left,
-        image=image, transmittance=transmittance, colors=colors, with_viewmat=True,
-    )  # fmt: skip
+    return gradients_of(
+        tiled, colors[tiled.ids], image, transmittance, normal(HEIGHT, WIDTH, 3), grad_left, with_viewmat=True
+    )
 
 
 @sweep("eps2d", [0.075, 0.3, 1.0])
@@ -86,10 +81,8 @@ def test_finite_differences() -> None:
 
     tiled = turned_view(start)
     image, left = composite(tiled, colors, BACKGROUND)
-    actual = view_gradients(
-        tiled, grad_image.astype(np.float32), grad_left.astype(np.float32),
-        image=image, transmittance=left, colors=colors,
-    )  # fmt: skip
+    wanted = grad_image.astype(np.float32), grad_left.astype(np.float32)
+    actual = gradients_of(tiled, colors[tiled.ids], image, left, *wanted, with_viewmat=False)
     for name in FIELDS:
         gradient = full(actual, name, n)
         step = gradient / np.abs(gradient).max()
@@ -112,10 +105,10 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
             tiled = tile_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
             assert len(tiled.flatten_ids) > 2000
             image, left = composite(tiled)
-            shape = view_gradients(
-                tiled, grads[..., :3], grads[..., 3], image=image, transmittance=left, with_viewmat=True
-            )
-            return [*vars(shape).values(), *vars(color_gradients(tiled, shape.colors)).values()]
+            colors = view_colors(tiled)
+            wanted = grads[..., :3].copy(), grads[..., 3].copy()
+            shape = gradients_of(tiled, colors, image, left, *wanted, with_viewmat=True)
+            return [*vars(shape).values(), *vars(color_gradients(tiled, shape.colors, colors)).values()]
 
     for one, other in zip(run(1), run(threads), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -144,7 +137,7 @@ def test_finite_input_gives_finite_gradients(change: str, eps2d: float, antialia
     actual = gradients_of_view(tiled, normal(60, 3), normal(HEIGHT, WIDTH))
     for name in (*FIELDS, "viewmat"):
         assert np.isfinite(getattr(actual, name)).all(), name
-    for array in vars(color_gradients(tiled, actual.colors)).values():
+    for array in vars(color_gradients(tiled, actual.colors, view_colors(tiled))).values():
         assert np.isfinite(array).all()
 
 
@@ -154,18 +147,3 @@ def test_a_view_of_nothing() -> None:
     actual = gradients_of_view(tiled, normal(5, 3), None)
     assert len(actual.ids) == len(actual.means) == len(actual.colors) == 0
     assert (actual.viewmat == 0).all()
-
-
-@pytest.mark.parametrize("name", ["grad_image", "grad_transmittance", "image", "transmittance", "colors"])
-def test_other_shapes_are_refused(name: str) -> None:
-    tiled = turned_view(random_gaussians(5))
-    arrays = {
-        "grad_image": normal(HEIGHT, WIDTH, 3),
-        "grad_transmittance": normal(HEIGHT, WIDTH),
-        "image": normal(HEIGHT, WIDTH, 3),
-        "transmittance": normal(HEIGHT, WIDTH),
-        "colors": normal(5, 3),
-    }
-    arrays[name] = arrays[name][:-1]
-    with refuses(ValueError, name, list(arrays[name].shape)):
-        view_gradients(tiled, **arrays)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from messages import refuses
 from slow_renderer import (
     random_gaussians,
     turned_cameras,
@@ -13,9 +12,8 @@ from slow_renderer import (
 from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge.kernels.raster import sh
-from gsmerge.raster.gradient import (
-    color_gradients,
-)
+from gsmerge.raster.composite import view_colors as drawn_colors
+from gsmerge.raster.gradient import color_gradients
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
@@ -42,7 +40,7 @@ def test_gradient_of_colours_of_every_degree(degree: int) -> None:
     gaussians, viewmat = random_gaussians(150, degree, degree), turned_cameras(1).viewmats[0]
     tiled = turned_view(gaussians)
     grad_colors = normal(len(tiled.ids), 3)
-    actual = color_gradients(tiled, grad_colors)
+    actual = color_gradients(tiled, grad_colors, drawn_colors(tiled))
     means, sh0, shN = (getattr(gaussians, name).double().requires_grad_() for name in ("means", "sh0", "shN"))
     colors = view_colors(means, torch.cat([sh0, shN], 1), viewmat)
     (colors[torch.from_numpy(tiled.ids).long()] * torch.from_numpy(grad_colors)).sum().backward()
@@ -57,15 +55,9 @@ def test_gradients_are_written_into_used_memory(number: int, enough: bool, degre
     """Where it is large enough; the answer is the same."""
     tiled, other = turned_view(random_gaussians(150, degree, degree)), turned_view(random_gaussians(number, degree, 5))
     assert (len(other.ids) > len(tiled.ids)) == enough
-    used = color_gradients(other, normal(len(other.ids), 3))
-    expected = color_gradients(tiled, normal(len(tiled.ids), 3))
-    actual = color_gradients(tiled, normal(len(tiled.ids), 3), used=used)
+    used = color_gradients(other, normal(len(other.ids), 3), drawn_colors(other))
+    given = normal(len(tiled.ids), 3), drawn_colors(tiled)
+    expected, actual = color_gradients(tiled, *given), color_gradients(tiled, *given, used=used)
     for one, again in zip(vars(expected).values(), vars(actual).values(), strict=True):
         np.testing.assert_array_equal(one, again)
     assert np.shares_memory(actual.sh0, used.sh0) == enough
-
-
-def test_gradients_of_other_numbers_of_colours_are_refused() -> None:
-    tiled = turned_view(random_gaussians(5))
-    with refuses(ValueError, "grad_colors", [4, 3], [5, 3]):
-        color_gradients(tiled, normal(len(tiled.ids) + 1, 3))

@@ -116,10 +116,12 @@ def test_bad_indices_are_refused() -> None:
           for parents in ([-1, 0, -1], [1, -1, -1], [3, -1, -1], [2, 2, 2])),
         *((seeds.voronoi, np.array([[0, 0], place]), 3, 4) for place in ([-1, 0], [0, 4], [3, 0])),
         *((ring, ONE, y, x, 0) for y, x in ((0, 1), (1, 0), (2, 1), (1, 2))),
-        (cut, np.array([2, 2, -1], np.int32), np.ones(0, bool), 2), (kd.cut_gain, integral, 0, 4, 5, 4, 1.0, 0.0),
+        (cut, np.array([2, 2, -1], np.int32), np.ones(0, bool), 2),
+        (kd.cut_gain, integral, 0, 4, 5, 4, 1.0, 0.0, np.empty(2)),
         (merge_tree.merge_order, same, tree, 1.0, 1.0, 1.0), (ward.merge_tree, same[:0], rows, 3, 1, np.float32(1)),
     ]  # fmt: skip
-    high, pairs = [(ward.merge_cost, rows, 0, 4), (merge_tree.merge_growth, tree, 4, 0, 1.0, 1.0)], []
+    far = np.array([[0, 4]], np.int32), np.empty(1, np.float32)
+    high, pairs = [(merge_tree.merge_growth, tree, 4, 0, 1.0, 1.0, np.empty(2))], [(ward.merge_costs, rows, *far)]
     for pair in (np.array([[0, 2]], np.int32), np.array([[-1, 0]], np.int32)):
         pairs += [
             (ward.merge_tree, pair, rows, 2, 1, np.float32(1)),

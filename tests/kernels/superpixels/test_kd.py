@@ -34,7 +34,9 @@ def test_best_cut_is_the_largest_fall_of_the_error(pixels: np.ndarray, box: tupl
     integral, near = kd.integral_image(pixels), y0 * 24 + x0
     size = float((y1 - y0) * (x1 - x0))
     for axis, (far, step, side) in enumerate([(near + x1 - x0, 24, y1 - y0), (near + 24 * (y1 - y0), 1, x1 - x0)]):
-        gain, cut = kd.cut_gain(integral, near, far, step, side, size, COMPACTNESS)
+        found = np.empty(2)
+        kd.cut_gain(integral, near, far, step, side, size, COMPACTNESS, found)
+        gain, cut = float(found[0]), int(found[1])
         candidates = [(g, c) for g, a, c in brute_cuts(pixels, *box) if a == axis]
         if candidates:
             assert gain == pytest.approx(max(candidates)[0], rel=1e-5)

@@ -104,7 +104,9 @@ def test_growth_of_one_merge(seed: int) -> None:
     view = View(seed)
     rows, _ = view.rows()
     for u, v in itertools.pairwise(range(12)):
-        error, place = kernels.merge_growth(rows, u, v, DEPTH_WEIGHT, COMPACTNESS)
+        growth = np.empty(2)
+        kernels.merge_growth(rows, u, v, DEPTH_WEIGHT, COMPACTNESS, growth)
+        error, place = growth.tolist()
         expected = view.growths_of(view.labels == u, view.labels == v)
         assert error == pytest.approx(expected[0], abs=1e-8)
         assert place == pytest.approx(COMPACTNESS * expected[1], abs=1e-8)

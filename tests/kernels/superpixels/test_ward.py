@@ -25,7 +25,9 @@ def test_merge_cost_is_the_growth_of_the_error(pixels: np.ndarray, labels: np.nd
     for u, v in [(0, 1), (4, 20), (7, 29)]:
         apart = squared_error(points[flat == u]) + squared_error(points[flat == v])
         together = squared_error(points[(flat == u) | (flat == v)])
-        assert ward.merge_cost(rows, u, v) == pytest.approx(together - apart, rel=1e-3)
+        cost = np.empty(1, np.float32)
+        ward.merge_costs(rows, np.array([[u, v]], np.int32), cost)
+        assert cost[0] == pytest.approx(together - apart, rel=1e-3)
 
 
 def test_adjacent_pairs_are_all_neighbours(labels: np.ndarray) -> None:

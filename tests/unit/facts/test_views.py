@@ -12,7 +12,6 @@ from messages import noted, refuses
 from gsmerge.facts.views import (
     MAX_SCORED_VIEWS,
     REPORT_VIEWS,
-    context_views,
     distinct_views,
     even_views,
     midpoint_views,
@@ -75,7 +74,8 @@ def test_targets_lie_midway() -> None:
     ],
 )
 def test_the_paper_s_lists(num_frames: int, count: int, expected: tuple[list[int], list[int]]) -> None:
-    assert context_views(num_frames, count) == expected
+    context = even_views(num_frames, count)
+    assert (context, midpoint_views(context, range(num_frames))) == expected
 
 
 def test_subset_is_the_scene_of_those_views() -> None:

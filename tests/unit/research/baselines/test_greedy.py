@@ -65,23 +65,18 @@ def slow_greedy(gaussians: Gaussians, count: int) -> list[Blob]:
 @pytest.mark.parametrize("degree", [0, 1])
 def test_the_same_as_the_slow_twin(count: int, degree: int) -> None:
     gaussians = some(60, seed=count, degree=degree)
-    cloud, slow = greedy.reduce_to(greedy.cloud_of(gaussians), count), slow_greedy(gaussians, count)
-    assert len(cloud) == len(slow) == count
-    np.testing.assert_allclose(cloud.means, [b.mean for b in slow], atol=1e-8)
-    np.testing.assert_allclose(cloud.covars, [[b.covar[i, j] for i, j in greedy.UPPER] for b in slow], atol=1e-8)
-    np.testing.assert_allclose(cloud.masses, [b.mass for b in slow], rtol=1e-8)
-    np.testing.assert_allclose(cloud.sh, [b.sh for b in slow], atol=1e-5)
-
-
-def test_opacity_is_mass_over_area() -> None:
-    gaussians = some(40)
-    back = greedy.gaussians_of(greedy.cloud_of(gaussians))
-    scenes.assert_same_set(back, gaussians, atol=1e-4)
-    lone = greedy.gaussians_of(greedy.reduce_to(greedy.cloud_of(gaussians), 1))
-    cloud = greedy.cloud_of(gaussians)
-    assert float(lone.opacities[0]) == pytest.approx(
-        min(0.999, cloud.masses.sum() / greedy.area(lone.scales.astype(np.float64))[0]), rel=1e-3
-    )
+    merged, slow = greedy.merge(gaussians, count), slow_greedy(gaussians, count)
+    means = np.stack([blob.mean for blob in slow])
+    places = np.linalg.norm(merged.means[:, None] - means, axis=2).argmin(1)
+    assert sorted(places) == list(range(count))
+    twins = [slow[place] for place in places]
+    np.testing.assert_allclose(merged.means, means[places], atol=1e-5)
+    covars = covariances(merged.quats.astype(np.float64), merged.scales.astype(np.float64))
+    np.testing.assert_allclose(covars, [blob.covar for blob in twins], atol=1e-5)
+    opacities = [min(0.999, blob.mass / slow_area(blob.covar)) for blob in twins]
+    np.testing.assert_allclose(merged.opacities, opacities, rtol=1e-3)
+    sh = np.concatenate([merged.sh0, merged.shN], 1).reshape(count, -1)
+    np.testing.assert_allclose(sh, [blob.sh for blob in twins], atol=1e-5)
 
 
 def slow_matching(left: np.ndarray, right: np.ndarray, costs: np.ndarray, limit: int) -> list[int]:
@@ -116,7 +111,7 @@ def test_hostile_sets(count: int) -> None:
         np.zeros((60, 3), np.float32), gaussians.quats, gaussians.scales * np.array([1, 1, 0], np.float32),
         np.zeros(60, np.float32), gaussians.sh0, gaussians.shN,
     )  # fmt: skip
-    merged = greedy.gaussians_of(greedy.reduce_to(greedy.cloud_of(stacked), count))
+    merged = greedy.merge(stacked, count)
     assert len(merged) == count
     for name in scenes.FIELDS:
         assert np.isfinite(getattr(merged, name)).all(), name

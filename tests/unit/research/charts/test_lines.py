@@ -15,7 +15,6 @@ from gsmerge.research.charts.lines import (
     line_key,
     line_names,
     mean_interval,
-    paired_difference,
     paired_intervals,
     size_label,
 )
@@ -117,16 +116,6 @@ def test_one_scene_has_a_mean_and_no_width() -> None:
     assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
     with refuses(ValueError, "", "value", "none"):
         mean_interval([])
-
-
-def test_pairing_takes_out_what_scenes_differ_by() -> None:
-    ours = {"a": 15.0, "b": 25.0, "c": 31.0, "only ours": 99.0}
-    theirs = {"a": 14.0, "b": 24.1, "c": 29.9}
-    actual = paired_difference(ours, theirs)
-    assert actual.mean == pytest.approx(1.0)
-    assert actual.count == 3
-    assert actual.low > 0.7
-    assert mean_interval(list(ours.values())[:3]).high - mean_interval([15, 25, 31]).low > 10
 
 
 def test_paired_intervals_match_a_slow_twin() -> None:

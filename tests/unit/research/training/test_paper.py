@@ -94,7 +94,7 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
     networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()
     for window in windows(example, 4):
-        loss = window_loss(networks, window, PAPER, 0, np.random.default_rng(0)).total
+        loss = window_loss(networks, window, PAPER, 0, np.random.default_rng(0))
         names, parameters = zip(*networks.named_parameters(), strict=True)
         for name, part in zip(names, torch.autograd.grad(loss, parameters, allow_unused=True), strict=True):
             if part is not None:
@@ -115,8 +115,6 @@ def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Pa
         if name.startswith("merger"):
             assert not np.array_equal(start, after.arrays[name]), name
     assert np.abs(after.arrays["merger.out.weight"]).max() > 1e-4
-    header = (tmp_path / "run" / "losses.csv").read_text().splitlines()[0]
-    assert header == "step,rate,loss,diversity_share,psnr_analytic,psnr_learned,matched"
 
 
 def teacher_of(example: Example) -> Prediction:

@@ -18,7 +18,6 @@ from gsmerge.networks.options import NetworkOptions
 from gsmerge.raster import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.examples import recolor
-from gsmerge.research.training.loop import gradient_share
 from gsmerge.research.training.losses import (
     color_loss,
     diversity_loss,
@@ -218,7 +217,7 @@ def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: E
         parameters = [layer.weight, layer.bias]
 
         def loss(window: Window = window) -> torch.Tensor:
-            return window_loss(networks, window, options, 0, np.random.default_rng(0)).total
+            return window_loss(networks, window, options, 0, np.random.default_rng(0))
 
         actual = torch.autograd.grad(loss(), parameters)
         directions = [torch.randn(p.shape, generator=generator) for p in parameters]
@@ -300,18 +299,19 @@ def test_diversification_does_not_depend_on_the_unit_of_the_world() -> None:
 
 
 def test_diversification_is_a_share_of_the_photometric_loss(example: Example) -> None:
-    """Twice the loss of colours, twice that of siblings; of its gradient a share between 0 and 1 is told."""
+    """Twice the loss of colours, twice that of siblings."""
     networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     window = whole_photo(example, 0, 2)
     options = replace(PHOTO, photo_loss="mse", ssim_weight=0.0, diversity_weight=0.5)
     parts = []
     for weight in (1.0, 2.0):
-        loss = window_loss(networks, window, replace(options, photo_weight=weight), 0, np.random.default_rng(0))
-        total, apart = float(loss.total.detach()), float(loss.diversity.detach())
-        parts.append(apart)
-        assert 0 < apart <= 0.5 * (total - apart) + 1e-9
-    assert parts[1] == pytest.approx(2 * parts[0], rel=1e-5)
-    assert gradient_share(torch.tensor([3.0, 4.0]), torch.tensor([3.0, 0.0])) == pytest.approx(3 / 7)
+        plain, total = (
+            float(window_loss(networks, window, chosen, 0, np.random.default_rng(0)).detach())
+            for chosen in (replace(options, photo_weight=weight, diversity_weight=share) for share in (0.0, 0.5))
+        )
+        parts.append(total - plain)
+        assert 0 < parts[-1] <= 0.5 * plain + 1e-9
+    assert parts[1] == pytest.approx(2 * parts[0], rel=1e-4)
 
 
 def test_renders_change_colours_as_photos_do(example: Example) -> None:
