@@ -45,7 +45,7 @@ COMMANDS = {
 # Imported before the commands are run, which would each do it anew
 MODULES = ("gsmerge.cli.app", "gsmerge.compaction.files", "gsmerge.networks.apply", "gsmerge.states.files")
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
-RECORDS = "batch.jsonl"  # of batches, for the next run
+RECORDS, LOCK = "batch.jsonl", ".gsmerge-lock"  # of batches, for the next run; there while a folder is in use
 # Faults to show that they would be reported: functions of ``os`` to replace
 PLANTS: dict[str, dict[str, Callable[..., object]]] = {
     "none": {},
@@ -116,8 +116,9 @@ def _main(call: list[str], printed: Path, plant: str) -> int:
 
 
 def read_files(folder: Path) -> dict[str, bytes]:
-    """Return the bytes of every file below a folder by its name."""
-    return {str(x.relative_to(folder)): x.read_bytes() for x in sorted(folder.rglob("*")) if x.is_file()}
+    """Return the bytes of every file below a folder by its name, but for the empty file of a lock."""
+    files = (x for x in sorted(folder.rglob("*")) if x.is_file() and x.name != LOCK)
+    return {str(x.relative_to(folder)): x.read_bytes() for x in files}
 
 
 def contents(files: dict[str, bytes]) -> Contents:

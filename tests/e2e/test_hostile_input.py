@@ -29,7 +29,7 @@ MEMORY_MARGIN, SECONDS_MARGIN = 20 if SANITIZED else 2, 10  # a scene is read an
 MOST_SECONDS, MOST_MEMORY = 100, 2**30  # of sparse files, whose budget is more than a machine has
 OPTIONS = {"-o", "--images"}  # what they name is nothing for ``inspect``
 FOR_OTHER_REASONS = ("nothing where the scene was", "the ply as cameras")  # sound files of another kind than expected
-SLOW = ("transforms.json: 3000 frames", "glb: nodes in one another")  # seconds of processor time
+SLOW = ("transforms.json: 300 frames", "glb: nodes in one another")  # seconds of processor time
 FEW = 12  # of a kind, all of which are in the default run
 
 COMPACTED = ("one position 1e30", "half of the positions NaN", "colours 1e38", "opacities 1e38", "scales 1e38",

@@ -37,8 +37,8 @@ def statuses(folder: Path) -> dict[str, list[str]]:
 
 
 def results(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file but the records: whatever is left half-done shows."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.name != RECORDS]
+    """SHA-256 of every file but the records and a lock's: whatever is left half-done shows."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in (RECORDS, ".gsmerge-lock")]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 

@@ -46,10 +46,15 @@ def along(places: np.ndarray) -> Scene:
 def test_blocks_are_as_good_as_one_piece() -> None:
     places = np.linspace(0, 1, 36)
     scene, between = along(places), along((places[1:] + places[:-1]) / 2)
-    whole, parts = (compact(scene, blocks=blocks, **{**SETTINGS, "fit_steps": 600}) for blocks in ("none", 3))
-    assert len(parts.gaussians) == pytest.approx(len(whole.gaussians), rel=0.1)
-    one, other = (scenes.psnr_of(result.gaussians, between) for result in (whole, parts))
+    results = [
+        [compact(scene, blocks=blocks, seed=seed, **{**SETTINGS, "fit_steps": 600}) for blocks in ("none", 3)]
+        for seed in range(3)  # single ones differ by a decibel
+    ]
+    scores = [[scenes.psnr_of(result.gaussians, between) for result in pair] for pair in results]
+    one, other = np.mean(scores, 0)
     assert other > one - 0.3
+    whole, parts = results[0]
+    assert len(parts.gaussians) == pytest.approx(len(whole.gaussians), rel=0.1)
     scenes.assert_invariants(parts.gaussians, scene)
     blocks = parts.report.choices["blocks"]
     assert [block["views"] for block in blocks] == pytest.approx([12] * 3, abs=2)
