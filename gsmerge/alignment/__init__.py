@@ -15,7 +15,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.alignment.judge import Recovery
-from gsmerge.alignment.layouts import ESTIMATED, MAY_BE_UNALIGNED, TRIMS, Layout, da3_borders
+from gsmerge.alignment.layouts import (
+    ESTIMATED,
+    MAY_BE_UNALIGNED,
+    TRIMS,
+    Layout,
+    da3_borders,
+    dropped_layout,
+    move_layout,
+)
 from gsmerge.alignment.rotations import choose_rotations, read_rotations, w_seems_last
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
 from gsmerge.alignment.search import AlignmentResult, align

@@ -1,7 +1,8 @@
 """Find the grid of rows that lack some pixels, from the rows alone: view after view, and line after line in each.
 
-Lines that are whole have one length, after which the step back to the left repeats. A projective camera that shows a
-few of them in their pixels shows the lines before and after in theirs, up to where the rows of a view end.
+Lines have one length, or about one where pixels are missing here and there, after which the step back to the left
+repeats. A projective camera that shows a few of them in their pixels shows the lines before and after in theirs, up to
+where the rows of a view end.
 """
 
 from __future__ import annotations
@@ -136,14 +137,17 @@ class _View:
 
 def _find_views(points: np.ndarray, length: int, slack: int) -> list[_View]:
     """Find the views whose lines have ``length`` rows, up to ``slack`` more or less."""
-    series = _find_lines(points, length, slack)
-    first = [seed.px for starts in series[:_SEEDS] if (seed := _solve_lines(points, starts)) is not None]
-    far, views = _AS_NEAR * min(first, default=0.0), list[_View]()
+    series = _find_lines(points, length, slack)[:_TRIED]
+    first = [_solve_lines(points, starts) for starts in series[:_SEEDS]]
+    nearest = min((seed.px for seed in first if seed is not None), default=None)
+    if nearest is None:
+        return []
+    far, views = _AS_NEAR * nearest, list[_View]()
     free = np.ones(len(points), bool)
-    for starts in series[:_TRIED] if first else ():
+    for i, starts in enumerate(series):
         if not free[starts[0] : starts[-1]].all():
             continue
-        seed = _solve_lines(points, starts)
+        seed = first[i] if i < len(first) else _solve_lines(points, starts)
         if seed is not None and seed.px <= far:
             margin = int(_MARGIN * length) if slack else 0  # of columns that the seed may lack
             width = int(seed.x.max()) + 1 + 2 * margin
@@ -355,8 +359,8 @@ def _walk(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place rows that follow the pixel ``last`` one after the other, up to ``reach`` lines on.
 
-    Rows from pixel to pixel without a gap come to one line together. Returns rows ``[p]`` and their ``x``, ``y``; ends
-    where as many rows as a line has do not follow the ones before.
+    Rows of a piece of a line, which lacks few pixels at once, come to one line together. Returns rows ``[p]`` and their
+    ``x``, ``y``; ends where as many rows as a line has do not follow the ones before.
     """
     points = points[: (reach + 1) * width]
     if not len(points):

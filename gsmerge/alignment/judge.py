@@ -111,9 +111,8 @@ class Fit:
 def choose_fit(fits: Sequence[Fit], read: Callable[[GridFit], AlignmentInput]) -> Fit | None:
     """Choose the fit that is nearest to its pixels, or among similar fits the one whose photos have the right colours.
 
-    ``read`` resizes the photos to a grid. None where a grid of another size is about as near
-    and no photos decide; SceneError where poses in
-    another convention are.
+    ``read`` resizes the photos to a grid. None where a grid of another size is about as near and no photos decide;
+    SceneError where poses in another convention are.
     """
     best = min(fits, key=lambda fit: fit.px, default=None)
     if best is None:

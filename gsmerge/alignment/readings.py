@@ -46,6 +46,7 @@ _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if
 # pixels from which no camera sees the rows of a layout: times the limit, and share of the shorter side
 _SEEN_LIMITS, _SEEN_SHARE = 2.0, 0.03
 _SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
+_EFFORTS = (0, 1, 2)  # of the search for a frame, see candidate_similarities
 _SEEN_SAMPLES = 200  # Gaussians of a view that it is judged by
 _LIKELY_VIEWS = 16  # cameras that a part may be of, by a few of its Gaussians
 
@@ -71,15 +72,12 @@ def _rounds(inputs: AlignmentInput, *, exact_frames: bool) -> Iterator[list[Read
     inputs = _without_same_labellings(inputs)
     yield _read_plain(inputs)
     layouts = possible_layouts(inputs)
-    for effort in (0,) if exact_frames or not is_seen(inputs, layouts) else (0, 1, 2):
-        yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
+    yield from _read_layouts(inputs, layouts, (0,) if exact_frames or not is_seen(inputs, layouts) else _EFFORTS)
     num_pixels = len(inputs.cameras) * inputs.cameras.width * inputs.cameras.height
     lacks_pixels = _PER_VIEW * len(inputs.cameras) <= finite and len(inputs.gaussians) < num_pixels
     if not exact_frames and lacks_pixels and inputs.order not in MAY_BE_UNALIGNED:
         yield _follow_rows(inputs)
-        layouts = dropped_layouts(inputs)
-        for effort in (0, 1, 2):
-            yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
+        yield from _read_layouts(inputs, _dropped_layouts(inputs), _EFFORTS)
 
 
 def _read_plain(inputs: AlignmentInput) -> list[Reading]:
@@ -146,7 +144,7 @@ def _follow_rows(inputs: AlignmentInput) -> list[Reading]:
     return readings
 
 
-def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
+def _dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
     """List the places, in the grid of the cameras, of the grid that rows which lack pixels are found to be."""
     cameras = inputs.cameras
     grid = inputs.dropped()
@@ -169,6 +167,12 @@ def dropped_layouts(inputs: AlignmentInput) -> list[Layout]:
         for margin, shift in zip(margins, shifts.tolist(), strict=True)
     )
     return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
+
+
+def _read_layouts(inputs: AlignmentInput, layouts: Sequence[Layout], efforts: Sequence[int]) -> Iterator[list[Reading]]:
+    """Yield the readings of all layouts, with one effort after the other."""
+    for effort in efforts:
+        yield [reading for layout in layouts for reading in _read_layout(inputs, layout, effort)]
 
 
 def _read_layout(inputs: AlignmentInput, layout: Layout, effort: int) -> list[Reading]:

@@ -70,10 +70,9 @@ def estimate_grid(
     (x, y), Ks, pixel_ids = match.trim, cameras.Ks.copy(), cameras.pixel_ids
     Ks[:, :2, 2] += match.trim
     if pixel_ids is not None:
-        line, column = np.divmod(pixel_ids, pictures.shape[2])
-        view, line = np.divmod(line, pictures.shape[1])
-        width, height = pictures.shape[2] + 2 * x, pictures.shape[1] + 2 * y
-        pixel_ids = np.where(pixel_ids < 0, -1, (view * height + line + y) * width + column + x)
+        views, height, width = pictures.shape[:3]
+        layout = alignment.dropped_layout(pixel_ids, views, width, height)
+        pixel_ids = alignment.move_layout(layout, width + 2 * x, height + 2 * y, x, y).pixel_ids(len(pixel_ids))
     return replace(
         cameras,
         Ks=Ks,
