@@ -310,7 +310,8 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, transform
     x, y = (whole / part for whole, part in zip(file_size, size, strict=True))
     transform = replace(transform, scale_x=x * transform.scale_x, scale_y=y * transform.scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
-    return GridFit(camera_file, to_cameras(camera_file), transform, (note,))
+    is_same = file_size == (transform.width, transform.height)
+    return GridFit(camera_file, to_cameras(camera_file), transform, () if is_same else (note,))
 
 
 def square_grids(grid: GridFit) -> Iterator[GridFit]:
