@@ -1,6 +1,6 @@
 """Choose between the depths of Gaussians and those of depth maps beside them, by what other views show.
 
-Depth Anything 3 writes both. Its Gaussians take depth along z as distance along the ray, and add an offset.
+Depth Anything 3 writes both; its Gaussians take depth along z as distance along the ray, and add an offset.
 """
 
 from __future__ import annotations
@@ -14,66 +14,99 @@ from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
+# Chosen on exports of seven captures whose Gaussians or maps are off by 5 to 20 %, or along the ray
 _SAME = 0.02  # logarithm of two depths of one surface
 _NEIGHBORS = 8  # nearest other views that are asked
-_COLOR = 5.0  # of a vote, for each unit of colour, sRGB in [0, 1], that the other view's differs by
-_CLEAR = 2.0  # times as many pixels must prefer the map for a view to be placed at it
-_ALONE = 3.0  # votes by which a pixel differs from its view's choice
+_COLOR = 2.0  # what a view's agreement loses for a unit of difference in colour, sRGB in [0, 1]
+_WON = 0.5  # of a view's agreement, by which one depth of a pixel must be ahead
+_DIFFERENT = 0.05  # least share of a view's pixels whose depths differ, for a choice for all of them
+_CLEAR = 0.2  # lead, of the votes of a view and of the scene, that decides for all its pixels
+_SIDE, _HERE, _ASKED = 33, 0.5, 0.3  # else the maps need this lead in a square of pixels, this share of which vote
 
 
 def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> Scene:
-    """Place Gaussians of an aligned scene at the depths ``maps [v,h,w]`` where other views confirm these alone.
+    """Place Gaussians of an aligned scene at the depths ``maps [v,h,w]`` where other views confirm these, not them.
 
-    ``unit``: that of the maps in the scene's; if nothing is confirmed, their median ratio to the Gaussians' depths is
-    tried. Each view is asked as a whole, then each of its pixels. The scene itself is returned where nothing moves.
+    ``unit``: that of the maps in the scene's; if the maps are not confirmed in it, their median ratio to the Gaussians'
+    depths is tried. The scene itself is returned where the Gaussians are as good.
     """
-    views = len(scene)
-    viewmats, valid = scene.cameras.viewmats.astype(np.float64), scene.valid.reshape(views, -1)
-    centres, means = camera_centres(viewmats)[:, None], scene.gaussians.means.astype(np.float64).reshape(views, -1, 3)
-    depths, maps = camera_depths(means, viewmats[:, None]), maps.reshape(views, -1).astype(np.float64)
-    usable = valid & (depths > 0) & (maps > 0) & np.isfinite(maps)
+    views, g = len(scene), scene.gaussians
+    viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1).astype(np.float64)
+    centres, means = camera_centres(viewmats), g.means.reshape(views, -1, 3)
+    depths = camera_depths(means, viewmats[:, None])
+    usable = scene.valid.reshape(views, -1) & (depths > 0) & (maps > 0) & np.isfinite(maps)
+    if views < 2 or not usable.any():
+        return scene
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
-    for scale in (unit, 1 / np.median(ratios[usable])) if views > 1 and usable.any() else ():
-        factors = np.where(usable, ratios * scale, 1)[..., None]
-        at_maps = centres + (means - centres) * factors
-        chosen = _confirmed(scene, at_maps.astype(np.float32), usable & (np.abs(factors[..., 0] - 1) > _SAME))
-        chosen &= usable
-        if chosen.any():
-            g, rows = scene.gaussians, chosen.reshape(-1)
-            moved, scales = g.means.copy(), g.scales.copy()
-            moved[rows] = at_maps[chosen]
-            scales[rows] *= factors[chosen].astype(np.float32)
-            return replace(scene, gaussians=replace(g, means=moved, scales=scales))
-    return scene
+
+    def place(scale: float) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        factors = np.where(usable, scale * ratios, 1)
+        differ = np.abs(factors - 1) > _SAME
+        if not differ.any():
+            return 1.0, differ, means, factors
+        placed = np.stack([c + (m - c) * f[:, None] for c, m, f in zip(centres, means, factors, strict=True)])
+        votes = _count_votes(scene, placed, differ)
+        return float(votes.sum() / max(1, np.abs(votes).sum())), _follow_votes(votes, differ) & usable, placed, factors
+
+    choice = place(unit)
+    if choice[0] <= _CLEAR:
+        other = place(1 / float(np.median(ratios[usable])))
+        choice = other if other[0] > _CLEAR else choice
+    rows, placed, factors = (array.reshape(len(g), -1) for array in choice[1:])
+    if not rows.any():
+        return scene
+    moved, scales = np.where(rows, placed, g.means), np.where(rows, g.scales * factors, g.scales)
+    return replace(scene, gaussians=replace(g, means=moved.astype(g.means.dtype), scales=scales.astype(g.scales.dtype)))
 
 
-def _confirmed(scene: Scene, at_maps: np.ndarray, differ: np.ndarray) -> np.ndarray:
-    """Return where ``[v,p]`` other views confirm the points ``at_maps [v,p,3]``, not the Gaussians that ``differ``."""
+def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.ndarray:
+    """Ask other views which points show their surfaces: 1 for ``placed [v,p,3]``, -1 for the Gaussians.
+
+    ``differ [v,p]``: pixels that are asked for; the votes ``[v,h,w]`` of others, and in doubt, are 0.
+    """
     cameras, (views, pixels) = scene.cameras, differ.shape
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
     shown = sh0_to_rgb(scene.gaussians.sh0) if scene.images is None else scene.images
-    colors = np.ascontiguousarray(shown, np.float32).reshape(-1, 3)
-    sources = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (scene.gaussians.means, at_maps)]
+    colors, opaque = np.ascontiguousarray(shown, np.float32).reshape(-1, 3), np.ones(differ.size, np.float32)
+    sources = [np.ascontiguousarray(points, np.float32).reshape(-1, 3) for points in (scene.gaussians.means, placed)]
     ids = np.where(scene.valid, np.arange(differ.size, dtype=np.int32).reshape(scene.valid.shape), -1)
-    away = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(viewmats), axis=2)
-    opaque = np.ones(differ.size, np.float32)
+    centres = camera_centres(viewmats)
 
-    def in_view(view: int) -> np.ndarray:
+    def ask(view: int) -> np.ndarray:
         rows = view * pixels + np.flatnonzero(differ[view])
-        near = np.argsort(away[view] + np.where(np.arange(views) == view, np.inf, 0), kind="stable")[:_NEIGHBORS]
-        near = near[near != view]
-        support = np.zeros((2, len(rows), COLUMNS))
-        for points, sums in zip(sources, support, strict=True):
+        order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
+        near = order[order != view][:_NEIGHBORS]
+        sums = np.zeros((2, len(rows), COLUMNS))
+        for points, out in zip(sources, sums, strict=True):
             for surface in sources:  # right points agree with whichever is right there
                 sum_cross_view(
                     points[rows].astype(np.float64), colors[rows], np.full(len(rows), -1), viewmats[near], Ks[near],
                     cameras.width, cameras.height, ids[near], surface, opaque, colors[:, None], 1.0, _SAME, 1.0, 0.0,
-                    0, len(rows), sums,
+                    0, len(rows), out,
                 )  # fmt: skip
-        ours, theirs = support[..., 1] - _COLOR * support[..., 4]
-        chosen = np.full(pixels, (theirs > ours).sum() > _CLEAR * (theirs < ours).sum())
-        clear = np.abs(theirs - ours) >= _ALONE
-        chosen[rows[clear] - view * pixels] = theirs[clear] > ours[clear]
-        return chosen
+        ours, theirs = sums[..., 1] - _COLOR * sums[..., 4]
+        votes = np.zeros(pixels, np.int64)
+        votes[rows - view * pixels] = np.sign(np.trunc((theirs - ours) / _WON))
+        return votes
 
-    return np.stack(parallel_map(in_view, range(views)))
+    return np.stack(parallel_map(ask, range(views))).reshape(scene.valid.shape)
+
+
+def _follow_votes(votes: np.ndarray, differ: np.ndarray) -> np.ndarray:
+    """Return for which pixels ``[v,p]`` the maps are ahead: in their view and the scene, or in the pixels around."""
+    of_views, cast = votes.sum((1, 2)), np.abs(votes).sum((1, 2))
+    leads = (of_views / np.maximum(cast, 1) + of_views.sum() / max(cast.sum(), 1)) / 2
+    leads[differ.mean(1) < _DIFFERENT] = 0
+    ahead, asked = _sum_squares(votes), _sum_squares(np.abs(votes))
+    here = (ahead > _HERE * asked) & (asked > _ASKED * _SIDE**2)
+    leads, decided = leads[:, None, None], np.abs(leads[:, None, None]) > _CLEAR
+    return np.where(decided, leads > 0, here).reshape(differ.shape)
+
+
+def _sum_squares(values: np.ndarray) -> np.ndarray:
+    """Sum ``values [v,h,w]`` over the square around each pixel."""
+    half = _SIDE // 2
+    for axis in (1, 2):
+        sums = np.cumsum(np.pad(values, [(half + 1, half) if i == axis else (0, 0) for i in range(3)]), axis)
+        values = sums.take(range(_SIDE, sums.shape[axis]), axis) - sums.take(range(values.shape[axis]), axis)
+    return values

@@ -364,11 +364,10 @@ def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: flo
         return scene, []
     from gsmerge.alignment import choose_depths, fill_from_depths
 
-    depths, notes = depths[list(layout.views)], []
+    depths = depths[list(layout.views)]
     better = choose_depths(scene, depths, unit)
-    moved = (better.gaussians.means != scene.gaussians.means).any(1).sum() / scene.valid.sum()
-    if better is not scene:
-        notes = [f"{100 * moved:.0f} % of the Gaussians start at the depth maps, which other views confirm more often"]
+    moved = int((better.gaussians.means != scene.gaussians.means).any(1).sum())
+    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
     if scene.images is None or scene.missing is None or layout.kind != "box+depth":
         return better, notes
     full = fill_from_depths(better, depths, scene.images)
