@@ -11,52 +11,50 @@ import numpy as np
 
 from gsmerge.geometry import camera_centres, camera_depths, sh0_to_rgb
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
+from gsmerge.kernels.pictures import blur
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
 # Chosen on exports of seven captures whose Gaussians or maps are off by 5 to 20 %, or along the ray
 _SAME = 0.02  # logarithm of two depths of one surface
+_MOST = 100.0  # times its depth by which a Gaussian is moved
 _NEIGHBORS = 8  # nearest other views that are asked
-_COLOR = 2.0  # what a view's agreement loses for a unit of difference in colour, sRGB in [0, 1]
+_COLOR = 5.0  # what a view's agreement loses for a unit of difference in colour, sRGB in [0, 1]
 _WON = 0.5  # of a view's agreement, by which one depth of a pixel must be ahead
 _DIFFERENT = 0.05  # least share of a view's pixels whose depths differ, for a choice for all of them
 _CLEAR = 0.2  # lead, of the votes of a view and of the scene, that decides for all its pixels
-_SIDE, _HERE, _ASKED = 33, 0.5, 0.3  # else the maps need this lead in a square of pixels, this share of which vote
+_AROUND, _HERE, _ASKED = 12.0, 0.6, 0.4  # else the maps need this lead so many pixels around, this share of which vote
 
 
-def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> Scene:
+def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, int]:
     """Place Gaussians of an aligned scene at the depths ``maps [v,h,w]`` where other views confirm these, not them.
 
     ``unit``: that of the maps in the scene's; if the maps are not confirmed in it, their median ratio to the Gaussians'
-    depths is tried. The scene itself is returned where the Gaussians are as good.
+    depths is tried. Also returns how many were placed; the scene itself is returned where the Gaussians are as good.
     """
     views, g = len(scene), scene.gaussians
     viewmats, maps = scene.cameras.viewmats.astype(np.float64), maps.reshape(views, -1).astype(np.float64)
     centres, means = camera_centres(viewmats), g.means.reshape(views, -1, 3)
     depths = camera_depths(means, viewmats[:, None])
     usable = scene.valid.reshape(views, -1) & (depths > 0) & (maps > 0) & np.isfinite(maps)
-    if views < 2 or not usable.any():
-        return scene
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
-
-    def place(scale: float) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        factors = np.where(usable, scale * ratios, 1)
+    best, lead = (usable & False, means, ratios), 0.0
+    for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
+        factors = np.where(usable, np.clip(scale * ratios, 1 / _MOST, _MOST), 1)
         differ = np.abs(factors - 1) > _SAME
-        if not differ.any():
-            return 1.0, differ, means, factors
         placed = np.stack([c + (m - c) * f[:, None] for c, m, f in zip(centres, means, factors, strict=True)])
         votes = _count_votes(scene, placed, differ)
-        return float(votes.sum() / max(1, np.abs(votes).sum())), _follow_votes(votes, differ) & usable, placed, factors
-
-    choice = place(unit)
-    if choice[0] <= _CLEAR:
-        other = place(1 / float(np.median(ratios[usable])))
-        choice = other if other[0] > _CLEAR else choice
-    rows, placed, factors = (array.reshape(len(g), -1) for array in choice[1:])
+        lead = float(votes.sum() / max(1, np.abs(votes).sum()))
+        if scale == unit or lead > _CLEAR:
+            best = _follow_votes(votes, differ) & usable, placed, factors
+        if lead > _CLEAR or not differ.any():
+            break
+    rows, placed, factors = (array.reshape(len(g), -1) for array in best)
     if not rows.any():
-        return scene
-    moved, scales = np.where(rows, placed, g.means), np.where(rows, g.scales * factors, g.scales)
-    return replace(scene, gaussians=replace(g, means=moved.astype(g.means.dtype), scales=scales.astype(g.scales.dtype)))
+        return scene, 0
+    means, scales = np.where(rows, placed, g.means), np.where(rows, g.scales * factors, g.scales)
+    g = replace(g, means=means.astype(g.means.dtype), scales=scales.astype(g.scales.dtype))
+    return replace(scene, gaussians=g), int(rows.sum())
 
 
 def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.ndarray:
@@ -84,7 +82,7 @@ def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.nda
                     cameras.width, cameras.height, ids[near], surface, opaque, colors[:, None], 1.0, _SAME, 1.0, 0.0,
                     0, len(rows), out,
                 )  # fmt: skip
-        ours, theirs = sums[..., 1] - _COLOR * sums[..., 4]
+        ours, theirs = np.maximum(sums[..., 1] - _COLOR * sums[..., 4], 0)
         votes = np.zeros(pixels, np.int64)
         votes[rows - view * pixels] = np.sign(np.trunc((theirs - ours) / _WON))
         return votes
@@ -97,16 +95,7 @@ def _follow_votes(votes: np.ndarray, differ: np.ndarray) -> np.ndarray:
     of_views, cast = votes.sum((1, 2)), np.abs(votes).sum((1, 2))
     leads = (of_views / np.maximum(cast, 1) + of_views.sum() / max(cast.sum(), 1)) / 2
     leads[differ.mean(1) < _DIFFERENT] = 0
-    ahead, asked = _sum_squares(votes), _sum_squares(np.abs(votes))
-    here = (ahead > _HERE * asked) & (asked > _ASKED * _SIDE**2)
+    around = np.stack([blur(np.stack([of_view, np.abs(of_view)], -1), _AROUND) for of_view in votes])
+    here = (around[..., 0] > _HERE * around[..., 1]) & (around[..., 1] > _ASKED)
     leads, decided = leads[:, None, None], np.abs(leads[:, None, None]) > _CLEAR
     return np.where(decided, leads > 0, here).reshape(differ.shape)
-
-
-def _sum_squares(values: np.ndarray) -> np.ndarray:
-    """Sum ``values [v,h,w]`` over the square around each pixel."""
-    half = _SIDE // 2
-    for axis in (1, 2):
-        sums = np.cumsum(np.pad(values, [(half + 1, half) if i == axis else (0, 0) for i in range(3)]), axis)
-        values = sums.take(range(_SIDE, sums.shape[axis]), axis) - sums.take(range(values.shape[axis]), axis)
-    return values

@@ -365,12 +365,11 @@ def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: flo
     from gsmerge.alignment import choose_depths, fill_from_depths
 
     depths = depths[list(layout.views)]
-    better = choose_depths(scene, depths, unit)
-    moved = int((better.gaussians.means != scene.gaussians.means).any(1).sum())
+    scene, moved = choose_depths(scene, depths, unit)
     notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
     if scene.images is None or scene.missing is None or layout.kind != "box+depth":
-        return better, notes
-    full = fill_from_depths(better, depths, scene.images)
+        return scene, notes
+    full = fill_from_depths(scene, depths, scene.images)
     count = int(full.valid.sum()) - int(scene.valid.sum())
     filled = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
     return full, [*notes, *[filled] * (count > 0)]
