@@ -18,7 +18,7 @@ from gsmerge.types import Scene
 # Chosen on exports of seven captures whose Gaussians or maps are off by 5 to 20 %, or along the ray
 _SAME = 0.02  # logarithm of two depths of one surface
 _MOST = 100.0  # times its depth by which a Gaussian is moved
-_NEIGHBORS = 8  # nearest other views that are asked
+_NEIGHBORS, _STEP = 8, 4  # other views that are asked: of many views every so many of the nearest
 _COLOR = 5.0  # what a view's agreement loses for a unit of difference in colour, sRGB in [0, 1]
 _WON = 0.5  # of a view's agreement, by which one depth of a pixel must be ahead
 _DIFFERENT = 0.05  # least share of a view's pixels whose depths differ, for a choice for all of them
@@ -73,7 +73,7 @@ def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.nda
     def ask(view: int) -> np.ndarray:
         rows = view * pixels + np.flatnonzero(differ[view])
         order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
-        near = order[order != view][:_NEIGHBORS]
+        near = order[order != view][:: min(max(1, views // _NEIGHBORS), _STEP)][:_NEIGHBORS]
         sums = np.zeros((2, len(rows), COLUMNS))
         for points, out in zip(sources, sums, strict=True):
             for surface in sources:  # right points agree with whichever is right there

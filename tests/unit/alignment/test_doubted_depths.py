@@ -9,31 +9,33 @@ import pytest
 from scenes import intrinsics, look_at, make_scene, room
 
 from gsmerge.alignment import choose_depths
-from gsmerge.geometry import camera_centres
+from gsmerge.geometry import camera_centres, camera_depths
 from gsmerge.types import Cameras, Scene
 
 VIEWS, WIDTH, HEIGHT = 5, 96, 72
 EYES = np.array([[-0.7, 0.2, 0], [-0.3, -0.3, 0.7], [0, 0.3, -0.6], [0.4, -0.2, 0.4], [0.8, 0.1, -0.2]])
-POSES = np.stack([look_at(eye, np.array([0.0, 0.0, 3.0])) for eye in EYES])
-RIGHT = make_scene(room(), Cameras(POSES, intrinsics(VIEWS, WIDTH, HEIGHT), WIDTH, HEIGHT))
-CENTRES = camera_centres(RIGHT.cameras.viewmats)[:, None]
-LENGTHS = np.linalg.norm(RIGHT.gaussians.means.reshape(VIEWS, -1, 3) - CENTRES, axis=2)
-MAPS = np.stack(
-    [
-        points @ viewmat[2, :3] + viewmat[2, 3]
-        for points, viewmat in zip(RIGHT.gaussians.means.reshape(VIEWS, -1, 3), RIGHT.cameras.viewmats, strict=True)
-    ]
-)
+
+
+def scene_from(eyes: np.ndarray) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """A right scene, its depth maps ``[v,hw]`` along z and the distances."""
+    poses = np.stack([look_at(eye, np.array([0.0, 0.0, 3.0])) for eye in eyes])
+    scene = make_scene(room(), Cameras(poses, intrinsics(len(eyes), WIDTH, HEIGHT), WIDTH, HEIGHT))
+    means = scene.gaussians.means.reshape(len(eyes), -1, 3)
+    distances = np.linalg.norm(means - camera_centres(poses)[:, None], axis=2)
+    return scene, camera_depths(means, poses[:, None]), distances
+
+
+RIGHT, MAPS, LENGTHS = scene_from(EYES)
 ALONG = MAPS / LENGTHS  # what a depth along z becomes, taken as the distance
 BY_VIEW = np.array([1.1, 0.9, 1.05, 0.95, 1.1])[:, None] * np.ones_like(MAPS)
 
 
-def moved_by(factors: np.ndarray) -> Scene:
+def moved_by(factors: np.ndarray, scene: Scene = RIGHT) -> Scene:
     """The right scene with each Gaussian so many times as far from its camera."""
-    g = RIGHT.gaussians
-    means = CENTRES + (g.means.reshape(VIEWS, -1, 3) - CENTRES) * factors[..., None]
+    g, centres = scene.gaussians, camera_centres(scene.cameras.viewmats)[:, None]
+    means = centres + (g.means.reshape(len(scene), -1, 3) - centres) * factors[..., None]
     scales = (g.scales * factors.reshape(-1, 1)).astype(np.float32)
-    return replace(RIGHT, gaussians=replace(g, means=means.reshape(-1, 3), scales=scales))
+    return replace(scene, gaussians=replace(g, means=means.reshape(-1, 3), scales=scales))
 
 
 def maps_of(factors: np.ndarray | float = 1.0) -> np.ndarray:
@@ -71,6 +73,15 @@ def test_one_view_is_wrong() -> None:
     chosen, count = choose_depths(moved_by(factors), maps_of(), 1.0)
     assert count == WIDTH * HEIGHT
     assert np.allclose(chosen.gaussians.means, RIGHT.gaussians.means, atol=1e-4)
+
+
+def test_many_views_with_little_parallax() -> None:
+    """The nearest views of a film hardly contradict any depth: those farther away are asked, too."""
+    t = np.linspace(-1, 1, 60)
+    scene, maps, distances = scene_from(np.stack([0.9 * t, 0.2 * np.sin(3 * t), 0.4 * np.cos(4 * t)], 1))
+    wrong = moved_by(maps / distances, scene)
+    _, count = choose_depths(wrong, maps.reshape(60, HEIGHT, WIDTH), 1.0)
+    assert count == len(wrong.gaussians)
 
 
 def test_each_is_wrong_in_half_of_the_pixels() -> None:
