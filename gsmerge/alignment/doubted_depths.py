@@ -38,16 +38,18 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     depths = camera_depths(means, viewmats[:, None])
     usable = scene.valid.reshape(views, -1) & (depths > 0) & (maps > 0) & np.isfinite(maps)
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
-    best, lead = (usable & False, means, ratios), 0.0
+    best = usable & False, means, ratios
     for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
         factors = np.where(usable, np.clip(scale * ratios, 1 / _MOST, _MOST), 1)
         differ = np.abs(factors - 1) > _SAME
+        if not differ.any():
+            return scene, 0
         placed = np.stack([c + (m - c) * f[:, None] for c, m, f in zip(centres, means, factors, strict=True)])
         votes = _count_votes(scene, placed, differ)
         lead = float(votes.sum() / max(1, np.abs(votes).sum()))
         if scale == unit or lead > _CLEAR:
             best = _follow_votes(votes, differ) & usable, placed, factors
-        if lead > _CLEAR or not differ.any():
+        if lead > _CLEAR:
             break
     rows, placed, factors = (array.reshape(len(g), -1) for array in best)
     if not rows.any():
