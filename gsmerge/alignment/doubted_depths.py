@@ -1,7 +1,4 @@
-"""Choose between the depths of Gaussians and those of depth maps beside them, by what other views show.
-
-Depth Anything 3 writes both; its Gaussians take depth along z as distance along the ray, and add an offset.
-"""
+"""Choose between depths of Gaussians and of depth maps beside them, as Depth Anything 3 writes both, by other views."""
 
 from __future__ import annotations
 
