@@ -10,7 +10,7 @@ from gsmerge.geometry import rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians, Scene, grid_ids
 
-_MAX_SPREAD = 0.03  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
+_MAX_SPREAD = 0.15  # of the Gaussians' depth over a depth map's: above it the map is not that of the Gaussians
 
 
 def fill_from_depths(scene: Scene, depths: np.ndarray, images: np.ndarray) -> Scene:
