@@ -30,6 +30,7 @@ from gsmerge.alignment.search import AlignmentResult, align
 
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions
+    from gsmerge.alignment.doubted_depths import choose_depths
     from gsmerge.alignment.dropped_depths import fill_from_depths
     from gsmerge.alignment.estimate import estimate_cameras, estimate_from_rows
     from gsmerge.alignment.explain import explain_misalignment, misalignment_error
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 _LATER = {
     "cameras": ("move_cameras", "other_conventions"),
+    "doubted_depths": ("choose_depths",),
     "dropped_depths": ("fill_from_depths",),
     "estimate": ("estimate_cameras", "estimate_from_rows"),
     "explain": ("explain_misalignment", "misalignment_error"),

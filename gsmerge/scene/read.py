@@ -309,7 +309,7 @@ def _make_load(
         more += [] if camera_file is None else [_unaligned_note(hints)]
     else:
         assert camera_file is not None, "pixels are those of cameras"
-        scene, note = _put_back(scene, camera_file, layout, views)
+        scene, note = _use_depths(scene, camera_file, layout, frame.scale)
         scene, turned = _with_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
         if result.given is not None:
@@ -354,18 +354,25 @@ def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFil
     return replace(gaussians, sh0=rgb_to_sh0(images.reshape(-1, 1, 3)))
 
 
-def _put_back(scene: Scene, camera_file: CameraFile, layout: Layout, views: Sequence[int]) -> tuple[Scene, list[str]]:
-    """Restore pixels that the exporter dropped where depth maps beside the file have them; with a note."""
-    if scene.images is None or scene.missing is None or layout.kind != "box+depth":
-        return scene, []
-    depths = read_depths(Path(camera_file.path))
-    if depths is None:
-        return scene, []
-    from gsmerge.alignment import fill_from_depths
+def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: float) -> tuple[Scene, list[str]]:
+    """Start from depth maps beside the file where they are better, or where the exporter dropped pixels; with notes.
 
-    full = fill_from_depths(scene, depths[views], scene.images)
+    ``unit``: that of the cameras' file in the scene's.
+    """
+    depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
+    if depths is None or depths[list(layout.views)].shape != scene.valid.shape:
+        return scene, []
+    from gsmerge.alignment import choose_depths, fill_from_depths
+
+    depths = depths[list(layout.views)]
+    scene, moved = choose_depths(scene, depths, unit)
+    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
+    if scene.images is None or scene.missing is None or layout.kind != "box+depth":
+        return scene, notes
+    full = fill_from_depths(scene, depths, scene.images)
     count = int(full.valid.sum()) - int(scene.valid.sum())
-    return full, [f"{count:,} pixels that the exporter dropped are put back from the depth maps"] * (count > 0)
+    filled = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
+    return full, [*notes, *[filled] * (count > 0)]
 
 
 def _place_rows(

@@ -23,11 +23,13 @@ from exports import (
 from messages import refuses
 from PIL import Image
 from plyfile import PlyData
+from scenes import arc, make_scene, room
 from sharp_files import write_elements
 from sweeps import sweep
 from tiny_scene import rotation, save_json, write_colmap_text, write_images, write_inria, write_npz
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import camera_depths
 from gsmerge.io import read_ply
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.types import SH_C0
@@ -98,6 +100,25 @@ def test_depth_is_the_distance_along_the_ray(tmp_path: Path) -> None:
     rows = da3_rows(tiny)  # and is never taken for the file's own
     assert np.array_equal(np.flatnonzero(scene.stored.reshape(-1)), rows)
     assert np.array_equal(scene.file_gaussians.means, tiny.gaussians.means[rows])
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_depth_is_wrongly_the_distance_along_the_ray(tmp_path: Path, images: bool) -> None:
+    """Where views show one surface, the depth maps are right; what was dropped is put back at them."""
+    scene = make_scene(room(), arc(3, 96, 72))
+    depths = camera_depths(scene.gaussians.means.reshape(3, -1, 3), scene.cameras.viewmats[:, None])
+    photos = (scene.images * 255).round().astype(np.uint8)
+    names = tuple(f"{i}.png" for i in range(3))
+    right = Smooth(np.linalg.inv(scene.cameras.viewmats), scene.cameras.Ks[0], 96, 72, photos, scene.gaussians, names,
+                   depths.reshape(3, 72, 96))  # fmt: skip
+    kept = da3_rows(right)
+    save_export(tmp_path / "gs_ply", right, export_rows(along_the_rays(right), kept), cameras=False, name="0000.ply")
+    arrays = {"image": photos} if images else {}
+    write_npz(tmp_path / "exports/npz/results.npz", right, depth=right.depths.astype(np.float32), **arrays)
+    loaded = load_scene(tmp_path / "gs_ply/0000.ply")
+    assert f"{len(kept):,} Gaussians start at the depth maps, which other views confirm more often" in loaded.notes
+    rows = slice(None) if images else kept
+    assert np.abs(loaded.scene.gaussians.means - scene.gaussians.means)[rows].max() < 1e-3
 
 
 def test_rotations_are_never_changed(tmp_path: Path) -> None:
