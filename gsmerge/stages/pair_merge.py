@@ -22,7 +22,7 @@ from gsmerge.types import Gaussians, to_float32
 LEFT = 0.25  # share of the Gaussians that a round leaves, at least
 LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze
 # Chosen on training scenes by the PSNR of views from cameras at random (docs/internals/notebook.md#bare-files)
-COLOR_WEIGHT = 1.0  # of squared distances of harmonics of degree 0 against nats
+COLOR_WEIGHT = 0.6  # of squared distances of harmonics of degree 0 against nats
 MASS_POWER = 0.7  # of the cost
 FLATNESS = 0.01  # least scale over the largest, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
