@@ -1,7 +1,8 @@
 """Gaussians -> fewer Gaussians by their positions and colours alone: for scenes without known views.
 
 Cells of a k-d tree are merged pair by pair, the cheapest pairs of all cells first, in rounds whose cells differ. Masses
-add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was.
+add up, opacity times the area of the ellipse of the two largest scales, so a surface stays as opaque as it was; scales
+grow where opacity cannot.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from gsmerge.types import Gaussians, to_float32
 LEFT = 0.25  # share of the Gaussians that a round leaves, at least
 LEAST_LEFT = 0.2  # the same in each cell: longer chains of merges end in haze
 # Chosen on training scenes by the PSNR of views from cameras at random (docs/internals/notebook.md#bare-files)
-COLOR_WEIGHT = 3.0  # of squared distances of harmonics of degree 0 against nats
+COLOR_WEIGHT = 0.6  # of squared distances of harmonics of degree 0 against nats
 MASS_POWER = 0.7  # of the cost
 FLATNESS = 0.01  # least scale over the largest, so that the logarithm of the volume stays finite
 MIN_OPACITY = 1e-4  # of what is merged, so that masses stay positive
-WIDER = 0.05  # by how much scales grow for each doubling of what was merged: fewer Gaussians leave more gaps
+WIDER = 0.05  # by how much scales grow at most for each doubling of what was merged: fewer Gaussians leave more gaps
 CELLS_PER_TASK = 256
 
 
@@ -124,10 +125,15 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
-    """Convert moments to Gaussians, by ``wider`` larger for each doubling; those that were not merged stay the same."""
+    """Convert moments to Gaussians; those that were not merged stay the same.
+
+    Masses that would need an opacity above one make scales larger instead, at most by ``wider`` for each doubling.
+    """
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
-    opacities = np.minimum(cloud.masses / (scales[:, 1] * scales[:, 2]), MAX_OPACITY)
-    scales *= 1 + wider * log(cloud.sizes.astype(np.float64))[:, None] / float(log(2.0))
+    opacities = cloud.masses / (scales[:, 1] * scales[:, 2])
+    most = 1 + wider * log(cloud.sizes.astype(np.float64)) / float(log(2.0))
+    scales *= np.sqrt(opacities).clip(1, most)[:, None]
+    opacities = np.minimum(opacities, MAX_OPACITY)
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     out = Gaussians(
         to_float32(cloud.means), to_float32(quats), to_float32(scales), to_float32(opacities), sh[:, :1], sh[:, 1:]

@@ -11,6 +11,7 @@ import unaligned_scenes
 from made_gaussians import random_gaussians
 
 from gsmerge import Gaussians, Scene, render
+from gsmerge.pooling import MAX_OPACITY
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.pair_merge import merge_neighbors
@@ -61,6 +62,15 @@ def test_copies_become_one_first() -> None:
     merged = merge_neighbors(replace(twice, opacities=np.full(600, 0.3, np.float32)), 300)
     found = np.isclose(merged.means[:, None], gaussians.means, atol=1e-5).all(2).any(0)
     assert found.mean() > 0.9  # the others lie on the border of two cells
+
+
+@pytest.mark.parametrize(("opacity", "wider"), [(0.3, 1.0), (0.54, 1.08**0.5), (0.9, 1.05)])
+def test_scales_grow_where_opacity_cannot(opacity: float, wider: float) -> None:
+    """Two copies have twice the mass: up to 5 % larger scales take what an opacity of one leaves over."""
+    one = replace(random_gaussians(1, 2), opacities=np.full(1, opacity, np.float32))
+    merged = merge_neighbors(Gaussians.concat([one, one]), 1)
+    np.testing.assert_allclose(np.sort(merged.scales), np.sort(one.scales) * wider, rtol=1e-4)
+    np.testing.assert_allclose(merged.opacities, min(2 * opacity, MAX_OPACITY), rtol=1e-4)
 
 
 def test_a_fifth_looks_nearly_as_all(room: Scene) -> None:
