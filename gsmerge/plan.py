@@ -16,7 +16,7 @@ from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.facts.views import report_views, scored_views
+from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
@@ -62,10 +62,11 @@ class Effort:
     refines: bool = True  # Whether `checkpoint="auto"` runs more of the networks than the heads
     prunes: bool = True  # Whether Gaussians in no photo are left out where nothing is fitted
     large_photos: bool = True  # Whether `photo_scale="auto"` may look at larger photos
+    report_views: int = REPORT_VIEWS  # Views that input and result are scored on for the report alone
 
 
 EFFORTS = {
-    "draft": Effort(30, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False),
+    "draft": Effort(36, 1.0, 0, merges=False, refines=False, prunes=False, large_photos=False, report_views=2),
     "fast": Effort(55, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(320, 2.0, 0),
     "best": Effort(1000, 3.0, 1),
@@ -181,7 +182,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         levels=options.budget.levels,
         output=options.budget.output,
         size=file_size(options.budget),
-        scored_views=_choose_scored_views(prepared, decisive=keeps or target is not None),
+        scored_views=_choose_scored_views(prepared, None if keeps or target is not None else EFFORTS[options.effort]),
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
@@ -451,11 +452,12 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
     return replace(fit, photo_scale=scale, move_cameras=moves)
 
 
-def _choose_scored_views(prepared: Prepared, *, decisive: bool) -> tuple[int, ...]:
-    """Choose views for scoring whose pictures show the scene; more if they are ``decisive`` for the count."""
+def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
+    """Choose views for scoring whose pictures show the scene: those of an effort's report; None: decisive ones."""
     reference = prepared.reference
     if reference.placed or not prepared.repeated:  # views that the scene lacks
         return reference.score_views
     candidates = [view for view, place in enumerate(prepared.repeated) if place in reference.score_views]
-    choose_some = scored_views if decisive else report_views
-    return tuple(candidates[i] for i in choose_some(len(candidates)))
+    count = len(candidates)
+    chosen = scored_views(count) if effort is None else pick_views(count, effort.report_views)
+    return tuple(candidates[i] for i in chosen)

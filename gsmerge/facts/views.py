@@ -32,11 +32,6 @@ def scored_views(num_views: int) -> list[int]:
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
 
-def report_views(num_views: int) -> list[int]:
-    """Return view ids for PSNR values that are only shown in the report."""
-    return pick_views(num_views, REPORT_VIEWS)
-
-
 def pick_views(num_views: int, most: int) -> list[int]:
     """Return at most ``most`` evenly spread view ids, where possible without the first and the last view."""
     count = min(num_views, most)

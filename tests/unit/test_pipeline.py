@@ -12,6 +12,7 @@ from sweeps import sweep
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.facts.views import pick_views
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
@@ -69,22 +70,21 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     assert report.worse is not None
 
 
-def test_many_views_are_scored_by_some(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_views_are_scored_by_some(scene: Scene) -> None:
     """Of both the same ones, and it is said."""
-    monkeypatch.setattr("gsmerge.facts.views.REPORT_VIEWS", 1)
-    result = scenes.compacted(scene, fit="none")
-    some = scenes.take_views(scene, [1])
+    result = scenes.compacted(scene, fit="none", effort="draft")
+    some = scenes.take_views(scene, pick_views(len(scene), 2))
     assert result.report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, some), abs=0.1)
     assert result.report.psnr_after == pytest.approx(scenes.psnr_of(result.gaussians, some), abs=0.1)
-    assert result.report.choices["scored_views"] == 1
-    better = scenes.compacted(scene, fit="none", quality="20dB")
+    assert result.report.choices["scored_views"] == 2 < len(scene)
+    better = scenes.compacted(scene, fit="none", effort="draft", quality="20dB")
     assert better.report.choices["scored_views"] == len(scene)
 
 
 def test_more_gaussians_are_fitted_in_more_steps(scene: Scene) -> None:
     few, many = (scenes.compacted(scene, effort="draft", superpixels=share).report for share in ("4%", "9.9%"))
-    assert (few.options["fit_steps"], few.choices["fit"]["steps"]) == (30, 30)
-    assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (45, 45)
+    assert (few.options["fit_steps"], few.choices["fit"]["steps"]) == (36, 36)
+    assert (many.options["fit_steps"], many.choices["fit"]["steps"]) == (54, 54)
 
 
 def test_progress_tells_every_step_of_the_full_fit(scene: Scene) -> None:
