@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
+from gsmerge.facts.holes import fill_between
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
@@ -25,7 +27,10 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     decoded = start(prepared, plan, count)
     if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
         return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
-    return fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
+    fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
+    if not plan.fit.grows or fitted.report is None or not fitted.report.accepted:
+        return fitted
+    return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras))
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

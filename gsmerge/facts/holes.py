@@ -1,25 +1,31 @@
-"""Scene -> the same with Gaussians where its views show something and its own Gaussians nothing.
+"""Gaussians where cameras show none: in the views themselves, and in what lies between and beside them.
 
 Exporters drop borders, far regions and faint rows, and voxels leave gaps. Each view is drawn from its own camera; a
 pixel that stays empty gets a Gaussian of its picture's colour. Its depth is that of the surface beside it or one beyond
 the view's farthest surface: the depth at which the pictures of the nearest other views agree best.
+
+New views uncover what no photo shows. So the result of a fit is drawn from cameras between the views and just beside
+them, and what is empty there continues the farther side of the surfaces around, where no view contradicts.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from gsmerge.facts.mend_photos import fill_gaps
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry import motion_matrices, motion_vectors, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import TiledView
-from gsmerge.raster.composite import blend
+from gsmerge.raster import TiledView, prepare, tile_view
+from gsmerge.raster.composite import blend, mean_depths, view_colors
 from gsmerge.raster.images import tile_views
+from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import note
-from gsmerge.types import Gaussians, PicturedScene, grid_ids
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
@@ -31,6 +37,22 @@ OTHERS = 3  # nearest views that a picture is compared with
 BLUR = 3.0  # standard deviation of the window over which differences are averaged, pixels
 LEAST = 1e-3  # weight in that window of the pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
+
+# What lies between views, chosen on seven training captures
+FAINT = 0.02  # opacity of Gaussians that make room: a fit leaves every tenth like that
+SHARE = 0.03  # of the Gaussians, at most, that fill what no view shows
+LEVEL = 8  # times a view's pixel is theirs: what no photo shows is blurred anyway
+PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
+BESIDE = -0.1  # of the way to the nearest view: a camera just outside
+WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
+MARGIN = 0.05  # of the sides, by which these cameras see more on each side
+CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is to be filled, below which it shows a surface
+WINDOW, NEARER = 0.08, 0.85  # of the width around a pixel: what is nearer than this share of the farthest depth there
+SOFT = 2.0  # standard deviation, pixels, by which colours and inverse depths are blurred into what is empty
+MOST_VIEWS = 64  # of a scene that is filled: time grows with their square
+DEEPER = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # times the depth: the first one that no view contradicts is taken
+REACH = 2  # pixels: standing so far beside a picture, a Gaussian still reaches into it
+FRONT = 0.98  # of the depth of a surface, in front of which a camera would see a Gaussian
 
 
 def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
@@ -79,14 +101,21 @@ def _fill_view(
     beyond = float(np.quantile(depths[covered], FARTHEST)) * FACTORS[:, None]
     tried = np.concatenate([beside[None], np.maximum(beyond, beside)])
     depth = _agreeing(scene, view, holes, rays, tried)
-    size = SIZE * depth / cameras.Ks[view, 0, 0]
+    eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
+    return _make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
+
+
+def _make_gaussians(
+    eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
+) -> Gaussians:
+    """Make round Gaussians at ``depths [n]`` along ``rays [n,3]``, ``size`` large at depth 1, of ``colors [n,3]``."""
     return Gaussians(
-        means=(cameras.centres[view] + depth[:, None] * rays).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(x), 1)),
-        scales=np.repeat(size[:, None], 3, 1).astype(np.float32),
-        opacities=np.full(len(x), OPACITY, np.float32),
-        sh0=rgb_to_sh0(scene.images[view][holes])[:, None].astype(np.float32),
-        shN=np.zeros((len(x), *shN.shape[1:]), np.float32),
+        means=(eye + depths[:, None] * rays).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(rays), 1)),
+        scales=np.repeat((size * depths)[:, None], 3, 1).astype(np.float32),
+        opacities=np.full(len(rays), OPACITY, np.float32),
+        sh0=rgb_to_sh0(colors)[:, None].astype(np.float32),
+        shN=np.zeros((len(rays), num_higher, 3), np.float32),
     )
 
 
@@ -123,3 +152,120 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
         better = cost < least
         chosen[better], least[better] = depth[better], cost[better]
     return chosen
+
+
+def fill_between(fitted: Gaussians, cameras: Cameras) -> Gaussians:
+    """Put Gaussians where cameras between and just beside those of the photos see nothing; faint ones make room.
+
+    At most ``SHARE`` of the Gaussians are replaced, for what half-way cameras see first. The new ones continue the
+    farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against them.
+    Scenes of more than ``MOST_VIEWS`` views stay as they are: photos show nearly all that lies between them.
+    """
+    if not 1 < len(cameras) <= MOST_VIEWS:
+        return fitted
+    cameras = _small_cameras(cameras)
+    between, order = _between_cameras(cameras), np.argsort(fitted.opacities, kind="stable")
+    most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
+    seen = _see(fitted, cameras), _see(fitted, between).where_covered()
+    added = fitted[:0]
+    for view in range(len(between)):
+        if len(added) >= most:
+            break
+        more = _continue_surfaces(Gaussians.concat([fitted, added]), between[[view]], seen)
+        added = Gaussians.concat([added, more[: most - len(added)]])
+    return Gaussians.concat([fitted[np.sort(order[len(added) :])], added])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What c cameras of one size see of a scene."""
+
+    cameras: Cameras
+    depths: np.ndarray  # [c,h,w] mean camera z
+    clear: np.ndarray  # [c,h,w] bool, where little is
+
+    def where_covered(self) -> Seen:
+        """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
+        return Seen(self.cameras, np.where(self.clear, np.float32(0), self.depths), np.zeros_like(self.clear))
+
+    def contradict(self, points: np.ndarray) -> np.ndarray:
+        """Return a mask ``[n]`` of the points ``[n,3]`` that stand before a surface, or where a camera sees nothing."""
+        (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
+        inside = (z > 0) & ((pixels >= -REACH) & (pixels < size + REACH)).all(2)
+        camera, point = np.nonzero(inside)
+        column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
+        wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.depths[camera, row, column])
+        return np.bincount(point[wrong], minlength=len(points)) > 0
+
+
+def _small_cameras(cameras: Cameras) -> Cameras:
+    """Return the cameras with pixels ``LEVEL`` times as large."""
+    width, height = (max(LEVEL, round(side / LEVEL)) for side in (cameras.width, cameras.height))
+    scales = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
+    return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
+
+
+def _between_cameras(cameras: Cameras) -> Cameras:
+    """Place cameras half way from each view to the nearest others, then one just beside each; they see a little more.
+
+    A camera moves along the screw from one pose to the other, so it keeps looking at what both look at.
+    """
+    right, down = (round(MARGIN * side) for side in (cameras.width, cameras.height))
+    viewmats, centres = cameras.viewmats.astype(np.float64), cameras.centres
+    nearest = [np.argsort(((centres - centre) ** 2).sum(1), kind="stable")[1 : 1 + PAIRS] for centre in centres]
+    middle = {(min(v, o), max(v, o)): MIDDLE for v, others in enumerate(nearest) for o in others}
+    beside = {(v, others[0]): BESIDE for v, others in enumerate(nearest)}
+    pairs, parts = np.array([*middle, *beside]).T, np.array([*middle.values(), *beside.values()])
+    motions = motion_vectors(viewmats[pairs[0]], viewmats[pairs[1]])
+    near = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
+    first, moves = pairs[0][near], motion_matrices((parts[:, None] * motions)[near])
+    Ks = cameras.Ks[first] + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
+    return Cameras(matmul(viewmats[first], moves), Ks, cameras.width + 2 * right, cameras.height + 2 * down)
+
+
+def _draw(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw what a camera sees: colours ``[h,w,3]``, depths ``[h,w]`` of what is there, and transmittance ``[h,w]``."""
+    tiled = tile_view(prepare(gaussians), camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=NEAR)
+    image, left = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))
+    opacity = np.maximum(1 - left, np.float32(1e-6))
+    return image / opacity[..., None], mean_depths(tiled, opacity), left
+
+
+def _see(gaussians: Gaussians, cameras: Cameras) -> Seen:
+    """Draw what cameras see; depths are the farthest around, as far as new Gaussians reach."""
+
+    def see(view: int) -> tuple[np.ndarray, np.ndarray]:
+        _, depths, left = _draw(gaussians, cameras[[view]])
+        return cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8)), left > CLEAR
+
+    shape = len(cameras), cameras.height, cameras.width
+    depths, clear = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    for view, pictures in enumerate(parallel_map(see, range(len(cameras)))):
+        depths[view], clear[view] = pictures
+    return Seen(cameras, depths, clear)
+
+
+def _continue_surfaces(gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, ...]) -> Gaussians:
+    """Make Gaussians for the clear pixels of a camera that continue the farther side of the surfaces beside.
+
+    Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
+    """
+    image, depths, left = _draw(gaussians, camera)
+    solid, clear = left < SOLID, left > CLEAR
+    around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
+    known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
+    clear &= cv2.dilate(known.astype(np.uint8), around) > 0
+    if not clear.any():
+        return gaussians[:0]
+    values = np.dstack([1 / np.maximum(depths, np.float32(1e-6)), image, np.ones_like(depths)])
+    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
+    y, x = np.nonzero(clear)
+    pixels, viewmat, K = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), camera.viewmats[0], camera.Ks[0]
+    eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
+    tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
+    points = (eye + tried[..., None] * rays).reshape(-1, 3)
+    hidden = ~np.logical_or(*(some.contradict(points) for some in seen)).reshape(tried.shape)
+    rows = np.flatnonzero(hidden.any(0))
+    chosen = tried[hidden.argmax(0)[rows], rows]
+    colors = sums[rows, 1:4] / sums[rows, 4:]
+    return _make_gaussians(eye, rays[rows], chosen, SIZE / K[0, 0], colors, gaussians.shN.shape[1])
