@@ -28,7 +28,8 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
         return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
-    if not plan.fit.grows or fitted.report is None or not fitted.report.accepted:
+    long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
+    if not long or not prepared.reference.of_views:  # what placed views see is all there is
         return fitted
     return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras))
 
