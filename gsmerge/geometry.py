@@ -207,6 +207,12 @@ def _lengths(vectors: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt(sum(columns, vectors.dtype.type(0))))[..., None]
 
 
+def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
+    """Order the other views by the distance of their cameras' ``centres [v,3]`` from that of ``view``."""
+    order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
+    return order[order != view]
+
+
 def median(values: np.ndarray) -> float:
     """Return the median of ``values [n]``, n >= 1, without the checks of ``np.median``; no value may be NaN."""
     middle = len(values) // 2

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry import camera_centres, camera_depths, sh0_to_rgb
+from gsmerge.geometry import camera_centres, camera_depths, nearest_views, sh0_to_rgb
 from gsmerge.kernels.gaussians.cross_view import COLUMNS, sum_cross_view
 from gsmerge.kernels.pictures import blur
 from gsmerge.runtime.threads import parallel_map
@@ -35,7 +35,7 @@ def choose_depths(scene: Scene, maps: np.ndarray, unit: float) -> tuple[Scene, i
     depths = camera_depths(means, viewmats[:, None])
     usable = scene.valid.reshape(views, -1) & (depths > 0) & (maps > 0) & np.isfinite(maps)
     ratios = np.where(usable, maps, 1) / np.where(usable, depths, 1)
-    best = usable & False, means, ratios
+    best = np.zeros_like(usable), means, ratios
     for scale in (unit, 1 / float(np.median(ratios[usable]))) if views > 1 and usable.any() else ():
         factors = np.where(usable, np.clip(scale * ratios, 1 / _MOST, _MOST), 1)
         differ = np.abs(factors - 1) > _SAME
@@ -71,8 +71,7 @@ def _count_votes(scene: Scene, placed: np.ndarray, differ: np.ndarray) -> np.nda
 
     def ask(view: int) -> np.ndarray:
         rows = view * pixels + np.flatnonzero(differ[view])
-        order = np.argsort(((centres - centres[view]) ** 2).sum(1), kind="stable")
-        near = order[order != view][:: min(max(1, views // _NEIGHBORS), _STEP)][:_NEIGHBORS]
+        near = nearest_views(centres, view)[:: min(max(1, views // _NEIGHBORS), _STEP)][:_NEIGHBORS]
         sums = np.zeros((2, len(rows), COLUMNS))
         for points, out in zip(sources, sums, strict=True):
             for surface in sources:  # right points agree with whichever is right there

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.mend_photos import fill_gaps
-from gsmerge.geometry import motion_matrices, motion_vectors, project, rgb_to_sh0
+from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import TiledView, prepare, tile_view
-from gsmerge.raster.composite import blend, mean_depths, view_colors
+from gsmerge.raster import Splats, TiledView, prepare, tile_view
+from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.images import tile_views
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import note
@@ -68,12 +68,11 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     holes, parts = np.zeros_like(free), dict[int, Gaussians]()
 
     def fill(view: int, tiled: TiledView) -> None:
-        depths = np.repeat(tiled.depths[:, None], 3, 1)
-        blended, left = blend(tiled, depths, np.zeros(3, np.float32))
+        depths, left = _blend_depths(tiled)
         covered = left <= 1 - EMPTY
         holes[view] = free[view] & ~covered
         if covered.any() and holes[view].any():
-            parts[view] = _fill_view(scene, view, holes[view], covered, blended[..., 0] / np.maximum(1 - left, 1e-6))
+            parts[view] = _fill_view(scene, view, holes[view], covered, depths)
 
     tile_views(scene, fill)
     if not parts or not (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
@@ -87,6 +86,12 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     for name, values in vars(added).items():
         columns[name][holes.reshape(-1)] = values
     return replace(scene, gaussians=Gaussians(**columns), pixel_ids=grid_ids(scene.valid | holes))
+
+
+def _blend_depths(tiled: TiledView) -> tuple[np.ndarray, np.ndarray]:
+    """Blend the mean depth ``[h,w]`` of what a view sees, camera z, and the transmittance ``[h,w]``."""
+    blended, left = blend(tiled, np.repeat(tiled.depths[:, None], 3, 1), np.zeros(3, np.float32))
+    return blended[..., 0] / np.maximum(1 - left, 1e-6), left
 
 
 def _fill_view(
@@ -125,8 +130,7 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
     The differences of colours are averaged over the ``holes [h,w]`` around. In doubt it is the first depth.
     """
     cameras, centres = scene.cameras, scene.cameras.centres
-    away = ((centres - centres[view]) ** 2).sum(1)
-    others = [other for other in np.argsort(away, kind="stable") if away[other] > 0][:OTHERS]
+    others = [other for other in nearest_views(centres, view) if (centres[other] != centres[view]).any()][:OTHERS]
     moves = []
     for other in others:
         K, (turn, shift) = cameras.Ks[other], np.split(cameras.viewmats[other, :3], [3], 1)
@@ -167,13 +171,14 @@ def fill_between(fitted: Gaussians, cameras: Cameras) -> Gaussians:
     between, order = _between_cameras(cameras), np.argsort(fitted.opacities, kind="stable")
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
     seen = _see(fitted, cameras), _see(fitted, between).where_covered()
-    added = fitted[:0]
+    filled, full = fitted, len(fitted) + most
     for view in range(len(between)):
-        if len(added) >= most:
+        if len(filled) >= full:
             break
-        more = _continue_surfaces(Gaussians.concat([fitted, added]), between[[view]], seen)
-        added = Gaussians.concat([added, more[: most - len(added)]])
-    return Gaussians.concat([fitted[np.sort(order[len(added) :])], added])
+        more = _continue_surfaces(filled, between[[view]], seen)
+        filled = Gaussians.concat([filled, more[: full - len(filled)]])
+    faintest = order[: len(filled) - len(fitted)]
+    return filled[np.delete(np.arange(len(filled)), faintest)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +216,8 @@ def _between_cameras(cameras: Cameras) -> Cameras:
     A camera moves along the screw from one pose to the other, so it keeps looking at what both look at.
     """
     right, down = (round(MARGIN * side) for side in (cameras.width, cameras.height))
-    viewmats, centres = cameras.viewmats.astype(np.float64), cameras.centres
-    nearest = [np.argsort(((centres - centre) ** 2).sum(1), kind="stable")[1 : 1 + PAIRS] for centre in centres]
+    viewmats = cameras.viewmats.astype(np.float64)
+    nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
     middle = {(min(v, o), max(v, o)): MIDDLE for v, others in enumerate(nearest) for o in others}
     beside = {(v, others[0]): BESIDE for v, others in enumerate(nearest)}
     pairs, parts = np.array([*middle, *beside]).T, np.array([*middle.values(), *beside.values()])
@@ -223,19 +228,17 @@ def _between_cameras(cameras: Cameras) -> Cameras:
     return Cameras(matmul(viewmats[first], moves), Ks, cameras.width + 2 * right, cameras.height + 2 * down)
 
 
-def _draw(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw what a camera sees: colours ``[h,w,3]``, depths ``[h,w]`` of what is there, and transmittance ``[h,w]``."""
-    tiled = tile_view(prepare(gaussians), camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=NEAR)
-    image, left = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))
-    opacity = np.maximum(1 - left, np.float32(1e-6))
-    return image / opacity[..., None], mean_depths(tiled, opacity), left
+def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
+    """Tile Gaussians in one of the cameras."""
+    return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR)
 
 
 def _see(gaussians: Gaussians, cameras: Cameras) -> Seen:
     """Draw what cameras see; depths are the farthest around, as far as new Gaussians reach."""
+    splats = prepare(gaussians)
 
     def see(view: int) -> tuple[np.ndarray, np.ndarray]:
-        _, depths, left = _draw(gaussians, cameras[[view]])
+        depths, left = _blend_depths(_tile(splats, cameras, view))
         return cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8)), left > CLEAR
 
     shape = len(cameras), cameras.height, cameras.width
@@ -250,14 +253,16 @@ def _continue_surfaces(gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, 
 
     Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
     """
-    image, depths, left = _draw(gaussians, camera)
+    tiled = _tile(prepare(gaussians), camera, 0)
+    depths, left = _blend_depths(tiled)
     solid, clear = left < SOLID, left > CLEAR
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
     clear &= cv2.dilate(known.astype(np.uint8), around) > 0
     if not clear.any():
         return gaussians[:0]
-    values = np.dstack([1 / np.maximum(depths, np.float32(1e-6)), image, np.ones_like(depths)])
+    image = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0] / np.maximum(1 - left, 1e-6)[..., None]
+    values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
     y, x = np.nonzero(clear)
     pixels, viewmat, K = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), camera.viewmats[0], camera.Ks[0]

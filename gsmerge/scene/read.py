@@ -360,11 +360,11 @@ def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: flo
     ``unit``: that of the cameras' file in the scene's.
     """
     depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
-    if depths is None or depths[list(layout.views)].shape != scene.valid.shape:
+    depths = None if depths is None else depths[list(layout.views)]
+    if depths is None or depths.shape != scene.valid.shape:
         return scene, []
     from gsmerge.alignment import choose_depths, fill_from_depths
 
-    depths = depths[list(layout.views)]
     scene, moved = choose_depths(scene, depths, unit)
     notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
     if scene.images is None or scene.missing is None or layout.kind != "box+depth":
