@@ -360,9 +360,9 @@ def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: flo
     ``unit``: that of the cameras' file in the scene's.
     """
     depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
-    depths = None if depths is None else depths[list(layout.views)]
-    if depths is None or depths.shape != scene.valid.shape:
+    if depths is None or depths.shape[1:] != scene.valid.shape[1:] or len(depths) <= max(layout.views):
         return scene, []
+    depths = depths[list(layout.views)]
     from gsmerge.alignment import choose_depths, fill_from_depths
 
     scene, moved = choose_depths(scene, depths, unit)

@@ -121,6 +121,14 @@ def test_depth_is_wrongly_the_distance_along_the_ray(tmp_path: Path, images: boo
     assert np.abs(loaded.scene.gaussians.means - scene.gaussians.means)[rows].max() < 1e-3
 
 
+def test_depth_maps_of_fewer_views_are_left_alone(tmp_path: Path) -> None:
+    tiny = smooth_scene(96, 72)
+    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, da3_rows(tiny)), cameras=False, name="0000.ply")
+    write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths[:1].astype(np.float32))
+    scene = load_scene(tmp_path / "gs_ply/0000.ply").pixel_scene()
+    assert int(scene.valid.sum()) == len(da3_rows(tiny))
+
+
 def test_rotations_are_never_changed(tmp_path: Path) -> None:
     tiny = with_surface_rotations(smooth_scene(96, 72))
     rows = export_rows(tiny, da3_rows(tiny))
