@@ -7,31 +7,50 @@ from dataclasses import replace
 
 from gsmerge.facts.holes import fill_between
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
+from gsmerge.raster.photos import scene_photos, score_photos
 from gsmerge.runtime.record import choose
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
+from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.stages.segment import segment_scene
-from gsmerge.types import Decoded
+from gsmerge.types import Decoded, Gaussians
+
+NEAR_INPUT = 36.0  # dB from renders of the input, from which on nobody sees what a fit to them gains
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for
 
 
 def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: as many as ``superpixels`` and K give."""
+    if plan.merges_pairs:
+        return build_from_pairs(prepared, plan, plan.limits.default if count is None else count)
     decoded = start(prepared, plan, count)
-    if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
-        return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
     long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
     if not long or not prepared.reference.of_views:  # what placed views see is all there is
         return fitted
     return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras))
+
+
+def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
+    """Merge neighbours into ``count`` canonical Gaussians, and fit them to renders of the input if these differ."""
+    merged = merge_neighbors(prepared.scene.gaussians, count)
+    if plan.fit.fit == "none" or shows_input(merged, prepared, plan):
+        return Fitted(merged, prepared.scene.cameras, None)
+    scene = prepared.scene_between if plan.fit.grows else prepared.scene
+    fitted = fit_scene(Decoded(merged, count, exact=True), scene, range(len(scene)), plan.fit, plan.seed)
+    return replace(fitted, cameras=prepared.scene.cameras)
+
+
+def shows_input(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> bool:
+    """Return whether canonical Gaussians are so near to renders of the input that a fit is not worth its time."""
+    photos, views = scene_photos(prepared.scene), prepared.reference.score_views
+    return score_photos(gaussians, photos, views, quarter=True).psnr >= max(NEAR_INPUT, plan.target_psnr or 0.0)
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

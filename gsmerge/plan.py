@@ -48,6 +48,7 @@ MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians 
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
 KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
+RENDERS_STEPS = 0.35  # times the steps of a fit: where renders stand for photos, it begins near to them
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -81,6 +82,7 @@ class Plan:
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
+    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels: only renders show the scene
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
@@ -160,19 +162,23 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
+        pairs = cuts and reference.name == RENDERS and checkpoint is None and not _asks_for_superpixels(asked)
+        if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
+            fit = replace(fit, judged=False, tuning=fit.tuning.scaled(RENDERS_STEPS))
     if keeps and has_few_rows(size):
         few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
         note(f"{few} the photos' pixels, up to half of the Gaussians")
     tree = None
     budget = options.budget
     searches = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    if cuts and (searches or limits.count is not None):
+    if cuts and not pairs and (searches or limits.count is not None):
         tree = scene_tree(scene, segment, limits, limits.exact or limits.default)
     return Plan(
         superpixels=SuperpixelChoices(segment, limits, start_share(fit), tree),
         match=replace(options.match, match=choices.match),
         decode=options.decode,
         fit=fit,
+        merges_pairs=pairs,
         clean=clean_options,
         unseen=unseen,
         target_psnr=target,
@@ -300,6 +306,12 @@ def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
         raise UsageError(f"{problem}, since nothing shows the scene better than the input; or give --images")
     if "sky" in options.clean.drops and prepared.input_scene.images is None:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
+
+
+def _asks_for_superpixels(options: CompactOptions) -> bool:
+    """Return whether settings say how superpixels are cut, matched or decoded; their numbers say how many Gaussians."""
+    segment, decode = replace(options.segment, superpixels=SHARE), replace(options.decode, k=DecodeOptions().k)
+    return (segment, options.match, decode) != (SegmentOptions(), MatchOptions(), DecodeOptions())
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:

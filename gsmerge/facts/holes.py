@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.mend_photos import fill_gaps
-from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, project, rgb_to_sh0
+from gsmerge.facts.place_cameras import between_cameras
+from gsmerge.geometry import nearest_views, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import Splats, TiledView, prepare, tile_view
@@ -42,9 +43,7 @@ SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
 FAINT = 0.02  # opacity of Gaussians that make room: a fit leaves every tenth like that
 SHARE = 0.03  # of the Gaussians, at most, that fill what no view shows
 LEVEL = 8  # times a view's pixel is theirs: what no photo shows is blurred anyway
-PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
 BESIDE = -0.1  # of the way to the nearest view: a camera just outside
-WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
 MARGIN = 0.05  # of the sides, by which these cameras see more on each side
 CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is to be filled, below which it shows a surface
 WINDOW, NEARER = 0.08, 0.85  # of the width around a pixel: what is nearer than this share of the farthest depth there
@@ -168,7 +167,7 @@ def fill_between(fitted: Gaussians, cameras: Cameras) -> Gaussians:
     if not 1 < len(cameras) <= MOST_VIEWS:
         return fitted
     cameras = _small_cameras(cameras)
-    between, order = _between_cameras(cameras), np.argsort(fitted.opacities, kind="stable")
+    between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
     seen = _see(fitted, cameras), _see(fitted, between).where_covered()
     filled, full = fitted, len(fitted) + most
@@ -210,22 +209,11 @@ def _small_cameras(cameras: Cameras) -> Cameras:
     return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
 
 
-def _between_cameras(cameras: Cameras) -> Cameras:
-    """Place cameras half way from each view to the nearest others, then one just beside each; they see a little more.
-
-    A camera moves along the screw from one pose to the other, so it keeps looking at what both look at.
-    """
+def _wider(cameras: Cameras) -> Cameras:
+    """Return the cameras with a margin on each side."""
     right, down = (round(MARGIN * side) for side in (cameras.width, cameras.height))
-    viewmats = cameras.viewmats.astype(np.float64)
-    nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
-    middle = {(min(v, o), max(v, o)): MIDDLE for v, others in enumerate(nearest) for o in others}
-    beside = {(v, others[0]): BESIDE for v, others in enumerate(nearest)}
-    pairs, parts = np.array([*middle, *beside]).T, np.array([*middle.values(), *beside.values()])
-    motions = motion_vectors(viewmats[pairs[0]], viewmats[pairs[1]])
-    near = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
-    first, moves = pairs[0][near], motion_matrices((parts[:, None] * motions)[near])
-    Ks = cameras.Ks[first] + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
-    return Cameras(matmul(viewmats[first], moves), Ks, cameras.width + 2 * right, cameras.height + 2 * down)
+    Ks = cameras.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
+    return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
 
 
 def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:

@@ -1,4 +1,4 @@
-"""Scene without views -> cameras that show most of it, and renders in place of photos."""
+"""Scene -> cameras that it lacks, in all of it or between its views, and renders in place of photos."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster import contributions, prepare, render, tile_view
@@ -27,6 +28,10 @@ PROBE = 96  # pixels per side of the pictures that candidates are judged by
 SMALLEST, LARGEST = 96, 640  # pixels per side
 CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
+PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
+WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
+OUTSIDE = -0.3  # of the way to the nearest view: how far outside a fit to renders looks
+FEW_VIEWS = 24  # up to which a fit to renders also sees what lies between them: of more it learns none by heart
 
 
 NO_VIEWS = (
@@ -79,6 +84,34 @@ def blank_pictures(scene: Scene) -> PicturedScene:
 def draw_pictures(scene: Scene) -> PicturedScene:
     """Render a canonical scene into its views and use the renders as its pictures."""
     return PicturedScene.of(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
+
+
+def draw_between(scene: PicturedScene) -> PicturedScene:
+    """Add renders of a canonical scene half way between its views and outside, if it has few; these come last."""
+    if not 1 < len(scene) <= FEW_VIEWS:
+        return scene
+    given, more = scene.cameras, between_cameras(scene.cameras, OUTSIDE)
+    images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
+    names = (*scene.names, *(f"between {view}" for view in range(len(more))))
+    viewmats, Ks = np.concatenate([given.viewmats, more.viewmats]), np.concatenate([given.Ks, more.Ks])
+    return replace(scene, cameras=replace(given, viewmats=viewmats, Ks=Ks), images=images, names=names)
+
+
+def between_cameras(cameras: Cameras, *further: float) -> Cameras:
+    """Place cameras half way from each of two views or more to the nearest others.
+
+    Others follow for each view, ``further`` of the way to its nearest. A camera moves along the screw from one pose to
+    the other, so it keeps looking at what both look at.
+    """
+    viewmats = cameras.viewmats.astype(np.float64)
+    nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
+    middle = {(min(v, o), max(v, o)): MIDDLE for v, others in enumerate(nearest) for o in others}
+    beside = [((v, others[0]), part) for part in further for v, others in enumerate(nearest)]
+    pairs, parts = (np.array(column) for column in zip(*middle.items(), *beside, strict=True))
+    motions = motion_vectors(viewmats[pairs[:, 0]], viewmats[pairs[:, 1]])
+    near = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
+    first, moves = pairs[near, 0], motion_matrices((parts[:, None] * motions)[near])
+    return replace(cameras, viewmats=matmul(viewmats[first], moves), Ks=cameras.Ks[first])
 
 
 def place_cameras(

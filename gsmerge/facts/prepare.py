@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from gsmerge.facts.place_cameras import (
     add_judges,
     add_views,
     blank_pictures,
+    draw_between,
     draw_pictures,
     keep_finite,
 )
@@ -157,6 +159,11 @@ class Prepared:
         size = measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
         # Gaussians that fill holes are not the file's
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
+
+    @cached_property
+    def scene_between(self) -> PicturedScene:
+        """The canonical scene with renders of it between few views besides, which a fit to renders needs."""
+        return draw_between(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""

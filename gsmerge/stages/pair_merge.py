@@ -135,9 +135,8 @@ def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussia
     scales *= np.sqrt(opacities).clip(1, most)[:, None]
     opacities = np.minimum(opacities, MAX_OPACITY)
     sh = cloud.sh.reshape(len(cloud), -1, 3)
-    out = Gaussians(
-        to_float32(cloud.means), to_float32(quats), to_float32(scales), to_float32(opacities), sh[:, :1], sh[:, 1:]
-    )
+    means, quats, scales = to_float32(cloud.means), to_float32(quats), to_float32(scales)
+    out = Gaussians(means, quats, scales, to_float32(opacities), sh[:, :1].copy(), sh[:, 1:].copy())
     alone = np.flatnonzero(cloud.sizes == 1)
     for name, column in vars(out).items():
         column[alone] = getattr(source, name)[cloud.rows[alone]]
