@@ -124,7 +124,7 @@ KINDS = {
     "state": Kind("a.gsm", extended("."), STATE),
     "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
-OFTEN = ("rows", "state")  # in the default run; the others are in the sweep
+OFTEN = ("parts", "state")  # in the default run; the others are in the sweep
 
 
 def placed(words: tuple[str, ...], folder: Path) -> list[object]:

@@ -233,6 +233,8 @@ def test_the_speed_of_this_device_is_in_the_headline(opened: tuple[Browser, Any]
     assert tab.run("id('speed').title") == "Medians of frames on this device: 18.0 and 2.0 ms"
     tab.run("times.clear(); solid.frameTime = source => 2; measureSpeed()")
     assert tab.run("[id('speed').textContent, id('speed').title]") == ["", ""]
+    size = {"width": 240, "height": 240, "deviceScaleFactor": 1, "mobile": False}  # little for a processor to draw
+    tab.call("Emulation.setDeviceMetricsOverride", **size)
     tab.run("delete solid.frameTime; set('solid', '1')")
     wait(tab, SETTLED)
     assert tab.run("[1, 2].every(source => solid.frameTime(source) > 0)")
