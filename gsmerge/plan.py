@@ -162,7 +162,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
-        pairs = cuts and reference.name == RENDERS and checkpoint is None and not _asks_for_superpixels(asked)
+        pairs = cuts and checkpoint is None and merges_pairs(size, asked)
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
             fit = replace(fit, judged=False, tuning=fit.tuning.scaled(RENDERS_STEPS))
     if keeps and has_few_rows(size):
@@ -308,10 +308,15 @@ def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
-def _asks_for_superpixels(options: CompactOptions) -> bool:
-    """Return whether settings say how superpixels are cut, matched or decoded; their numbers say how many Gaussians."""
+def merges_pairs(scene: SceneSize, options: CompactOptions) -> bool:
+    """Return whether neighbours are merged, not superpixels, because renders of the scene alone show it.
+
+    Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
+    """
     segment, decode = replace(options.segment, superpixels=SHARE), replace(options.decode, k=DecodeOptions().k)
-    return (segment, options.match, decode) != (SegmentOptions(), MatchOptions(), DecodeOptions())
+    usual = (segment, options.match, decode) == (SegmentOptions(), MatchOptions(), DecodeOptions())
+    ours = options.method == OURS and choose_networks(options, scene) == "none"
+    return usual and ours and scene.rendered
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:

@@ -17,7 +17,7 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, choose_for_scene, load_networks, resolve_budget, stands_alone
+from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, choose_for_scene, load_networks, merges_pairs, resolve_budget
 from gsmerge.report import document_head
 from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
 from gsmerge.runtime.memory import human_bytes
@@ -38,8 +38,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` or ``loss_kept`` is a
         number, the fewest: more are taken until the result is so many dB from the input, or shows the photos at most so
         much worse; ``ratio`` to the input, ``bytes`` as a ``.ply``;
-        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where no view is
-        known), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
+        ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where neighbours are
+        merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
         machine has enough.
     """
@@ -68,7 +68,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if stands_alone(scene, options) else None if distributed else limits.per_view,
+        "superpixels_per_view": 0 if merges_pairs(size, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings, photos=size.photos),
         "fit_steps": choices.fit.steps,
@@ -86,7 +86,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
         superpixels = f"{per_view:,} superpixels per view, {run['k']} Gaussian(s) each"
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     if per_view == 0:
-        method = "neighbours merged pair by pair, because no view is known"
+        method = "neighbours merged pair by pair, because no photo shows them"
     count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
     number = f"at most {count}" if kept is None else f"{count}, or more until {kept:g} dB from the input are kept"
     if run["loss_kept"] is not None:

@@ -27,7 +27,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 
-COUNT, MANY = 3, 60  # mutations of a kind
+COUNT, MANY = 3, 40  # mutations of a kind
 FEWER = 20  # of kinds whose rows have to be placed, which takes two seconds for each mutation
 LIMITS = Limits(1 << 30, 100)
 

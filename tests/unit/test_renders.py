@@ -10,9 +10,12 @@ import pytest
 import scenes
 import unaligned_scenes
 
-from gsmerge import Cameras, Scene, compact, render
+from gsmerge import Cameras, CompactOptions, Scene, compact, render
+from gsmerge.compaction.estimate import estimate
 from gsmerge.facts.place_cameras import FEW_VIEWS, OUTSIDE, between_cameras, draw_between, draw_pictures
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry import camera_centres
+from gsmerge.plan import merges_pairs
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
@@ -59,6 +62,15 @@ def test_counts_and_cameras_are_as_asked_for(scene: Scene) -> None:
         result = compact(scene, fit_steps=150, **settings)
         assert len(result.gaussians) == 200
         np.testing.assert_array_equal(result.cameras.viewmats, scene.cameras.viewmats)
+
+
+def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
+    size = measure_size(scene)
+    assert merges_pairs(size, CompactOptions())
+    assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
+    for settings in ({"max_color": 0.11}, {"segmentation": "slic"}, {"checkpoint": "shipped"}, {"method": "voxel"}):
+        assert not merges_pairs(size, CompactOptions().with_settings(settings))
+    assert not merges_pairs(replace(size, photos=True, drawn=False), CompactOptions())
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:
