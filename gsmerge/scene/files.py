@@ -42,6 +42,10 @@ MASK_PLACES = ("masks",)
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
+# ends of paths that many scenes have
+_USUAL_END = re.compile(
+    r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
+)
 # what files are called that have a view or a part each
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
@@ -157,9 +161,9 @@ def _depths_cameras(path: Path) -> Path:
 
 
 def scene_title(ply: Path) -> str:
-    """Name a scene for a page: by its file, or by its folder where the file has the usual name."""
-    name = ply.stem.removesuffix(".compact")
-    return ply.parent.absolute().name if name == "scene" else name
+    """Name a scene for a page: by its file, or by its folder where the file has the name that all scenes of it have."""
+    path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
+    return Path(_USUAL_END.sub("", path)).name or ply.stem
 
 
 def result_cameras(ply: Path) -> Path | None:

@@ -229,7 +229,17 @@ def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.parametrize(
     ("path", "title"),
-    [("room/scene.ply", "room"), ("room/scene.compact.ply", "room"), ("room/a.compact.ply", "a"), ("room/b.ply", "b")],
+    [
+        ("room/scene.ply", "room"),
+        ("room/scene.compact.ply", "room"),
+        ("room/a.compact.ply", "a"),
+        ("room/b.ply", "b"),
+        ("room/exports/gs_ply/0000.ply", "room"),
+        ("room/gs_ply/0000.ply", "room"),
+        ("room/point_cloud/iteration_30000/point_cloud.ply", "room"),
+        ("0003/gaussians.ply", "0003"),
+        ("/scene.ply", "scene"),
+    ],
 )
 def test_a_scene_is_named_by_its_file_or_its_folder(path: str, title: str) -> None:
     assert scene_title(Path(path)) == title
