@@ -247,6 +247,8 @@ def _prepare_others(
     else:
         note("no photos: views rendered from the scene itself stand in for them")
         scene = draw_pictures(scene)
+        shown = tuple(view for view in every if scene.images[view].any())  # any result looks like an empty view
+        reference = replace(reference, score_views=shown or every)
     return Prepared(given, scene, frame, reference, repeated, moved=False, unseen=unseen)
 
 

@@ -57,6 +57,15 @@ def test_what_shows_the_input_already_is_not_fitted(scene: Scene) -> None:
     assert len(result.gaussians) == int(0.6 * len(scene.gaussians))
 
 
+def test_a_view_that_shows_nothing_says_nothing_of_a_result(scene: Scene) -> None:
+    turned = scene.cameras.viewmats.copy()
+    turned[1] = np.diag([-1, 1, -1, 1]) @ turned[0]
+    away = replace(scene, cameras=replace(scene.cameras, viewmats=turned))
+    fidelity = compact(away, budget="2%", fit="none").report.choices["fidelity"]
+    assert fidelity["views"] == 3
+    assert 15 < fidelity["psnr"] < 35
+
+
 def test_counts_and_cameras_are_as_asked_for(scene: Scene) -> None:
     for settings in ({"budget": 200}, {"superpixels": 25, "k": 2}):
         result = compact(scene, fit_steps=150, **settings)
