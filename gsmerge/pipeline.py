@@ -42,8 +42,9 @@ def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
     merged = merge_neighbors(prepared.scene.gaussians, count)
     if plan.fit.fit == "none" or shows_input(merged, prepared, plan):
         return Fitted(merged, prepared.scene.cameras, None)
-    scene = prepared.scene_between if plan.fit.grows else prepared.scene
-    fitted = fit_scene(Decoded(merged, count, exact=True), scene, range(len(scene)), plan.fit, plan.seed)
+    scene = prepared.scene_around if plan.fit.grows else prepared.scene
+    decoded, views, given = Decoded(merged, count, exact=True), range(len(scene)), len(prepared.scene)
+    fitted = fit_scene(decoded, scene, views, plan.fit, plan.seed, num_judged=given)
     return replace(fitted, cameras=prepared.scene.cameras)
 
 

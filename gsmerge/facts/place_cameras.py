@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.facts.views import concat_cameras
+from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
@@ -30,8 +32,9 @@ CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
 WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
-OUTSIDE = -0.3  # of the way to the nearest view: how far outside a fit to renders looks
-FEW_VIEWS = 24  # up to which a fit to renders also sees what lies between them: of more it learns none by heart
+FEW_VIEWS = 24  # up to which a fit to renders also sees what lies around them: of more it learns none by heart
+OUTSIDE = 0.5  # of their number look from outside; least and most step back, as a share of the depth, turns in degrees
+NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
 NO_VIEWS = (
@@ -86,15 +89,16 @@ def draw_pictures(scene: Scene) -> PicturedScene:
     return PicturedScene.of(scene, render(scene.gaussians, scene.cameras).images.clip(0, 1), None)
 
 
-def draw_between(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a canonical scene half way between its views and outside, if it has few; these come last."""
+def draw_around(scene: PicturedScene) -> PicturedScene:
+    """Add renders of a canonical scene from between its views and from outside, if it has few; these come last."""
     if not 1 < len(scene) <= FEW_VIEWS:
         return scene
-    given, more = scene.cameras, between_cameras(scene.cameras, OUTSIDE)
+    means, count = scene.gaussians.means, math.ceil(OUTSIDE * len(scene))
+    outside = outside_cameras(means[:: max(1, len(means) // SAMPLES)], scene.cameras, count, NEAREST, FARTHEST)
+    more = concat_cameras(between_cameras(scene.cameras), outside)
     images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
-    names = (*scene.names, *(f"between {view}" for view in range(len(more))))
-    viewmats, Ks = np.concatenate([given.viewmats, more.viewmats]), np.concatenate([given.Ks, more.Ks])
-    return replace(scene, cameras=replace(given, viewmats=viewmats, Ks=Ks), images=images, names=names)
+    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
+    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, names=names)
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:

@@ -23,7 +23,7 @@ from gsmerge.facts.place_cameras import (
     add_judges,
     add_views,
     blank_pictures,
-    draw_between,
+    draw_around,
     draw_pictures,
     keep_finite,
 )
@@ -161,9 +161,9 @@ class Prepared:
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     @cached_property
-    def scene_between(self) -> PicturedScene:
-        """The canonical scene with renders of it between few views besides, which a fit to renders needs."""
-        return draw_between(self.scene)
+    def scene_around(self) -> PicturedScene:
+        """The canonical scene with renders of it around few views besides, which a fit to renders needs."""
+        return draw_around(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""

@@ -7,6 +7,7 @@ steps back. So after a third of a run some steps look from behind and beside, ab
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -25,7 +26,7 @@ from gsmerge.types import Cameras
 
 # Least and largest step back, as a share of the depth of what a view sees, and turns about its middle to the sides, and
 # up or down, degrees. Cameras that turn without a step back see what new views see, and would cost them their fill
-LOW, HIGH = np.array([0.4, -35.0, -25.0]), np.array([1.6, 35.0, 25.0])
+LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 24  # views outside, at most, or as many as there are photos
@@ -54,7 +55,7 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     points = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
-    placed = _place_cameras(points, cameras, min(looks, max(PLACES, len(photos))))
+    placed = outside_cameras(points, cameras, min(looks, max(PLACES, len(photos))), LOW, HIGH)
     views = blank_photos(placed, min(2, photos.width / LEAST_WIDTH))
 
     def mark(view: int) -> np.ndarray:
@@ -66,12 +67,17 @@ def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos 
     return replace(views[kept], weights=weight * np.stack([marks[view] for view in kept])) if kept else None
 
 
-def _place_cameras(means: np.ndarray, cameras: Cameras, count: int) -> Cameras:
-    """Step back from the points ``[n,3]`` that each camera sees, and turn about their middle."""
+def outside_cameras(
+    means: np.ndarray, cameras: Cameras, count: int, low: Sequence[float], high: Sequence[float]
+) -> Cameras:
+    """Step back from the points ``[n,3]`` that each camera sees, and turn about their middle: ``count`` cameras.
+
+    ``low``, ``high``: least and largest step back, and turns to the sides, and up or down; as of ``LOW``.
+    """
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
     views, viewmats = [number % len(cameras) for number in range(count)], []
     for number, view in enumerate(views):
-        back, azimuth, elevation = LOW + (0.5 + number * EVEN) % 1 * (HIGH - LOW)
+        back, azimuth, elevation = low + (0.5 + number * EVEN) % 1 * np.subtract(high, low)
         viewmats.append(step_outside(cameras.viewmats[view], depths[view], back, azimuth, elevation))
     return replace(cameras, viewmats=np.stack(viewmats), Ks=cameras.Ks[views])
 

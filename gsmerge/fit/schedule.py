@@ -46,6 +46,7 @@ class FitJob:
     seed: int = 0
     progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
+    num_judged: int | None = None  # Of the photos, the first ones, that a result has to show better; None: all
     outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
 
 

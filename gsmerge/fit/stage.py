@@ -26,8 +26,19 @@ ALWAYS = float("inf")  # where the full fit failed: it may have begun where anot
 START = 0.57  # share of the Gaussians that a run which grows begins with
 
 
-def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], options: FitOptions, seed: int) -> Fitted:
-    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for."""
+def fit_scene(
+    decoded: Decoded,
+    scene: PicturedScene,
+    views: Sequence[int],
+    options: FitOptions,
+    seed: int,
+    *,
+    num_judged: int | None = None,
+) -> Fitted:
+    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
+
+    ``num_judged``: of the views, the first ones, that the result has to show better; None: all.
+    """
     if not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)
     with stage("fit"):
@@ -35,7 +46,7 @@ def fit_scene(decoded: Decoded, scene: PicturedScene, views: Sequence[int], opti
         choose(start_count=len(decoded.gaussians))
         if decoded.exact and not options.grows:  # then nothing is left out either
             options = replace(options, min_contribution=0.0)
-        job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed)
+        job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
         gaussians, report = fit(decoded.gaussians, job)
         record_fit(report)
     cameras = scene.cameras
@@ -69,12 +80,12 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport
     options = job.options
     if options.fit == "none":  # as a state does, which has no photos
         return gaussians[visible_mask(gaussians, job.photos[1], options.min_contribution)], None
-    run = prepare_fit(job)
+    run, judges = prepare_fit(job), job.photos[0][range(len(job.photos[0]))[: job.num_judged]]
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(job.photos[0], kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
+    fitted, report = _better_of(judges, kept, *fit_full(kept, run, survey[keep], fixed), CLOSE)
     if report.accepted:
         assert report.origins is not None
         return fitted, replace(report, origins=rows[report.origins])
@@ -84,12 +95,12 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport
         state = grow_to(start_state(kept), job.photos[1], job.count)
         fitted, report = _fit_colors(gaussians_of(state.x, state.splats.shN), job)
         if report.accepted:
-            fitted, report = _better_of(job.photos[0], kept, fitted, report, ALWAYS)
+            fitted, report = _better_of(judges, kept, fitted, report, ALWAYS)
         if report.accepted:
             return fitted, replace(report, origins=rows[state.origins])
         return kept, replace(report, origins=rows)
     fitted, report = _fit_colors(gaussians, job)
-    fitted, report = _better_of(job.photos[0], kept, fitted[keep], report, ALWAYS)
+    fitted, report = _better_of(judges, kept, fitted[keep], report, ALWAYS)
     return fitted, replace(report, origins=rows)
 
 
@@ -109,7 +120,7 @@ def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitR
     """
     if not report.accepted or report.holdout_after - report.holdout_before >= close:
         return after, report
-    moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats)
+    moved = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
     if photo_error(after, moved) <= photo_error(before, photos):
         return after, report
     why = "the photos as a whole were shown worse"
