@@ -32,8 +32,9 @@ CLEAR = 0.02  # near plane, as a share of the scene's radius
 ENOUGH = 1.0  # pixels of blending weight at which a Gaussian counts as seen
 PAIRS, MIDDLE = 2, 0.5  # nearest other views, and how far on the way to them a camera stands
 WIDEST = np.pi / 4  # turn between two views from which on what lies between them is not known
-FEW_VIEWS = 24  # up to which a fit to renders also sees what lies around them: of more it learns none by heart
-OUTSIDE = 0.5  # of their number look from outside; least and most step back, as a share of the depth, turns in degrees
+FEW_VIEWS = 24  # up to which a fit to renders also sees what lies between them: of more it learns none by heart
+OUTSIDE, MOST_OUTSIDE = 0.5, 24  # of their number look from outside, at most
+# Least and most step back of these, as a share of the depth, and turns to the sides, and up or down, degrees
 NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
@@ -90,12 +91,17 @@ def draw_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a canonical scene from between its views and from outside, if it has few; these come last."""
-    if not 1 < len(scene) <= FEW_VIEWS:
+    """Add renders of a canonical scene from outside, and from between its views if they are few; these come last.
+
+    A scene of one view stays as it is.
+    """
+    means, views = scene.gaussians.means, len(scene)
+    if views == 1:
         return scene
-    means, count = scene.gaussians.means, math.ceil(OUTSIDE * len(scene))
-    outside = outside_cameras(means[:: max(1, len(means) // SAMPLES)], scene.cameras, count, NEAREST, FARTHEST)
-    more = concat_cameras(between_cameras(scene.cameras), outside)
+    count = min(int(OUTSIDE * views), MOST_OUTSIDE)
+    more = outside_cameras(means[:: max(1, len(means) // SAMPLES)], scene.cameras, count, NEAREST, FARTHEST)
+    if views <= FEW_VIEWS:
+        more = concat_cameras(between_cameras(scene.cameras), more)
     images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
     names = (*scene.names, *(f"around {view}" for view in range(len(more))))
     return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, names=names)

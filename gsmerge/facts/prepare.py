@@ -162,7 +162,7 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with renders of it around few views besides, which a fit to renders needs."""
+        """The canonical scene with renders of it around its views besides, which a fit to renders needs."""
         return draw_around(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:

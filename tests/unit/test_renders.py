@@ -11,7 +11,7 @@ import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
 from gsmerge.compaction.estimate import estimate
-from gsmerge.facts.place_cameras import FEW_VIEWS, between_cameras, draw_around, draw_pictures
+from gsmerge.facts.place_cameras import FEW_VIEWS, MOST_OUTSIDE, OUTSIDE, between_cameras, draw_around, draw_pictures
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit.outside import HIGH, LOW, outside_cameras
@@ -109,14 +109,17 @@ def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> No
     assert np.linalg.norm(outside_second - first) > apart
 
 
-def test_few_views_see_what_lies_around_them(scene: Scene) -> None:
+def test_a_fit_sees_what_lies_around_its_views(scene: Scene) -> None:
     drawn = draw_pictures(scene)
     more = draw_around(drawn)
-    assert len(more) > len(scene)
+    assert len(more) > len(scene) + int(OUTSIDE * len(scene))
     assert len(more.images) == len(more.cameras) == len(more.names) == len(set(more.names))
     np.testing.assert_array_equal(more.images[: len(scene)], drawn.images)
     assert np.abs(more.images - render(scene.gaussians, more.cameras).images.clip(0, 1)).mean() < 1e-4
-    for count in (1, FEW_VIEWS + 1):
-        views = [0] * count
-        other = replace(drawn, cameras=drawn.cameras[views], images=drawn.images[views], names=("",) * count)
-        assert draw_around(other) is other
+
+
+@pytest.mark.parametrize(("count", "outside"), [(1, 0), (FEW_VIEWS + 1, 12), (4 * MOST_OUTSIDE, MOST_OUTSIDE)])
+def test_of_many_views_nothing_between_is_drawn(scene: Scene, count: int, outside: int) -> None:
+    drawn, views = draw_pictures(scene), [0] * count
+    several = replace(drawn, cameras=drawn.cameras[views], images=drawn.images[views], names=("",) * count)
+    assert len(draw_around(several)) == count + outside
