@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from gsmerge.facts.holes import fill_between
 from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import scene_photos, score_photos
@@ -30,6 +31,8 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if plan.merges_pairs:
         return build_from_pairs(prepared, plan, plan.limits.default if count is None else count)
     decoded = start(prepared, plan, count)
+    if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
+        return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
     long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
     if not long or not prepared.reference.of_views:  # what placed views see is all there is
@@ -45,7 +48,8 @@ def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
     scene = prepared.scene_around if plan.fit.grows else prepared.scene
     decoded, views, given = Decoded(merged, count, exact=True), range(len(scene)), len(prepared.scene)
     fitted = fit_scene(decoded, scene, views, plan.fit, plan.seed, num_judged=given)
-    return replace(fitted, cameras=prepared.scene.cameras)
+    refused = fitted.report is None or not fitted.report.accepted
+    return replace(fitted, gaussians=merged if refused else fitted.gaussians, cameras=prepared.scene.cameras)
 
 
 def shows_input(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> bool:

@@ -48,7 +48,7 @@ MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians 
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
 KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
-RENDERS_STEPS = 0.35  # times the steps of a fit: where renders stand for photos, it begins near to them
+RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,12 +15,14 @@ from gsmerge.compaction.estimate import estimate
 from gsmerge.facts.place_cameras import FEW_VIEWS, MOST_OUTSIDE, OUTSIDE, between_cameras, draw_around, draw_pictures
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
+from gsmerge.fit import Fitted
 from gsmerge.fit.outside import HIGH, LOW, outside_cameras
+from gsmerge.fit.report import FitReport
 from gsmerge.geometry import camera_centres
 from gsmerge.pipeline import build
 from gsmerge.plan import make_plan, merges_pairs
 from gsmerge.raster.metrics import psnr
-from gsmerge.types import Gaussians
+from gsmerge.types import Decoded, Gaussians
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,21 @@ def test_what_lies_around_does_not_refuse_a_fit(scene: Scene) -> None:
     fitted = build(prepared, plan, 400)
     assert fitted.report is not None
     assert fitted.report.accepted
+
+
+def test_a_refused_fit_leaves_all_that_was_merged(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(decoded: Decoded, around: Scene, *_: object, **__: object) -> Fitted:
+        report = FitReport("none", False, 1, math.nan, math.nan, "worse")
+        return Fitted(decoded.gaussians[:10], around.cameras, report)
+
+    monkeypatch.setattr("gsmerge.pipeline.fit_scene", fail)
+    assert len(compact(scene, budget=300).gaussians) == 300
+
+
+def test_all_of_the_input_is_left_as_it_is_by_superpixels_too(scene: Scene) -> None:
+    result = compact(scene, budget="100%", max_color=0.11)
+    assert "fit" not in result.report.choices
+    assert len(result.gaussians) == len(scene.gaussians)
 
 
 def test_a_fit_brings_them_nearer_where_few_are_left(scene: Scene) -> None:
