@@ -55,7 +55,9 @@ def project(root: Path) -> dict[str, Any]:
 
 
 def packed(source: Path) -> set[str]:
-    return {str(path.relative_to(source)) for path in (source / "gsmerge").rglob("*") if path.is_file()}
+    """Files of the package, without the byte code of what the build runs."""
+    files = (path for path in (source / "gsmerge").rglob("*") if path.is_file() and path.suffix != ".pyc")
+    return {str(path.relative_to(source)) for path in files}
 
 
 def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:

@@ -27,8 +27,8 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 
-COUNT, MANY = 3, 40  # mutations of a kind
-FEWER = 20  # of kinds whose rows have to be placed, which takes two seconds for each mutation
+COUNT, MANY = 3, 30  # mutations of a kind
+FEWER = 15  # of kinds that take one or two seconds for each mutation: their rows have to be placed
 LIMITS = Limits(1 << 30, 100)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
@@ -112,8 +112,8 @@ KINDS = {
     "photos": Kind("images/*.png"),
     "views.npz": Kind("views.npz", of_views("views.npz")),
     "results.npz": Kind("results.npz", of_views("results.npz")),
-    "COLMAP, binary": Kind("sparse/*.bin", colmap("bin")),
-    "COLMAP, text": Kind("sparse/*.txt", colmap("txt")),
+    "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), many=FEWER),
+    "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), many=FEWER),
     "chunk": Kind("*.torch", chunk),
     "spz": Kind("a.spz", alone("a.spz"), ("inspect", "a.spz")),
     "sog": Kind("a.sog", alone("a.sog"), ("inspect", "a.sog")),

@@ -38,6 +38,7 @@ _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _MAX_STRIDE = 252  # bytes from a value to the next that glTF allows
 _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # of a budget's 20 microseconds
+_PLACEMENT = {"matrix", "rotation", "scale", "translation"}  # keys of a node that stands elsewhere than its parent
 _EVEN = 1e-3  # by how much the scales of a node's axes may differ, and its axes be oblique
 
 
@@ -229,7 +230,7 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
             raise _ForeignError(f"one with node {node_id} in two places")
         seen.add(node_id)
         node = nodes[node_id]
-        place = matmul(above, _node_matrix(node))
+        place = above if _PLACEMENT.isdisjoint(node) else matmul(above, _node_matrix(node))
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
         yield from ((primitive, place) for primitive in primitives if NAME in primitive.get("extensions", {}))
         stack += [(child, place) for child in reversed(node.get("children", []))]
