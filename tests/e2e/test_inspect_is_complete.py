@@ -27,8 +27,8 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 
-COUNT, MANY = 3, 30  # mutations of a kind
-FEWER = 15  # of kinds that take one or two seconds for each mutation: their rows have to be placed
+COUNT, MANY = 3, 20  # mutations of a kind
+FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed
 LIMITS = Limits(1 << 30, 100)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
