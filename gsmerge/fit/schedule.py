@@ -151,6 +151,9 @@ class Schedule:
         if not self.queue:
             self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
+        given = self.run.job.num_judged
+        if given is not None and view >= given:  # a render from outside, black where the scene is empty
+            background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout
         return Step(number, progress, self.run.draw_mode(number, progress), view, background, kept)

@@ -68,7 +68,9 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
     if options.fit != "none":
-        job = replace(job, outside=outside_views(prepare(gaussians), job.photos[1], options))
+        half = job.photos[1]
+        given = half[range(len(half))[: job.num_judged]]
+        job = replace(job, outside=outside_views(prepare(gaussians), given, options))
     fitted, report = _choose_fit(gaussians, job)
     if report is not None and job.outside is not None:
         report = replace(report, fog=score_fog(prepare(fitted), job.outside))
