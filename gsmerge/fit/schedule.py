@@ -46,7 +46,8 @@ class FitJob:
     seed: int = 0
     progress: Progress | None = None  # Called after each step
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
-    num_judged: int | None = None  # Of the photos, the first ones, that a result has to show better; None: all
+    # Where renders stand for photos, how many of them, the first ones, a result has to show better; None: photos, all
+    num_judged: int | None = None
     outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
 
 
@@ -151,8 +152,7 @@ class Schedule:
         if not self.queue:
             self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
-        given = self.run.job.num_judged
-        if given is not None and view >= given:  # a render from outside, black where the scene is empty
+        if self.run.job.num_judged is not None:  # renders are black where the scene is empty
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout

@@ -37,7 +37,8 @@ def fit_scene(
 ) -> Fitted:
     """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene, if a fit is asked for.
 
-    ``num_judged``: of the views, the first ones, that the result has to show better; None: all.
+    ``num_judged``: where renders stand for photos, how many of the views, the first ones, the result has to show
+    better; None: photos, all.
     """
     if not options.needs_photos:
         return Fitted(decoded.gaussians, scene.cameras, None)

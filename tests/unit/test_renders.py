@@ -48,6 +48,16 @@ def test_nearer_to_the_input_than_superpixels(scene: Scene) -> None:
         assert ours.min() > theirs.min()
 
 
+def test_what_is_empty_stays_empty(scene: Scene) -> None:
+    """Renders have no opacity: on a background other than black, a fit would cover what is empty with black."""
+    half = replace(scene, gaussians=scene.gaussians[scene.gaussians.means[:, 0] > 0])
+    result = compact(half, budget="8%").gaussians
+    alphas = [render(g, scene.cameras).alphas[..., 0] for g in (half.gaussians, result)]
+    empty = alphas[0] < 0.02
+    assert empty.mean() > 0.2
+    assert alphas[1][empty].mean() < 0.05
+
+
 def test_what_lies_around_does_not_refuse_a_fit(scene: Scene) -> None:
     """A fit that shows the given views better is kept, whatever it does to the others."""
     prepared = prepare(scene)
