@@ -50,6 +50,11 @@ class FitJob:
     num_judged: int | None = None
     outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
 
+    def judges(self, size: int) -> Photos:
+        """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""
+        photos = self.photos[size]
+        return photos[range(len(photos))[: self.num_judged]]
+
 
 @dataclass(frozen=True)
 class DrawMode:

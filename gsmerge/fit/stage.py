@@ -69,9 +69,7 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
     if not options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
     if options.fit != "none":
-        half = job.photos[1]
-        given = half[range(len(half))[: job.num_judged]]
-        job = replace(job, outside=outside_views(prepare(gaussians), given, options))
+        job = replace(job, outside=outside_views(prepare(gaussians), job.judges(1), options))
     fitted, report = _choose_fit(gaussians, job)
     if report is not None and job.outside is not None:
         report = replace(report, fog=score_fog(prepare(fitted), job.outside))
@@ -83,7 +81,7 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport
     options = job.options
     if options.fit == "none":  # as a state does, which has no photos
         return gaussians[visible_mask(gaussians, job.photos[1], options.min_contribution)], None
-    run, judges = prepare_fit(job), job.photos[0][range(len(job.photos[0]))[: job.num_judged]]
+    run, judges = prepare_fit(job), job.judges(0)
     survey = survey_photos(gaussians, run)
     keep = survey.visible(options.min_contribution)
     kept, rows = gaussians[keep], np.flatnonzero(keep)
