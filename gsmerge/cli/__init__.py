@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import NoReturn
@@ -29,9 +30,17 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would spin beside ours
     gc.set_threshold(*GC_THRESHOLDS)
     _open_streams()
-    from gsmerge.cli.app import run
+    try:
+        from gsmerge.cli.app import run
 
-    return run(args)
+        return run(args)
+    except Exception as error:  # a library that is needed is broken, or explaining an error failed
+        words = sys.argv[1:] if args is None else args
+        if "--debug" in words:
+            traceback.print_exc()
+        cause = f"{type(error).__name__}: {error}".splitlines()[0]
+        print(f"gsmerge: error: unexpected error: {cause}; run again with --debug", file=sys.stderr)
+        return 1
 
 
 def _open_streams() -> None:

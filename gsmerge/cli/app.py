@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import sys
 import threading
@@ -14,12 +13,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
 from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.parameters import SEED, listed_settings
+from gsmerge.cli.usage import FORMER_COMMANDS, LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -34,51 +32,11 @@ from gsmerge.errors import (
 )
 from gsmerge.runtime.plugins import COMMANDS as PLUGINS
 from gsmerge.runtime.plugins import find_plugins, load_plugin
-from gsmerge.settings.reading import FileHints
-from gsmerge.settings.setting import flat_settings
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-PROGRAM = "gsmerge"
 DEBUG = "--debug"
-
-# What other programs call a command, and the number of Gaussians
-OTHER_WORDS = {
-    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
-    "convert": ("transform", "export", "join", "crop", "translate"),
-    "inspect": ("info", "stats", "describe", "show", "validate", "verify", "lint", "test"),
-    "evaluate": ("eval", "measure", "metrics", "score", "report"),
-    "render": ("preview", "segment"),
-    "view": ("viewer", "compare"),
-}
-# Commands and options of 0.1 -> what to type instead; to be left out after the next release
-FORMER_COMMANDS = {
-    "encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2", "check": "gsmerge inspect",
-    **{name: f"gsmerge lab {name}" for name in ("chart", "generate", "stress", "train")},
-}  # fmt: skip
-FORMER_OPTIONS = {
-    "rerun": "use --overwrite", "max_memory": "use --jobs", "retries": "a second call makes what failed",
-    "timeout": "end the run, and a second call goes on", "device": "all runs on the processor",
-    "align": "views are scored as they are", "help_all": "use --help", "report": "use --json > FILE",
-    "save_cameras": "they are in NAME.cameras.json beside the result",
-    "embed_cameras": "they are in NAME.cameras.json beside the result",
-    **dict.fromkeys(("up", "scale", "rotate", "translate"), "use gsmerge convert for it"),
-    "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
-    "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
-    "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
-    "target_images": "photos beside the cameras of --targets are found", "masks": "masks beside the photos are found",
-    "config": "use --set NAME=VALUE for each setting in it",
-    "draw_only": "a call without scenes draws what the folder holds",
-    "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
-    "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",
-    "antialiased": "gsmerge.render in Python has it", "superpixels": "gsmerge.superpixels in Python has them",
-    "dry_run": "no file of yours is replaced unless you say so", "overwrite": "what gsmerge made is replaced",
-}  # fmt: skip
-BUDGET_WORDS = (
-    "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
-    "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
-)  # fmt: skip
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
@@ -87,7 +45,6 @@ COMMANDS = {
     "Look and measure": ("inspect", "view", "render", "evaluate"),
 }
 OWN_COMMANDS = {name for names in COMMANDS.values() for name in names}
-LAB, LOOK = "lab", "look"  # the group of research commands, and compact with a page, which a scene's name alone calls
 ADDED = "Added by other packages"
 # In 40 columns
 OPENING = """\
@@ -105,24 +62,12 @@ evaluate  scores against photos
 lab       research: charts, training"""
 
 
-class Command(TyperCommand):
-    """A command whose usage begins with its arguments, each as its help names it."""
-
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """List the parts of the usage line after the name of the command."""
-        pieces = []
-        for param in self.params:
-            if param.param_type_name == "argument":
-                name = param.metavar or str(param.name).upper()
-                pieces.append(f"{name}..." if param.nargs == -1 and "..." not in name else name)
-        return [*pieces, "[OPTIONS]"]
-
-
 def make_app(only: str | None = None) -> typer.Typer:
     """Make the application with all commands, or with ``only`` one, so that the others are not imported."""
     made = typer.Typer(
-        name=PROGRAM, pretty_exceptions_enable=False, context_settings={"help_option_names": ["-h", "--help"]}
-    )
+        name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )  # fmt: skip
     made.callback(invoke_without_command=True)(root)
     for panel, names in COMMANDS.items():
         for name in names:
@@ -133,7 +78,9 @@ def make_app(only: str | None = None) -> typer.Typer:
         made.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
     if only in (*OWN_COMMANDS, LOOK):
         return made
-    lab = typer.Typer(help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks.")
+    lab = typer.Typer(
+        cls=Group, help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
+    )
     lab.callback(invoke_without_command=True)(_lab_root)
     for name, entry in find_plugins(PLUGINS).items():
         is_ours = _is_ours(entry)
@@ -150,6 +97,11 @@ def make_app(only: str | None = None) -> typer.Typer:
     if only in (None, LAB):
         made.add_typer(lab, name=LAB, rich_help_panel="Research")
     return made
+
+
+def make_command(only: str | None = None) -> Any:
+    """Make the command that parses and calls: of all commands, or of ``only`` one."""
+    return typer.main.get_command(make_app(only))
 
 
 def _lab_root(context: typer.Context) -> None:
@@ -206,44 +158,6 @@ def root(
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
     if context.invoked_subcommand is None:
         print(OPENING)
-
-
-def _usage_message(error: Any) -> str:
-    """Describe wrong usage in one line, with the correct way to write it."""
-    place = PROGRAM if error.ctx is None else error.ctx.command_path
-    message = error.format_message().replace("Value error, ", "", 1).rstrip(".")  # a prefix of checks inside Typer
-    parameters = [] if error.ctx is None else error.ctx.command.params
-    has_output = any(parameter.name == "output" for parameter in parameters)
-    if hasattr(error, "option_name"):
-        message = _suggest(error.option_name, error.ctx.command) or message
-    elif message.startswith("Got unexpected extra argument") and has_output:
-        message += "; name what is written with -o"
-    elif match := re.match(r"No such command '(\w+)'", message):
-        if match[1] in FORMER_COMMANDS:
-            return f"{match[1]} is no command any more: use {FORMER_COMMANDS[match[1]]}"
-        near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
-        message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
-    return f"{message}; see '{place} --help'"
-
-
-def _suggest(option: str, command: Any) -> str | None:
-    """Suggest ``--set`` or ``--hint`` for a setting that has no option of its own; None for other names."""
-    name = option.lstrip("-").replace("-", "_")
-    names = {parameter.name for parameter in command.params}
-    if name in names:
-        return None
-    if name in BUDGET_WORDS and "budget" in names:
-        more = ", or --k" if "k" in names else ""
-        return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
-    if name in flat_settings(FileHints) and "hint" in names:
-        return f"{option} is no option: use --hint {name}=VALUE"
-    positive, settings = name.removeprefix("no_"), listed_settings(getattr(command.callback, "kinds", ()))
-    if positive not in settings:
-        return f"{option} is no option any more: {FORMER_OPTIONS[name]}" if name in FORMER_OPTIONS else None
-    default = settings[positive].default
-    value = str(not default).lower() if isinstance(default, bool) else "VALUE"
-    more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
-    return f"{option} is no option: use --set {positive}={value}{more}"
 
 
 _SOON = 0.02  # seconds after which a signal is raised again that came where it could not be handled
@@ -321,8 +235,8 @@ def run(args: Sequence[str] | None = None) -> int:
         with plain_warnings(), _orderly_stop(signals):
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
-            app = make_app(_command_of(words))
-            code = app(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
+            command = make_command(_command_of(words))
+            code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # whoever read our output has seen enough
                 sys.stdout.flush()
         return stopped() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
@@ -335,8 +249,8 @@ def run(args: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if isinstance(error, _UsageErrors):
-            return fail(_usage_message(error), 2)
+        if isinstance(error, UsageErrors):
+            return fail(usage_message(error, make_command), UsageError.exit_code)
         if is_out_of_memory(error) or file_problem(error) is not None:
             return fail(error_line(error, "what was printed"), SceneError.exit_code)
         if is_opencv_damaged(error):
@@ -349,7 +263,3 @@ def run(args: Sequence[str] | None = None) -> int:
             return fail(str(vanished), vanished.exit_code)
         first = f"{type(error).__name__}: {error}".splitlines()[0]
         return fail(f"unexpected error: {first}; run again with --debug", 1)
-
-
-# Typer does not export its usage errors; BadParameter, which it exports, derives from their common base
-_UsageErrors = typer.BadParameter.__mro__[2]

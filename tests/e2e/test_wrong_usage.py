@@ -132,7 +132,7 @@ USAGE = {
     "evaluate room --lpips none --set photo_side=-1": "photo_side*0",
     "evaluate room --lpips none --set views=6": "views*1 to 5*6",
     "evaluate room --lpips none --set views=3 --targets room/targets": "--views*--targets",
-    "evaluate room --lpips none -o a.md -o a.md": "a.md*twice",
+    "evaluate room --lpips none -o a.md -o ./a.md": "a.md*twice",
     "evaluate room alone.ply alone.ply": "*alone.ply*twice",
     "evaluate room --targets room/targets -o room/targets/transforms.json": "targets/transforms.json*input",
     "lab stress room --cases hail": "cases*unchanged*'hail'",
