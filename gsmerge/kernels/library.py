@@ -49,12 +49,25 @@ def _open(target: Target) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
         built = ctypes.c_char_p.in_dll(library, "sources_hash").value or b""
     except (OSError, ValueError) as error:  # the latter where it is none of ours
-        problem = "cannot be loaded" if path.exists() else "is missing"
-        reason = f" ({error})" if path.exists() else ""
-        raise UsageError(f"{path}: the native library {problem}{reason}; {REMEDY}") from None
+        if path.exists():
+            raise UsageError(f"{path}: the native library cannot be loaded ({error}); {REMEDY}") from None
+        raise UsageError(f"{path}: the native library is missing; {_find_shadow() or REMEDY}") from None
     if hash_sources().encode() not in (b"", built):
         raise UsageError(f"{path}: the native library is older than its sources; {REMEDY}")
     return library
+
+
+def _find_shadow() -> str | None:
+    """Say what to do where this package is a folder of sources in front of the installed package; else None."""
+    from importlib import metadata  # 8 ms that only this needs
+
+    package = FOLDER.parent
+    for installed in metadata.distributions(name=package.name):
+        place = Path(str(installed.locate_file(package.name)))
+        if (place / "__init__.py").exists() and place.resolve() != package.resolve():
+            remedy = f"start Python in another folder, or run pip install -e {package.parent}"
+            return f"the folder {package.parent} hides the package that is installed: {remedy}"
+    return None
 
 
 def _check_end(path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -85,6 +86,16 @@ def test_a_target_beyond_the_processor_is_refused(monkeypatch: pytest.MonkeyPatc
 def test_a_missing_library_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
     with pytest.raises(UsageError, match=r"the native library is missing; run python tasks.py native, or pip install"):
+        load_library()
+
+
+def test_sources_that_hide_the_installed_package_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("gsmerge/__init__.py", "gsmerge-9.dist-info/METADATA"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("Name: gsmerge\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
+    with pytest.raises(UsageError, match=rf"is missing; the folder {re.escape(str(FOLDER.parents[1]))} hides"):
         load_library()
 
 
