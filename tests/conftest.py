@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import os
 import shutil
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,13 @@ from shared import make_once
 
 ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
+WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
+
+if sys.dont_write_bytecode:  # as many containers ask for: each process of the run would compile the package anew
+    sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp()
+    del os.environ["PYTHONDONTWRITEBYTECODE"]
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -28,14 +38,26 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, pytest.CollectReport, Any]:
+    """Every second process collects from the end, so that each compiles half of the tests and reads the other half."""
+    report = yield
+    if isinstance(collector, pytest.Directory) and WORKER[-1:] in tuple("13579"):
+        report.result = report.result[::-1]
+    return report
+
+
 def pytest_collection_finish() -> None:
-    """Torch has one thread: its own cost more than the sizes of these tests take."""
+    """Seek no cycles in what stays. Torch has one thread: its own cost more than the sizes of these tests take."""
+    gc.collect()
+    gc.freeze()
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests with the fixture have the mark of that name, so that ``measure_floors.py`` finds them."""
+    """Put files in order. Tests with the fixture have the mark of that name, which ``measure_floors.py`` finds."""
+    items.sort(key=lambda item: item.path)
     for item in items:
         if "floor" in getattr(item, "fixturenames", ()):
             item.add_marker("floor")
@@ -70,7 +92,7 @@ def root() -> Path:
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that all processes of a run share; :func:`make_once` fills it."""
     base = tmp_path_factory.getbasetemp()
-    return (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    return (base.parent if WORKER else base) / "shared"
 
 
 @pytest.fixture(scope="session")

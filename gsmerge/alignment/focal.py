@@ -40,7 +40,9 @@ _STEPS = 48  # so that the last is four sides
 _FEW_SAMPLES = 3000  # Gaussians that are compared with the photos at each of these
 _SAMPLES = 20_000  # and near the best
 _SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # shares of it around the best that are searched next
-_ROUNDS, _FEWER = 8, 4  # of the first of them, at most, where pixels are far from square; with every fourth Gaussian
+_ROUNDS = 8  # of each of them, at most
+_FINE, _FEWER = 0.01, 8  # above this span every eighth of the Gaussians is compared
+_MOST = 0.1  # distance of a Gaussian's colour from the photo's that counts, of 1: what is larger is another surface
 _HALF = 4  # places on either side in each
 _ENTRIES = (((0, 0), (1, 1)), ((0, 0),), ((1, 1),), ((0, 2),), ((1, 2),))  # of intrinsics, changed in turn
 _CHANGES = [np.array([[float((i, j) in entries) for j in range(3)] for i in range(3)]) for entries in _ENTRIES]
@@ -188,32 +190,34 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
     colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1)
 
     def search(K: np.ndarray, span: float) -> np.ndarray:
-        rows = slice(None, None, _FEWER if span == _SPANS[0] else 1)
+        rows = slice(None, None, _FEWER if span > _FINE else 1)
 
         def color_error(K: np.ndarray) -> float:
             return _color_error(points[rows], colors[rows], pictures.cameras(viewmats, K), pictures.images)
 
-        for change in _CHANGES:
-            steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
-            K = min((K + focal * span * step / _HALF * change for step in steps), key=color_error)
+        for _ in range(_ROUNDS):
+            before = K
+            for change in _CHANGES:
+                steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
+                K = min((K + focal * span * step / _HALF * change for step in steps), key=color_error)
+            if np.array_equal(K, before):
+                break
         return K
 
-    K = pictures.pinhole(focal)
-    for _ in range(_ROUNDS):
-        before, K = K, search(K, _SPANS[0])
-        if np.array_equal(K, before):
-            break
-    return reduce(search, _SPANS[1:], K)
+    return reduce(search, _SPANS, pictures.pinhole(focal))
 
 
 def _color_error(points: np.ndarray, colors: np.ndarray, cameras: Cameras, images: np.ndarray) -> float:
-    """Measure the mean distance of colours ``[n,3]`` from the photos where points are seen."""
-    errors = []
+    """Measure the mean distance of colours ``[n,3]`` from the photos, at most 0.1 for each point and view.
+
+    So points that a photo does not show, or shows behind others, count alike wherever they are drawn.
+    """
+    total = 0.0
     for view, image in enumerate(images):
         with np.errstate(all="ignore"):
             xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
         inside = (depth > 0) & (xy >= 0).all(1) & (xy < (cameras.width, cameras.height)).all(1)
         x, y = xy[inside].T - 0.5
-        errors.append(np.abs(colors[inside] - sample_bilinear(image, x, y)).mean(1))
-    every = np.concatenate(errors)
-    return float(every.mean()) if len(every) else math.inf
+        errors = np.abs(colors[inside] - sample_bilinear(image, x, y)).mean(1)
+        total += float(np.minimum(errors, _MOST).sum()) + _MOST * (len(points) - len(errors))
+    return total / (len(points) * len(images))

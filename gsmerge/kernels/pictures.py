@@ -73,11 +73,15 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
     return out.reshape(*places[0].shape, *source.shape[2:])
 
 
-def enlarge(picture: Picture, width: int, height: int) -> Picture:
-    """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32."""
+def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False) -> Picture:
+    """Resize a picture ``[h,w]`` or ``[h,w,c]`` to a larger size in pixels by cubic convolution; float32.
+
+    Outside are the border pixels, or those of the opposite border where it is ``periodic``.
+    """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
-        ids, weights = _cubic_taps(out.shape[axis], size)
+        places, weights = _cubic_taps(out.shape[axis], size)
+        ids = places % out.shape[axis] if periodic else places.clip(0, out.shape[axis] - 1)
         shape = [-1 if i == axis else 1 for i in range(out.ndim)]
         terms = [out.take(some, axis) * share.reshape(shape) for some, share in zip(ids, weights, strict=True)]
         out = terms[0] + terms[1] + terms[2] + terms[3]
@@ -85,15 +89,14 @@ def enlarge(picture: Picture, width: int, height: int) -> Picture:
 
 
 def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return the four of ``old`` pixels, and their weights, that make each new pixel: ids and weights ``[4,new]``."""
+    """Return the places of four of ``old`` pixels, and their weights, that make each new pixel: both ``[4,new]``."""
     places = (np.arange(new) + 0.5) * (old / new) - 0.5
     first = np.floor(places).astype(np.int64)
     away = np.abs(places - first - np.arange(-1, 3)[:, None])
     a = CUBIC
     near = ((a + 2) * away - (a + 3)) * away * away + 1
     far = ((a * away - 5 * a) * away + 8 * a) * away - 4 * a
-    ids = (first + np.arange(-1, 3)[:, None]).clip(0, old - 1)
-    return ids, np.where(away <= 1, near, far).astype(np.float32)
+    return first + np.arange(-1, 3)[:, None], np.where(away <= 1, near, far).astype(np.float32)
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:

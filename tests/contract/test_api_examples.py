@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import doctest
+import functools
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,11 +15,22 @@ import gsmerge
 NAMES = sorted(set(gsmerge.__all__) - {"__version__"})
 
 
+@pytest.fixture(scope="module")
+def compact() -> Callable[..., gsmerge.CompactResult]:
+    """The function, which takes the folder ``demo`` once for the same options, with its cameras as they are."""
+    once, plain = functools.cache(gsmerge.compact), gsmerge.compact
+    return lambda scene, **options: (once if isinstance(scene, str) else plain)(scene, poses="fixed", **options)
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_example_runs(name: str, small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_runs(
+    name: str, compact: object, small_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shutil.copytree(small_scene, tmp_path / "demo")
     monkeypatch.chdir(tmp_path)
     text = getattr(gsmerge, name).__doc__
+    monkeypatch.setattr(gsmerge, "compact", compact)
+    monkeypatch.setattr("gsmerge.pages.data.OUTLINE_SIDE", 48)
     example = doctest.DocTestParser().get_doctest(text, {"gsmerge": gsmerge}, name, None, 0)
     assert example.examples
     assert doctest.DocTestRunner().run(example).failed == 0

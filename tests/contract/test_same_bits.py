@@ -1,4 +1,4 @@
-"""What computes results calls nothing whose bits depend on the processor.
+"""What computes results, and what makes the data of tests, calls nothing whose bits depend on the processor.
 
 NumPy, its BLAS and OpenCV choose code by processor, and the last bits of these functions with it; `kernels.elementary`,
 `kernels.matrices` and `kernels.pictures` take their places. Sums, square roots, medians and products of whole arrays
@@ -8,6 +8,7 @@ are safe, and so is the rest of OpenCV that is in use (tests/e2e/test_same_bytes
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -46,12 +47,16 @@ def dotted(node: ast.expr) -> str:
     return f"{dotted(node.value)}.{node.attr}" if isinstance(node, ast.Attribute) else getattr(node, "id", "")
 
 
+def refused_here(node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
+        yield "@"
+    elif isinstance(node, ast.Attribute) and dotted(node) in REFUSED:
+        yield dotted(node)
+
+
 def refused_names(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
-        if isinstance(node, ast.BinOp | ast.AugAssign) and isinstance(node.op, ast.MatMult):
-            yield "@"
-        elif isinstance(node, ast.Attribute) and dotted(node) in REFUSED:
-            yield dotted(node)
+        yield from refused_here(node)
 
 
 def test_nothing_depends_on_the_processor(root: Path) -> None:
@@ -61,6 +66,67 @@ def test_nothing_depends_on_the_processor(root: Path) -> None:
         if not name.startswith(OTHERS):
             found |= {(name, what) for what in refused_names(ast.parse(path.read_text(encoding="utf-8")))}
     assert found == ALLOWED
+
+
+# What makes data: tests' own helpers, the generator, the example that makes a scene
+MAKERS = ("tests/helpers", "tests/hostile", "gsmerge/research/generate", "examples/01_make_scene.py")
+ALLOWED_MAKERS = {
+    ("gsmerge/research/generate/photograph.py", "cv2.remap"),  # bilinear: the same without AVX2 and AVX-512
+    ("gsmerge/research/generate/textures.py", "cv2.remap"),
+    ("tests/helpers/model_rows.py", "cv2.INTER_CUBIC"),  # of bytes: whole numbers
+    ("tests/helpers/slow_renderer.py", "@"),  # of tensors: a twin, no data
+}
+SUSPECT = rf"\b(np|math)\.a?({'|'.join(ELEMENTARY.split())}|cos|sin|tan)|\barg(sort|partition)|order="  # worth parsing
+TWIN = "tests/kernels/test_elementary.py"  # compares NumPy's functions with ours
+
+
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All nodes but those of assertions, where an expectation may have another last bit."""
+    for child in ast.iter_child_nodes(node):
+        name = dotted(child.func).rpartition(".")[2] if isinstance(child, ast.Call) else ""
+        if not isinstance(child, ast.Assert) and not name.startswith("assert_") and name != "approx":
+            yield child
+            yield from statements(child)
+
+
+def refused_data(tree: ast.AST) -> Iterator[str]:
+    """Elementary functions of NumPy and of the system, and sorts that leave ties in any order."""
+    elementary = {f"{module}.{name}" for module in ("np", "math") for name in ELEMENTARY.split()}
+    elementary |= {f"math.{name}" for name in ("pow", "atan", "atan2", "acos", "asin")}
+    for node in statements(tree):
+        if isinstance(node, ast.Attribute) and dotted(node) in elementary:
+            yield dotted(node)
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            words = {word.arg for word in node.keywords}
+            name = node.func.attr
+            ties = name in ("argsort", "argpartition") or (name == "sort" and "order" in words)
+            if ties and not words & {"kind", "stable"}:
+                yield name
+
+
+def python_files(root: Path, *places: str, having: str = "") -> Iterator[tuple[str, ast.AST]]:
+    """Names and trees of the files at some places in whose text a pattern is."""
+    for place in places:
+        for path in sorted((root / place).rglob("*.py")) or [root / place]:
+            text = path.read_text(encoding="utf-8")
+            if re.search(having, text):
+                yield path.relative_to(root).as_posix(), ast.parse(text)
+
+
+def test_data_are_the_same_on_every_processor(root: Path) -> None:
+    makers = list(python_files(root, *MAKERS))
+    used = {(name, what) for name, tree in makers for node in statements(tree) for what in refused_here(node)}
+    assert used == ALLOWED_MAKERS
+    files = [*makers, *python_files(root, "tests", having=SUSPECT)]
+    assert {(name, what) for name, tree in files if name != TWIN for what in refused_data(tree)} == set()
+
+
+def test_what_is_refused_in_data_is_seen() -> None:
+    tree = ast.parse(
+        "a = np.exp(b)\nc = np.argsort(a)\nd = np.sort(a, order='x')\ne = math.sin(1)\nassert np.log(a) > 1"
+    )
+    assert sorted(refused_data(tree)) == ["argsort", "math.sin", "np.exp", "sort"]
+    assert list(refused_data(ast.parse("a = np.argsort(b, kind='stable')\nassert_allclose(a, np.exp(b))"))) == []
 
 
 def test_what_is_refused_is_seen() -> None:

@@ -1,10 +1,14 @@
-"""The package and the command line load nothing before they are asked for something."""
+"""The package and the command line load nothing before they are asked for something.
+
+Each test is about a process that has loaded nothing, and so takes a second.
+"""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,61 +27,62 @@ def run_python(code: str) -> str:
     return done.stdout
 
 
-def loaded_after(code: str) -> set[str]:
-    listing = run_python(f"{code}\nimport sys\nprint('modules:', *(m for m in sys.modules if '.' not in m))")
-    return set(listing.splitlines()[-1].split()) & set(HEAVY)
+def test_help_loads_nothing_heavy_and_modules_hide_no_functions() -> None:
+    """In one process: help of one command, of all, a mistyped option; then modules named as functions are."""
+    told = [[], ["--help"], ["--version"], ["compact", "--set", "help"], *([*c.split(), "--help"] for c in COMMANDS)]
+    code = f"""
+import sys, gsmerge
+from gsmerge.cli import main
+assert main(["compact", "--help"]) == 0
+one = [m for m in sys.modules if m.startswith("gsmerge.cli.")]
+for words in {told!r}:
+    assert main(words) == 0
+assert main(["compact", "room", "--magic"]) == 2
+loaded, kinds = [m for m in sys.modules if "." not in m], []
+import gsmerge.raster, gsmerge.compaction.inspect
+kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
+import gsmerge.pipeline
+kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
+print()
+for words in (one, loaded, kinds):
+    print(*words)
+"""
+    one, loaded, kinds = (line.split() for line in run_python(code).splitlines()[-3:])
+    parts = ("app", "compact_command", "console", "parameters", "paths", "usage")
+    assert set(one) == {f"gsmerge.cli.{name}" for name in parts}  # a command loads no other
+    assert set(loaded) & set(HEAVY) == set()
+    assert kinds == ["function"] * 4
 
 
-def test_neither_import_nor_help_nor_mistyped_options_load_anything_heavy() -> None:
-    """One after the other in one process."""
-    told = (
-        ["--help"],
-        ["--version"],
-        [],
-        ["compact", "--set", "help"],
-        *([*name.split(), "--help"] for name in COMMANDS),
-    )
-    code = f"import gsmerge\nfrom gsmerge.cli import main\nfor words in {told!r}:\n    assert main(words) == 0\n"
-    assert loaded_after(f"{code}assert main(['compact', 'room', '--magic']) == 2") == set()
-
-
-def test_a_command_loads_no_other() -> None:
-    code = "from gsmerge.cli import main\nassert main(['compact', '--help']) == 0\nimport sys\n"
-    modules = run_python(f"{code}print(*(m for m in sys.modules if m.startswith('gsmerge.cli.')))").splitlines()[-1]
-    assert set(modules.split()) == {
-        f"gsmerge.cli.{name}" for name in ("app", "compact_command", "console", "parameters", "paths")
-    }
-
-
-@sweep("settings", [[], ["--fit", "none"], ["--effort", "draft"], ["--set", "recipe=paper"]], ids=" ".join)
+@sweep("settings", [["--set", "fit_steps=5"], [], ["--fit", "none"], ["--set", "recipe=paper"]], ids=" ".join)
 def test_compacting_loads_and_needs_neither_torch_nor_scipy_nor_matplotlib(
-    settings: list[str], small_scene: Path, tmp_path: Path
+    settings: list[str], make_scene: Callable[..., Path], tmp_path: Path
 ) -> None:
     """Which take longer to load than a small scene takes to merge; without them the result is the same bytes."""
-    outputs, loaded = [tmp_path / "with.ply", tmp_path / "without.ply"], []
-    for output, missing in zip(outputs, ((), ("torch", "scipy", "skimage", "matplotlib")), strict=True):
-        hide = f"import sys\nsys.modules.update(dict.fromkeys({missing!r}))\n"
-        arguments = ["compact", str(small_scene), "-o", str(output), *settings]
-        code = f"{hide}from gsmerge.cli import main\nassert main({arguments!r}) == 0\n"
-        loaded.append(set(run_python(f"{code}print(*sys.modules)").splitlines()[-1].split()))
+    scene = make_scene(tmp_path / "scene", num_views=2, width=24, height=16)
+    outputs = [tmp_path / "with.ply", tmp_path / "without.ply"]
+    arguments = [["compact", str(scene), "-o", str(output), *settings] for output in outputs]
+    code = f"""
+import sys
+from gsmerge.cli import main
+assert main({arguments[0]!r}) == 0
+print(*sys.modules)
+sys.modules.update(dict.fromkeys(("torch", "scipy", "skimage", "matplotlib")))
+assert main({arguments[1]!r}) == 0
+"""
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
-    assert loaded[0].isdisjoint({"torch", "skimage", "matplotlib", *(f"scipy.{name}" for name in heavy)})
+    never = {"torch", "skimage", "matplotlib", *(f"scipy.{name}" for name in heavy)}
+    (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.pipeline" in line)
+    assert never.isdisjoint(loaded.split())
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 
 
-def test_submodule_imports_do_not_hide_functions() -> None:
-    """Modules may share their names with public functions, but not at the top."""
-    print_kinds = "print(type(gsmerge.render).__name__, type(gsmerge.inspect).__name__)\n"
-    code = f"import gsmerge.raster, gsmerge.compaction.inspect\n{print_kinds}import gsmerge.pipeline\n{print_kinds}"
-    assert run_python(code).split() == ["function"] * 4
-
-
-def test_a_damaged_opencv_names_the_remedy(tmp_path: Path, made_scene: Path) -> None:
+def test_a_damaged_opencv_names_the_remedy(tmp_path: Path, small_scene: Path) -> None:
     """Uninstalling one of several opencv packages leaves a module cv2 without its parts."""
     (tmp_path / "cv2").mkdir()
     (tmp_path / "cv2" / "__init__.py").touch()
     done = subprocess.run(
-        [sys.executable, "-m", "gsmerge", "inspect", str(made_scene)],
+        [sys.executable, "-m", "gsmerge", "inspect", str(small_scene)],
         capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}"},
     )  # fmt: skip

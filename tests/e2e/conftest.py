@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from batches import FAST, NAMES, finish, results
+from batches import FAST, NAMES, InlinePool, finish, results
 from forked_commands import CommandServer
 from messages import ERROR, says
 from shared import make_once
@@ -47,6 +47,12 @@ def small_copy(small_scene: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(small_scene, tmp_path / "scene"))
 
 
+@pytest.fixture
+def smallest_copy(smallest_scene: Path, tmp_path: Path) -> Path:
+    """A copy of the smallest scene that a test may change."""
+    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
+
+
 @pytest.fixture(scope="session")
 def compacted_scene(made_scene: Path, shared: Path) -> Path:
     """``small.ply``, which the defaults make of the made scene, and the report ``run.json``. Read only."""
@@ -62,32 +68,22 @@ def compacted_scene(made_scene: Path, shared: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def charted_scene(make_scene: Callable[..., Path], shared: Path) -> Path:
-    """A scene ``room``, and ``out`` with the charts of two merges and the input on it. Read only."""
+    """A scene ``room``, and ``out`` with the charts of two merges, seconds of drawing. Read only."""
 
     def make(place: Path) -> None:
         scene = make_scene(place / "room", num_views=3, width=64, height=48)
-        words = (
-            "lab",
-            "chart",
-            scene,
-            "-o",
-            place / "out",
-            *CHART_TARGETS,
-            *CHART_FAST,
-            "-q",
-        )
-        assert main([str(word) for word in words]) == 0
+        words = ("lab", "chart", scene, "-o", place / "out", *CHART_TARGETS, *CHART_FAST, "-q")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+            assert main([str(word) for word in words]) == 0
 
     return make_once(shared / "charted", make)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server(smallest_scene: Path) -> Iterator[CommandServer]:
-    """A process that has imported what the commands need."""
-    ply = smallest_scene / "scene.ply"
-    with CommandServer(
-        [("compact", smallest_scene, "--dry-run"), ("inspect", ply), ("inspect", ply, smallest_scene)]
-    ) as server:
+    """A process that has imported what the commands need, which takes it two seconds."""
+    with CommandServer([("inspect", smallest_scene)]) as server:
         yield server
 
 

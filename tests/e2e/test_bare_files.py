@@ -7,41 +7,21 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import unaligned_scenes
 from messages import noted
+from sweeps import sweep
 
 import gsmerge
-from gsmerge import Gaussians
 
 PLACED = ("no cameras", "--cameras", "--images", "cannot be better than its input")
 
 
-def make_object(count: int) -> Gaussians:
-    """A ball of anisotropic Gaussians with harmonics of degree 1, as models of objects write."""
-    rng = np.random.default_rng(0)
-    normals = rng.normal(size=(count, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    quats = np.concatenate([1 + normals[:, 2:], -normals[:, 1:2], normals[:, :1], 0 * normals[:, :1]], 1)
-    colors = np.sin(4 * normals + [0, 1, 2])
-    columns = (
-        normals,
-        quats,
-        np.exp(rng.normal(0, 0.3, (count, 3))) * [0.05, 0.05, 0.005],
-        rng.uniform(0.3, 1, count),
-        colors[:, None],
-        rng.normal(0, 0.1, (count, 3, 3)),
-    )
-    return Gaussians(*(column.astype(np.float32) for column in columns))
-
-
-@pytest.fixture(scope="module", params=["voxels", pytest.param("object", marks=pytest.mark.slow)])
-def bare(request: pytest.FixtureRequest, small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module")
+def bare(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file alone in its folder. Read only."""
-    path = tmp_path_factory.mktemp(request.param) / "scene.ply"
-    voxels = unaligned_scenes.voxels(gsmerge.read_scene(small_scene), 0.05).gaussians
-    gsmerge.write_ply(path, voxels if request.param == "voxels" else make_object(3000))
+    path = tmp_path_factory.mktemp("bare") / "scene.ply"
+    gsmerge.write_ply(path, unaligned_scenes.voxels(gsmerge.read_scene(smallest_scene), 0.05).gaussians)
     return path
 
 
@@ -61,31 +41,32 @@ def test_compact_needs_no_hint(bare: Path, tmp_path: Path, run: Any) -> None:
     assert judged["held_out"]
     assert report["psnr_input_views"] == {"before": None, "after": None}
     assert "unseen" not in report["choices"]
-    hinted = report_of(run, "compact", bare, "-o", tmp_path / "b.ply", "--budget", "20%", "--hint", "order=none")
+    said = run("compact", bare, "-o", tmp_path / "b.ply", "--budget", "20%", "--hint", "order=none", code=0)
     assert (tmp_path / "small.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-    assert hinted["notes"] == report["notes"]
-    line = run("compact", bare, "-o", tmp_path / "c.ply", code=0).out
-    assert "dB from the input in 8 held-out views" in line
+    assert all(note in said.err for note in report["notes"])
+    assert "dB from the input in 8 held-out views" in said.out
 
 
-def test_other_commands_need_none(bare: Path, tmp_path: Path, run: Any) -> None:
+@sweep(
+    "words",
+    [
+        "compact BARE --dry-run", "inspect BARE", "evaluate BARE SMALL --lpips none", "render BARE SMALL -o OUT.png",
+        "extend OUT.gsm BARE --set superpixels=40 --set checkpoint=none",
+        "view BARE SMALL -o OUT.html --no-open", "render BARE --path orbit --frames 2 -o OUT",
+    ],
+    often=5,
+)  # fmt: skip
+def test_other_commands_need_none(words: str, bare: Path, tmp_path: Path, run: Any) -> None:
     small = tmp_path / "small.ply"
-    run("compact", bare, "-o", small, "--effort", "draft", code=0)
-    quick = ("--set", "superpixels=40", "--set", "checkpoint=none")
-    for words in (
-        ("compact", bare, "--dry-run"), ("inspect", bare), ("render", bare, small, "-o", tmp_path / "p.png"),
-        ("render", bare, "--path", "orbit", "--frames", "2", "-o", tmp_path / "frames"),
-        ("view", bare, small, "-o", tmp_path / "v.html"), ("evaluate", bare, small, "--lpips", "none"),
-        ("extend", tmp_path / "state.gsm", bare, *quick),
-    ):  # fmt: skip
-        document = report_of(run, *words)
-        notes = document.get("batches", [document])[0]["notes"]
-        assert sum(noted([note], *PLACED) for note in notes) == 1, words
-    folder = tmp_path / "scenes" / "first"
-    folder.mkdir(parents=True)
-    shutil.copy(bare, folder)
-    run("batch", tmp_path / "scenes", "-o", tmp_path / "out", "--effort", "draft", code=0)
-    run("inspect", bare, code=0)
+    if "SMALL" in words:
+        gsmerge.write_ply(small, gsmerge.read_ply(bare).gaussians[::9])
+    places = {"BARE": bare, "SMALL": small, "OUT": tmp_path / "out"}
+    for name, place in places.items():
+        words = words.replace(name, str(place))
+    document = report_of(run, *words.split())
+    assert document.get("reference", "renders of the input") == "renders of the input"
+    notes = document.get("batches", [document])[0]["notes"]
+    assert sum(noted([note], *PLACED) for note in notes) == 1
 
 
 def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_path: Path, run: Any) -> None:
@@ -98,18 +79,7 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
 
 
 def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:
-    words = (
-        "--set",
-        "fit_steps=50",
-        "--set",
-        "unseen=keep",
-        "--levels",
-        "3",
-        "--set",
-        "drop=floaters",
-        "--k",
-        "2",
-    )
+    words = ("--set", "fit_steps=50", "--set", "unseen=keep", "--levels", "3", "--set", "drop=floaters", "--k", "2")
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", *words)
     assert noted(report["notes"], "not used", "fit_steps", "unseen")
     assert not noted(report["notes"], "not used", "k")
@@ -117,26 +87,24 @@ def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Pa
     assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_photos_without_cameras_change_nothing(
-    bare: Path, small_scene: Path, tmp_path: Path, run: Any, named: bool
+def test_photos_without_cameras_change_nothing(bare: Path, smallest_scene: Path, tmp_path: Path, run: Any) -> None:
+    """Neither those that are named nor those that lie beside the scene."""
+    named, beside = smallest_scene / "images", Path(shutil.copytree(smallest_scene / "images", tmp_path / "images"))
+    scene, quick = Path(shutil.copy(bare, tmp_path)), ("--budget", "20%", "--effort", "draft")
+    run("compact", bare, *quick, "-o", tmp_path / "expected.ply", code=0)
+    for photos, words in ((named, (bare, "--images", named)), (beside, (scene,))):
+        report = report_of(run, "compact", *words, *quick, "-o", tmp_path / "a.ply", "--overwrite")
+        assert sum(noted([note], photos, "not used", "no cameras", "transforms.json") for note in report["notes"]) == 1
+        assert sum(noted([note], *PLACED) for note in report["notes"]) == 1
+        assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
+
+
+def test_photos_are_used_with_order_none_where_cameras_are_known(
+    smallest_scene: Path, tmp_path: Path, run: Any
 ) -> None:
-    photos, scene = small_scene / "images", bare
-    if not named:
-        scene = shutil.copy(bare, tmp_path)
-        photos = shutil.copytree(photos, tmp_path / "images")
-    quick = ("--budget", "20%", "--effort", "draft")
-    report = report_of(run, "compact", scene, *(("--images", photos) * named), *quick, "-o", tmp_path / "a.ply")
-    assert sum(noted([note], photos, "not used", "no cameras", "transforms.json") for note in report["notes"]) == 1
-    assert sum(noted([note], *PLACED) for note in report["notes"]) == 1
-    run("compact", bare, *quick, "-o", tmp_path / "b.ply", code=0)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
-def test_photos_are_used_with_order_none_where_cameras_are_known(small_scene: Path, tmp_path: Path, run: Any) -> None:
     """Where the photos' sizes are the rows', their cameras are estimated, whatever the hint says of the order."""
-    shutil.copy(small_scene / "scene.ply", tmp_path / "scene.ply")
-    images = ("--images", small_scene / "images")
+    shutil.copy(smallest_scene / "scene.ply", tmp_path / "scene.ply")
+    images = ("--images", smallest_scene / "images")
     quick = ("--effort", "draft", "--hint", "order=none")
     report = report_of(run, "compact", tmp_path / "scene.ply", *images, *quick, "-o", tmp_path / "a.ply")
     assert not noted(report["notes"], "not used")

@@ -25,13 +25,13 @@ ROOT = Path(__file__).parents[2]
 def script() -> Iterator[Callable[[str], ModuleType]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        patch.setattr(load_script(ROOT / "benchmarks" / "make_capture.py"), "SIDE", 160)
+        patch.setattr(load_script(ROOT / "benchmarks" / "make_capture.py"), "SIDE", 128)
         yield lambda name: load_script(ROOT / "benchmarks" / f"{name}.py")
 
 
 @pytest.fixture(scope="module")
 def made(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_scene(tmp_path_factory.mktemp("photos") / "made", num_views=5, width=240, height=160)
+    return make_scene(tmp_path_factory.mktemp("photos") / "made", num_views=5, width=144, height=96)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_capture_is_read_by_its_export(
     document = json.loads((capture / "transforms.json").read_text())
     roles = [frame["role"] for frame in document["frames"]]
     assert roles == ["context", "target", "context", "target", "context"]
-    assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(160, 96)}
+    assert {(frame["w"], frame["h"]) for frame in document["frames"]} == {(128, 64)}
 
     views = script("capture_exports").read_scene(capture)
     assert [view["name"] for view in views] == ["00000.jpg", "00002.jpg", "00004.jpg"]
@@ -83,12 +83,12 @@ def test_a_capture_is_read_by_its_export(
 
     loaded = load_scene(script("capture_exports").export(capture, tmp_path / "plain"))
     assert loaded.alignment.ok
-    assert loaded.scene.num_gaussians == 3 * 160 * 96
+    assert loaded.scene.num_gaussians == 3 * 128 * 64
 
 
 def test_a_view_without_points_is_named(script: Callable[[str], ModuleType], photos: Path, tmp_path: Path) -> None:
     first = min((photos / "images").iterdir())
-    cv2.imwrite(str(first), np.full((160, 240, 3), 128, np.uint8))
+    cv2.imwrite(str(first), np.full((96, 144, 3), 128, np.uint8))
     with pytest.raises(SystemExit, match="00000: expected 10 points in common with others, found 0"):
         script("make_capture").make_capture(photos, tmp_path / "out", flat, 3)
 

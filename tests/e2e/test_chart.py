@@ -9,13 +9,11 @@ from typing import Any
 
 import pytest
 from batches import InlinePool
-from messages import names, noted
+from messages import names
 
 import gsmerge
 from gsmerge.research.charts import measure_run as running
 from gsmerge.research.charts.measure_run import RunRecord, read_runs
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 from gsmerge.settings.compact import CompactOptions
 
 from .conftest import CHART_FAST, CHART_TARGETS, Outcome, Run, listing
@@ -28,9 +26,12 @@ def copied(charted_scene: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _inline(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the jobs of a test in this process, where they can be watched; the fixture above has processes."""
+def _inline(charted_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the jobs in this process, where they can be watched, and draw nothing more, which takes half a second."""
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr(
+        "gsmerge.research.charts.figures.draw_figures", lambda figures, folder: {f.name: b"<svg/>" for f in figures}
+    )
 
 
 @pytest.fixture
@@ -100,13 +101,11 @@ def test_the_bytes_are_those_of_the_file(charted_scene: Path, tmp_path: Path) ->
 
 def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     before = (copied / "out" / "batch.jsonl").read_bytes()
-    page = (copied / "out" / "index.html").read_bytes()
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err
     assert merges == []
     assert (copied / "out" / "batch.jsonl").read_bytes() == before
     assert names(outcome.out, "3 runs", "0 new")
-    assert len((copied / "out" / "index.html").read_bytes()) == pytest.approx(len(page), rel=0.01)
 
 
 @pytest.mark.slow
@@ -122,35 +121,8 @@ def test_a_killed_grid_goes_on_where_it_was(copied: Path, merges: list[CompactOp
     next((copied / "out" / "room").glob("*1%*.jpg")).unlink()
     assert again(run, copied).code == 0
     assert budgets(merges)[-1] == "1%"
-
-
-@pytest.mark.slow
-def test_another_scene_another_setting_and_rerun_do_run(copied: Path, merges: list[CompactOptions], run: Run) -> None:
     assert again(run, copied, "--set", "rerun=true").code == 0
     assert budgets(merges)[-2:] == ["1%", "2%"]
-    count = len(merges)
-    assert again(run, copied, "--set", "seed=1").code == 0
-    assert {settings.seed for settings in merges[count:]} == {1}
-    ply = copied / "room" / "scene.ply"
-    data = bytearray(ply.read_bytes())
-    data[-1] ^= 1
-    ply.write_bytes(bytes(data))
-    plan = json.loads(again(run, copied, "--dry-run", "--json").out)
-    assert plan["num_pending"] == 3
-
-
-@pytest.mark.slow
-def test_photos_of_a_given_size_are_measured_anew(copied: Path, run: Run) -> None:
-    before = runs(copied / "out")["input"]
-    assert again(run, copied, "--grid", "budget=2%", "--set", "photo_side=48").code == 0
-    after = runs(copied / "out")["input"]
-    assert after.value("psnr_target_visible") != before.value("psnr_target_visible")
-    assert "--set photo_side=48" in after.command
-    scene = load_scene(copied / "room")
-    targets = read_held_out(scene, copied / "room" / "targets")
-    options = gsmerge.EvaluateOptions(lpips=(), photo_side=48)
-    expected = gsmerge.evaluate(scene.scene, {}, targets, options).results[0].mean("target")[1].psnr
-    assert after.value("psnr_target_visible") == expected
 
 
 def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,30 +151,10 @@ def test_a_failed_run_does_not_end_the_grid(copied: Path, run: Run, monkeypatch:
 def test_a_scene_that_cannot_be_read_is_a_failure_of_its_runs(copied: Path, run: Run) -> None:
     bad = Path(shutil.copytree(copied / "room", copied / "bad"))
     (bad / "scene.ply").write_text("ply\nThese are notes.\n")
-    outcome = run(
-        "lab",
-        "chart",
-        bad,
-        copied / "room",
-        "--output",
-        copied / "out",
-        *CHART_TARGETS,
-        *CHART_FAST,
-        "--quiet",
-        code=5,
-    )
+    words = ("lab", "chart", bad, copied / "room", "--output", copied / "out", *CHART_TARGETS, *CHART_FAST)
+    outcome = run(*words, "--quiet", code=5)
     assert names(outcome.err, "3 of 3", "bad/input")
     assert outcome.err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_views_are_chosen_and_those_too_many_left_out(copied: Path, run: Run) -> None:
-    outcome = again(run, copied, "--grid", "views=2,9", "--grid", "budget=1%,2%", "--json")
-    assert outcome.code == 0
-    document = json.loads(outcome.out)
-    assert document["num_done"] == 3
-    assert noted(document["notes"], "room", "views", 3)
-    assert {r["views"] for r in document["runs"] if r["views_asked"] == 2} == {2}
 
 
 def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> None:
@@ -218,12 +170,13 @@ def test_a_dry_run_tells_the_plan_and_writes_nothing(copied: Path, run: Run) -> 
 
 
 def test_drawing_alone(copied: Path, run: Run) -> None:
-    shutil.rmtree(copied / "out" / "charts")
+    drawn = {path.name for path in (copied / "out" / "charts").iterdir()}
+    (copied / "out" / "index.html").unlink()
     shutil.rmtree(copied / "room")
     outcome = run("lab", "chart", "--output", copied / "out", "--json")
     assert (outcome.code, outcome.err) == (0, "")
     document = json.loads(outcome.out)
     assert document["schema_version"] == 1
     assert (document["num_runs"], document["num_done"], document["num_failed"]) == (3, 0, 0)
-    assert all(Path(path).stat().st_size > 1000 for path in document["charts"])
-    assert Path(document["page"]).is_file()
+    assert {Path(path).name for path in document["charts"]} == drawn
+    assert "3 runs on 1 scene(s): room" in Path(document["page"]).read_text()

@@ -24,7 +24,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Gaussians
 
 from .conftest import Run, assert_refused
 
@@ -244,21 +244,6 @@ def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) 
     assert run("convert", result).code == 2
     assert run("convert", result, result, "--overwrite").code == 2
     assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
-
-
-def test_the_cameras_of_a_result_are_turned_with_it(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q")
-    run("compact", small_scene, "-o", tmp_path / "a.ply", *quick, code=0)
-    run("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--up", "y", "--scale", "2", "-q", code=0)
-    a, b = (
-        gsmerge.render(read(tmp_path / f"{name}.ply"), moved(tmp_path / f"{name}.cameras.json")).images for name in "ab"
-    )
-    assert np.abs(a - b).max() < 0.02
-    assert np.abs(read(tmp_path / "a.ply").means - read(tmp_path / "b.ply").means).max() > 0.5
-
-
-def moved(path: Path) -> Cameras:
-    return gsmerge.to_cameras(gsmerge.read_cameras(path))
 
 
 def test_all_columns_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> None:

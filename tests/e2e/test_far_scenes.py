@@ -49,7 +49,6 @@ def set_apart(folder: Path, factor: float) -> None:
 @sweep(
     ("name", "shift", "worse"),
     [("out.ply", 5e6, True), ("out.spz", 0, True), ("out.sog", 1e5, False), ("out.splat", 5e6, True)],
-    often=2,
 )
 def test_the_score_is_that_of_the_file(
     scene_copy: Path, tmp_path: Path, run: Run, name: str, shift: float, worse: bool

@@ -30,33 +30,33 @@ def pages_in(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.html"))
 
 
-def test_a_scene_alone_is_compacted_and_shown(small_copy: Path, run: Run, opened: list[str]) -> None:
-    said = run(small_copy / "scene.ply", *FAST, code=0)
-    (page,) = pages_in(small_copy)
+def test_a_scene_alone_is_compacted_and_shown(smallest_copy: Path, run: Run, opened: list[str]) -> None:
+    said = run(smallest_copy / "scene.ply", *FAST, code=0)
+    (page,) = pages_in(smallest_copy)
     assert opened == [page.as_uri()]
-    assert (small_copy / "scene.compact.ply").exists()
+    assert (smallest_copy / "scene.compact.ply").exists()
     assert f"{page}: " in said.out
     assert b"scene.compact.ply" in page.read_bytes()  # the result beside the input
-    before = listing(small_copy)
-    again = run(small_copy / "scene.ply", *FAST)
-    assert_refused(again, 2, small_copy / "scene.compact.ply", "gsmerge view", "--overwrite")
-    assert listing(small_copy) == before
+    before = listing(smallest_copy)
+    again = run(smallest_copy / "scene.ply", *FAST)
+    assert_refused(again, 2, smallest_copy / "scene.compact.ply", "gsmerge view", "--overwrite")
+    assert listing(smallest_copy) == before
 
 
-def test_json_and_quiet(small_copy: Path, run: Run, opened: list[str]) -> None:
-    said = run(small_copy, *FAST, "--json", code=0)
+def test_json_and_quiet(smallest_copy: Path, run: Run, opened: list[str]) -> None:
+    said = run(smallest_copy, *FAST, "--json", code=0)
     assert json.loads(said.out)["output"]["num_gaussians"] > 0
     assert (said.err, opened) == ("", [])
-    assert len(pages_in(small_copy)) == 1
-    pages_in(small_copy)[0].unlink()
-    said = run(small_copy, *FAST, "--overwrite", "--quiet", code=0)
+    assert len(pages_in(smallest_copy)) == 1
+    pages_in(smallest_copy)[0].unlink()
+    said = run(smallest_copy, *FAST, "--overwrite", "--quiet", code=0)
     assert (said.out, said.err, len(opened)) == ("", "", 1)
 
 
-def test_a_plan_and_what_no_page_shows_open_none(small_copy: Path, run: Run, opened: list[str]) -> None:
-    assert "would write" in run(small_copy, *FAST, "--dry-run", code=0).out
-    run(small_copy, *FAST, "-o", small_copy / "colmap", code=0)
-    assert (pages_in(small_copy), opened) == ([], [])
+def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, opened: list[str]) -> None:
+    assert "would write" in run(smallest_copy, *FAST, "--dry-run", code=0).out
+    run(smallest_copy, *FAST, "-o", smallest_copy / "colmap", code=0)
+    assert (pages_in(smallest_copy), opened) == ([], [])
 
 
 def test_a_name_of_no_file_is_a_scene_by_its_ending(tmp_path: Path, run: Run, monkeypatch: Any) -> None:
@@ -66,12 +66,12 @@ def test_a_name_of_no_file_is_a_scene_by_its_ending(tmp_path: Path, run: Run, mo
     assert "No such command" in run("nowhere.txt").err
 
 
-def test_results_are_written_into_folders_that_exist(small_copy: Path, tmp_path: Path, run: Run) -> None:
+def test_results_are_written_into_folders_that_exist(smallest_copy: Path, tmp_path: Path, run: Run) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes.txt").touch()
-    run("compact", small_copy, "-o", tmp_path / "out", *FAST, code=0)
+    run("compact", smallest_copy, "-o", tmp_path / "out", *FAST, code=0)
     result = tmp_path / "out" / "scene.compact.ply"
-    assert says(run("compact", small_copy, "-o", tmp_path / "out", *FAST).err, "", result, "--overwrite")
+    assert says(run("compact", smallest_copy, "-o", tmp_path / "out", *FAST).err, "", result, "--overwrite")
     (tmp_path / "copies").mkdir()
     (tmp_path / "copies" / "notes.txt").touch()
     run("convert", result, tmp_path / "copies", code=0)
@@ -79,19 +79,19 @@ def test_results_are_written_into_folders_that_exist(small_copy: Path, tmp_path:
     assert len(copied) == len(gsmerge.read_ply(result).gaussians)
 
 
-def test_threads_of_the_environment(small_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+def test_threads_of_the_environment(smallest_copy: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
     from gsmerge.runtime.threads import available_threads, use_threads
 
     monkeypatch.setenv("GSMERGE_THREADS", "3")
     with use_threads() as count:
         assert available_threads() == count == 3
     monkeypatch.setenv("GSMERGE_THREADS", "0")
-    assert_refused(run("inspect", small_copy), 2, "GSMERGE_THREADS", "'0'")
+    assert_refused(run("inspect", smallest_copy), 2, "GSMERGE_THREADS", "'0'")
 
 
-def test_the_page_of_joined_files_is_the_result_s(made_scene: Path, tmp_path: Path, opened: list[str]) -> None:
+def test_the_page_of_joined_files_is_the_result_s(smallest_scene: Path, tmp_path: Path, opened: list[str]) -> None:
     state = tmp_path / "room.gsm"
-    assert main(["extend", str(state), str(made_scene), "--set", "superpixels=60", "--set", "replay=0", "-q"]) == 0
+    assert main(["extend", str(state), str(smallest_scene), "--set", "superpixels=60", "--set", "replay=0", "-q"]) == 0
     assert main([str(state), "-q"]) == 0
     assert [page.parent for page in pages_in(tmp_path)] == [tmp_path]
     assert len(opened) == 1

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import shutil
-import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from former_formats import compressed_bytes
-from hostile.gsm_files import damaged, filled, header, with_array, with_text
+from hostile.gsm_files import damaged, header, with_text
 from messages import ERROR, says
-from safetensors.numpy import load_file
+from sweeps import sweep
 
 import gsmerge
 from gsmerge.cli import main
@@ -25,18 +23,20 @@ from gsmerge.networks.checkpoint import IN_PACKAGE
 
 from .conftest import Run, assert_refused, listing
 
-FORMATS = ("scene.ply", "a.compressed.ply", "a.spz", "a.splat", "a.sog")
+# The last two without cameras, among whose views their rows would be looked for at length
+FORMATS = ("scene.ply", "a.spz", "a.splat", "away/a.compressed.ply", "away/a.sog")
 OTHERS = ("state.gsm", "networks.safetensors", "transforms.json", "views.npz")
 Spoil = Callable[[Path], object]
 
 
 @pytest.fixture(scope="module")
-def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sound(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a sound file of every kind. Read only."""
-    folder = Path(shutil.copytree(small_scene, tmp_path_factory.mktemp("sound") / "room"))
+    folder = Path(shutil.copytree(smallest_scene, tmp_path_factory.mktemp("sound") / "room"))
+    (folder / "away").mkdir()
     for name in FORMATS[1:]:
         gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
-        if name == "a.compressed.ply":
+        if name.endswith(".compressed.ply"):
             (folder / name).write_bytes(compressed_bytes(gaussians))
         else:
             write_gaussians(folder / name, gaussians)
@@ -44,7 +44,7 @@ def sound(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = gsmerge.read_cameras(folder / "transforms.json")
     np.savez(folder / "views.npz", extrinsics=cameras.viewmats[:, :3], intrinsics=cameras.Ks)
     small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
-    assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
+    assert main(["extend", str(folder / "state.gsm"), str(smallest_scene), *small]) == 0
     return folder
 
 
@@ -54,9 +54,9 @@ def test_sound_files(sound: Path, run: Run) -> None:
     assert [line.split(": ")[0] for line in done.out.splitlines()] == [
         f"ok     {sound / name}" for name in (*FORMATS, *OTHERS)
     ]
-    assert "scene.ply: 7,680 Gaussians, 17-column export, 5 cameras, 5 photos" in done.out
+    assert "scene.ply: 1,152 Gaussians, 17-column export, 3 cameras, 3 photos" in done.out
     assert ", state, " in done.out
-    assert "views.npz: 5 cameras" in done.out
+    assert "views.npz: 3 cameras" in done.out
     assert run("inspect", sound / "a.spz", "-q", code=0).out == ""
     assert listing(sound) == before
 
@@ -66,20 +66,10 @@ def test_a_document_of_all(sound: Path, run: Run, tmp_path: Path) -> None:
     assert done.code == 3
     document = json.loads(done.out)
     first, second = document["files"]
-    assert (first["kind"], first["count"], first["problems"]) == ("Gaussians", 7680, [])
+    assert (first["kind"], first["count"], first["problems"]) == ("Gaussians", 1152, [])
     assert first["file_bytes"] == (sound / "scene.ply").stat().st_size
     assert (second["kind"], second["problems"], document["num_wrong"]) == ("", ["no such file"], 1)
     assert says(done.err.removeprefix(ERROR), tmp_path / "none.spz", "no such file", "1 of 2")
-
-
-def fill(value: float, row: int, column: int) -> Spoil:
-    def spoil(path: Path) -> None:
-        head, body = path.read_bytes().split(b"end_header\n", 1)
-        rows = np.frombuffer(body, "<f4").reshape(-1, 17).copy()
-        rows[row, column : column + 4] = value
-        path.write_bytes(head + b"end_header\n" + rows.tobytes())
-
-    return spoil
 
 
 def flip(place: int) -> Spoil:
@@ -89,14 +79,6 @@ def flip(place: int) -> Spoil:
         data = bytearray(path.read_bytes())
         data[place] ^= 1
         path.write_bytes(data)
-
-    return spoil
-
-
-def version(number: int) -> Spoil:
-    def spoil(path: Path) -> None:
-        data = gzip.decompress(path.read_bytes())
-        path.write_bytes(gzip.compress(data[:4] + struct.pack("<I", number) + data[8:]))
 
     return spoil
 
@@ -116,34 +98,17 @@ def append(path: Path) -> None:
     path.write_bytes(path.read_bytes() + bytes(100))
 
 
-def without_key(path: Path) -> None:
-    data = json.loads(path.read_text())
-    del data["frames"][2]["transform_matrix"]
-    path.write_text(json.dumps(data))
-
-
-def infinite(path: Path) -> None:
-    with_array(min(load_file(path)), filled(np.inf))(path)
-
-
 # How a sound file is spoiled, the place in it that is named, if any, and the values
 WRONG: dict[str, tuple[Any, ...]] = {
-    "fewer rows": ("scene.ply", halve, "truncated or damaged", "'vertex'", 7680),
+    "fewer rows": ("scene.ply", halve, "truncated or damaged", "'vertex'", 1152),
     "more bytes": ("scene.ply", append, "", "100 bytes"),
-    "more bytes, compressed": ("a.compressed.ply", append, "", "100 bytes"),
     "the stream's checksum": ("a.spz", flip(-6), "", "gzip", ".spz"),
     "the stream's end": ("a.spz", lambda path: path.write_bytes(path.read_bytes()[:-4]), "", "cut", "Compressed"),
-    "a wrong version": ("a.spz", version(2), "", "7,680 bytes", "version 2"),
-    "half a spz": ("a.spz", halve, "", "truncated"),
     "half a splat": ("a.splat", lambda path: path.write_bytes(path.read_bytes()[:-5]), "", "32 bytes"),
-    "a bit of a sog": ("a.sog", member_bit, "", "CRC-32"),
+    "a bit of a sog": ("away/a.sog", member_bit, "", "CRC-32"),
     "a bit of an npz": ("views.npz", member_bit, "", "CRC-32"),
     "a bit of a gsm": ("state.gsm", flip(-9), "", "checksums"),
     "an array of a gsm": ("state.gsm", damaged("features.means"), "features.means", "checksums"),
-    "NaN in a gsm": ("state.gsm", with_array("features.covars", filled(np.nan)), "features.covars", "finite"),
-    "half a gsm": ("state.gsm", halve, "", ".gsm", "read"),
-    "inf in networks": ("networks.safetensors", infinite, "", "finite"),
-    "a view without a pose": ("transforms.json", without_key, "", "'transform_matrix'"),
     "no file": ("scene.ply", Path.unlink, "", "no such file"),
 }
 
@@ -151,19 +116,12 @@ WRONG: dict[str, tuple[Any, ...]] = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_files(case: str, sound: Path, tmp_path: Path, run: Run) -> None:
     name, spoil, place, *found = WRONG[case]
-    path = Path(shutil.copy(sound / name, tmp_path / name))
+    path = Path(shutil.copy(sound / name, tmp_path))
     spoil(path)
     assert_refused(run("inspect", path, "-q"), 3, f"{path}{place and ': '}{place}", *found)
     done = run("inspect", path, sound / "a.spz")
     assert (done.code, done.out.startswith(f"wrong  {path}: ")) == (3, True)
     assert says(done.err.splitlines()[-1].removeprefix(ERROR), path, "refused", "1 of 2")
-
-
-def test_odd_rows_are_noted(sound: Path, tmp_path: Path, run: Run) -> None:
-    for name, spoil in {"NaN": fill(float("nan"), 3, 0), "scale": fill(40, 3, 10)}.items():
-        path = Path(shutil.copy(sound / "scene.ply", tmp_path / f"{name}.ply"))
-        spoil(path)
-        assert "1 " in run("inspect", path, sound / "a.spz", code=0).err
 
 
 def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) -> None:
@@ -174,10 +132,10 @@ def test_older_files_have_no_checksums(sound: Path, tmp_path: Path, run: Run) ->
 
 
 # What no result is left of, and beside it what is merged to find that out, and is sound
-@pytest.mark.parametrize(
+@sweep(
     ("name", "value", "code"),
-    [("opacities", 0, 3), ("opacities", 1e-13, 3), ("opacities", 1e-5, 3), ("opacities", 1e-4, 0),
-     ("scales", np.exp(-30), 3), ("scales", 0.01, 0), ("means", 1e6, 3)],
+    [("opacities", 1e-5, 3), ("opacities", 1e-4, 0), ("scales", 1e-13, 3), ("scales", 0.01, 0), ("means", 1e6, 3),
+     ("opacities", 0, 3), ("opacities", 1e-13, 3)], often=2,
 )  # fmt: skip
 def test_a_scene_that_shows_nothing_is_refused_as_compact_refuses_it(
     name: str, value: float, code: int, smallest_scene: Path, tmp_path: Path, run: Run

@@ -27,7 +27,7 @@ import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 
-COUNT, MANY = 3, 20  # mutations of a kind
+COUNT, MANY = 2, 20  # mutations of a kind
 FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed
 LIMITS = Limits(1 << 30, 100)
 
@@ -39,23 +39,6 @@ def embed(folder: Path) -> None:
     scene = gsmerge.read_scene(folder)
     without_transforms(folder)
     embed_cameras(folder / "scene.ply", scene.cameras, cameras.names)
-
-
-def alone(name: str) -> Callable[[Path], None]:
-    """A file of the Gaussians, with nothing beside it."""
-
-    def make(folder: Path) -> None:
-        gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
-        shutil.rmtree(folder)
-        folder.mkdir()
-        gsmerge.write_gaussians(folder / name, gaussians)
-
-    return make
-
-
-def in_levels(folder: Path) -> None:
-    gaussians = gsmerge.read_ply(folder / "scene.ply").gaussians
-    gsmerge.write_levels(folder / "levels" / "lod-meta.json", [gaussians, gaussians[::4]])
 
 
 def of_views(kind: str) -> Callable[[Path], None]:
@@ -102,7 +85,6 @@ def chunks_module() -> Any:
     return importlib.import_module("hostile.chunks")
 
 
-INSPECT = ("inspect", "levels/lod-meta.json")
 STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
@@ -115,16 +97,10 @@ KINDS = {
     "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), many=FEWER),
     "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), many=FEWER),
     "chunk": Kind("*.torch", chunk),
-    "spz": Kind("a.spz", alone("a.spz"), ("inspect", "a.spz")),
-    "sog": Kind("a.sog", alone("a.sog"), ("inspect", "a.sog")),
-    "splat": Kind("a.splat", alone("a.splat"), ("inspect", "a.splat")),
-    "glb": Kind("a.glb", alone("a.glb"), ("inspect", "a.glb")),
-    "index": Kind("levels/lod-meta.json", in_levels, INSPECT),
-    "chunks": Kind("levels/*/*", in_levels, INSPECT),
     "state": Kind("a.gsm", extended("."), STATE),
     "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
-OFTEN = ("parts", "state")  # in the default run; the others are in the sweep
+OFTEN = ("views.npz", "state")  # in the default run; the others are in the sweep
 
 
 def placed(words: tuple[str, ...], folder: Path) -> list[object]:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(
-    sys.platform != "linux" or shutil.which("gcc") is None, reason="preloads a library, with gcc"
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux" or shutil.which("gcc") is None, reason="preloads a library, with gcc"),
+]
 
 
 def kill(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
@@ -19,7 +20,7 @@ def kill(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*tool, *words], cwd=root, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("command", ["compact", pytest.param("extend", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("command", ["compact", "extend"])
 def test_nothing_is_half_written_and_the_next_run_succeeds(command: str, root: Path) -> None:
     done = kill(root, "--calls", "3", "--commands", command)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -27,7 +28,6 @@ def test_nothing_is_half_written_and_the_next_run_succeeds(command: str, root: P
     assert done.stdout.endswith(" 0 faults\n")
 
 
-@pytest.mark.slow
 def test_files_that_are_not_synced_are_reported(root: Path) -> None:
     done = kill(root, "--calls", "1", "--commands", "extend", "--plant", "no syncs")
     assert done.returncode == 1, done.stderr

@@ -13,6 +13,8 @@ import pytest
 from messages import names, noted
 from tiny_scene import edited_json
 
+from gsmerge.kernels import elementary
+
 from .conftest import Run
 
 SCALE = 1.8
@@ -33,7 +35,7 @@ def psnr(folder: Path, photos: Path) -> float:
     for path in sorted(photos.iterdir()):
         drawn = cv2.imread(str(folder / f"{path.stem}.png")).astype(float)
         errors.append(((drawn - cv2.imread(str(path)).astype(float)) ** 2).mean())
-    return float(np.mean(10 * np.log10(255**2 / np.array(errors))))
+    return float(np.mean(10 * elementary.log10(255**2 / np.array(errors))))
 
 
 def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -> None:

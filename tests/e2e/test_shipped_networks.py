@@ -70,7 +70,7 @@ def test_the_papers_method_beats_its_moment_matching(
     make_scene: Callable[..., Path], target_psnr: Callable[[Path, Path], float], tmp_path: Path
 ) -> None:
     """With the networks of absolute outputs that ship, on a scene that nobody trained on."""
-    made = make_scene(tmp_path / "scene", num_views=4, width=192, height=144, seed=123)
+    made = make_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)
     scene, psnr = gsmerge.read_scene(made), {}
     for name, settings in {"networks": {"recipe": "paper"}, "moments": {"method": "moment-matching"}}.items():
         gsmerge.write_ply(tmp_path / "small.ply", gsmerge.compact(scene, **settings).gaussians, overwrite=True)

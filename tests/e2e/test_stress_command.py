@@ -5,21 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
 from messages import names
 
 from .conftest import Run
-
-FAST = ("--set", "fit=none", "--cases", "order, threads,large")
-
-
-@pytest.mark.slow
-def test_table(scene_copy: Path, run: Run) -> None:
-    outcome = run("lab", "stress", scene_copy, *FAST)
-    assert (outcome.code, outcome.err) == (0, "")
-    lines = outcome.out.splitlines()
-    assert [line.split()[0] for line in lines[:3]] == ["held", "held", "held"]
-    assert lines[-1] == "3 of 3 held"
 
 
 def test_json_and_quiet(small_copy: Path, run: Run) -> None:

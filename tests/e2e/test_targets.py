@@ -20,25 +20,13 @@ from .conftest import Run
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.01)
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
 def test_levels_are_a_chain(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "chain.ply"
-    said = run(
-        "compact",
-        small_scene,
-        "-o",
-        out,
-        "--levels",
-        3,
-        "--set",
-        "fit_steps=20",
-        "--set",
-        "superpixels=300",
-        "--json",
-        code=0,
-    )
+    sizes = ("--levels", 3, "--set", "fit_steps=20", "--set", "superpixels=300")
+    said = run("compact", small_scene, "-o", out, *sizes, "--json", code=0)
     document = json.loads(said.out)
     paths = [out, tmp_path / "chain.level1.ply", tmp_path / "chain.level2.ply"]
     counts = [len(read_ply(path).gaussians) for path in paths]
@@ -85,10 +73,10 @@ def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, ru
     assert str(out) in said.out
 
 
-def test_a_loss_spends_less_where_more_may_be_lost(scene: Scene) -> None:
-    few, many = (compact(scene, fit_steps=12, quality=f"-{drop}dB") for drop in (3.0, 0.0))
-    assert len(few.gaussians) < len(many.gaussians)
-    curve = many.report.choices["curve"]
+def test_a_loss_is_read_off_a_curve(scene: Scene) -> None:
+    result = compact(scene, fit_steps=12, quality="-2dB")
+    curve = result.report.choices["curve"]
+    assert curve[0]["count"] < len(result.gaussians) < curve[-1]["count"]
     assert [point["count"] for point in curve] == sorted(point["count"] for point in curve)
     assert all(0 < point["psnr"] < 60 and 0 < point["ssim"] <= 1 for point in curve)
 
@@ -102,8 +90,8 @@ def test_auto_without_a_fit_reports_its_curve(small_scene: Path, tmp_path: Path,
 
 def test_a_device_is_a_limit(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     assert scenes.identical(compact(scene, fit="none", budget="quest3").gaussians, compact(scene, fit="none").gaussians)
-    monkeypatch.setitem(DEVICES, "quest3", 200)
-    assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 200
+    monkeypatch.setitem(DEVICES, "quest3", 30)
+    assert len(compact(scene, fit_steps=12, budget="quest3").gaussians) == 30
 
 
 def test_quality_without_photos_and_pixels_is_that_from_the_input(scene: Scene) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import select
+import shutil
 import struct
 import sys
 from pathlib import Path
@@ -18,6 +20,15 @@ from .conftest import Run
 
 pty = pytest.importorskip("pty")
 COLUMNS, ROWS = 80, 50
+NEXT = "the next command"
+EACH = f"""
+import json, os, sys
+from gsmerge.cli import main
+for columns, words in json.loads(sys.argv[1]):
+    print("{NEXT}", end="", flush=True)
+    os.environ["COLUMNS"] = str(columns)
+    main(words)
+"""
 
 
 def screen(data: bytes) -> list[str]:
@@ -43,16 +54,16 @@ def screen(data: bytes) -> list[str]:
     return [line.rstrip() for line in lines if line.strip()]
 
 
-def in_terminal(*arguments: object, interrupt_at: bytes | None = None, columns: int = COLUMNS) -> tuple[int, bytes]:
-    """Exit code and bytes of a command in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
+def in_terminal(*words: object, interrupt_at: bytes | None = None) -> tuple[int, bytes]:
+    """Exit code and bytes of Python in a terminal; Ctrl-C is typed once ``interrupt_at`` has been printed."""
     import fcntl
     import termios
 
     pid, terminal = pty.fork()
     if pid == 0:
-        words = [sys.executable, "-m", "gsmerge", *map(str, arguments)]
-        os.execve(sys.executable, words, {**os.environ, "TERM": "xterm", "COLUMNS": str(columns)})
-    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
+        environment = {**os.environ, "TERM": "xterm", "COLUMNS": str(COLUMNS)}
+        os.execve(sys.executable, [sys.executable, *map(str, words)], environment)
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
     output = b""
     while select.select([terminal], [], [], 300)[0]:
         try:
@@ -72,7 +83,8 @@ def in_terminal(*arguments: object, interrupt_at: bytes | None = None, columns: 
 
 def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
     out = tmp_path / "small.ply"
-    code, output = in_terminal("compact", small_copy, "-o", out, "--set", "superpixels=200", "--set", "fit_steps=20")
+    sizes = ("--set", "superpixels=200", "--set", "fit_steps=20")
+    code, output = in_terminal("-m", "gsmerge", "compact", small_copy, "-o", out, *sizes)
     lines = screen(output)
     assert code == 0
     first = next(i for i, line in enumerate(lines) if line.startswith("  Gaussians"))
@@ -88,16 +100,8 @@ def test_compact_ends_with_a_table(small_copy: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("foreground")
 def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
-    words = (
-        "compact",
-        small_copy,
-        "-o",
-        tmp_path / "small.ply",
-        "--set",
-        "superpixels=200",
-        "--set",
-        "fit_steps=100000",
-    )
+    long = ("--set", "superpixels=200", "--set", "fit_steps=100000")
+    words = ("-m", "gsmerge", "compact", small_copy, "-o", tmp_path / "small.ply", *long)
     code, output = in_terminal(*words, interrupt_at=b"photos")
     assert code == 130
     lines = screen(output)
@@ -105,35 +109,32 @@ def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
     assert list(tmp_path.glob("small*")) == []
 
 
-def test_inspect_breaks_no_words(small_copy: Path, run: Run) -> None:
-    code, output = in_terminal("inspect", small_copy)
-    assert code == 0
-    *_, report = output.split(b"\x1b[2K")  # after the last bar is erased
-    lines = report.decode().replace("\r", "").splitlines()
-    whole = run("inspect", small_copy).out.splitlines()
-    assert any(len(line) > COLUMNS for line in whole)
-    assert [len(line) for line in lines if len(line) > COLUMNS and " " in line[11:]] == []
-    assert " ".join(" ".join(lines).split()) == " ".join(" ".join(whole).split())
-
-
-@pytest.mark.parametrize("columns", [80, 40])
 def test_no_command_breaks_a_word_or_a_row_of_figures(
-    small_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: int
+    smallest_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
     """Only paths, and commands to copy, are as long as they are."""
     monkeypatch.chdir(tmp_path)
-    small_copy.rename("s")
-    quick = ("--fit", "none", "--budget", 300)
-    for words in (
-        ("compact", "s", "-o", "a.ply", *quick), ("batch", "s", "-o", "b", *quick), ("inspect", "a.ply"),
-        ("convert", "a.ply", "a.sog"), ("compact", "s", "-o", "a.ply"), ("extend", "a.gsm", "s"),
-    ):  # fmt: skip
-        _, output = in_terminal(*words, columns=columns)
-        *_, text = re.split(r"\r\x1b\[\d*A|\x1b\[\d?K", output.decode())  # after the last bar is erased
+    shutil.copytree(smallest_scene, "s")
+    quick = ("--fit", "none", "--budget", "100")
+    commands = [
+        ("inspect", "s"), ("compact", "s", "-o", "a.ply", *quick, "--overwrite"), ("compact", "s", "-o", "a.ply"),
+        ("convert", "a.ply", "a.sog", "--overwrite"), ("extend", "a.gsm", "s", *quick[:2]),
+    ]  # fmt: skip
+    calls = [(COLUMNS, words) for words in commands]
+    calls += [(COLUMNS // 2, words) for words in (*commands, ("batch", "s", "-o", "b", *quick))]
+    whole = run("inspect", "s").out.splitlines()
+    assert any(len(line) > COLUMNS for line in whole)
+    _, output = in_terminal("-c", EACH, json.dumps(calls))
+    _, *parts = output.decode().split(NEXT)
+    for (columns, _), part in zip(calls, parts, strict=True):
+        *_, text = re.split(r"\r\x1b\[\d*A|\x1b\[\d?K", part)  # after the last bar is erased
         text = re.sub(r"\x1b[^A-Za-z]*[A-Za-z]", "", text).replace("\r\n", "\n")
         lines = [line.rpartition("\r")[2] for line in text.split("\n")]
         assert max(map(len, lines)) > 20
-        assert [line for line in lines if len(line) > columns and not line.startswith("  next ")] == []
+        long = [line for line in lines if len(line) > columns and not line.startswith("  next ")]
+        assert [line for line in long if " " in line.strip()] == []
+        if part == parts[0]:
+            assert " ".join(text.split()) == " ".join(" ".join(whole).split())
 
 
 def test_lines_are_wrapped_below_their_first_value() -> None:
@@ -150,23 +151,19 @@ def test_lines_are_wrapped_below_their_first_value() -> None:
     ]
 
 
-def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_copy: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "small.ply"
+def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    out, call = tmp_path / "small.ply", ("compact", small_scene, "--dry-run", "-o", tmp_path / "small.ply")
     out.write_text("mine")
-    said = run("compact", small_copy, "-o", out, "--dry-run", code=0)
-    assert f"note       {out} exists" in said.out
-    assert "exists" not in run("compact", small_copy, "-o", out, "--dry-run", "--overwrite").out
+    assert f"note       {out} exists" in run(*call, code=0).out
+    assert "exists" not in run(*call, "--overwrite").out
     assert out.read_text() == "mine"
 
 
-def test_a_compact_scene_is_known_again(small_copy: Path, tmp_path: Path, run: Run) -> None:
-    out, again = tmp_path / "small.ply", tmp_path / "smaller.ply"
-    words = ("--fit", "none", "--set", "superpixels=200")
-    first = run("compact", small_copy, "-o", out, *words)
-    assert "already" not in first.err
-    views = ("--cameras", small_copy / "transforms.json", "--images", small_copy / "images")
-    second = run("compact", out, "-o", again, *words, *views, code=0)
-    assert second.err.count("already (") == 1
-    scored = run("evaluate", small_copy, out, "--set", "views=2", "--lpips", "none")
+def test_a_compact_scene_is_known_again(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    out, words = tmp_path / "small.ply", ("--fit", "none", "--set", "superpixels=200")
+    assert "already" not in run("compact", small_scene, "-o", out, *words).err
+    views = ("--cameras", small_scene / "transforms.json", "--images", small_scene / "images")
+    assert run("compact", out, "-o", tmp_path / "smaller.ply", *words, *views, code=0).err.count("already (") == 1
+    scored = run("evaluate", small_scene, out, "--set", "views=2", "--lpips", "none")
     assert "measured as results of 2 views" in scored.err
-    assert "more" not in run("evaluate", small_copy, out, "--lpips", "none").err
+    assert "more" not in run("evaluate", small_scene, out, "--lpips", "none").err

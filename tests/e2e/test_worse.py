@@ -11,6 +11,7 @@ import pytest
 from batches import InlinePool, records
 from messages import names
 from scenes import psnr_of
+from sweeps import sweep
 
 import gsmerge
 from gsmerge import Scene
@@ -19,30 +20,25 @@ from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 
-FEW = ("--budget", 30, "--set", "fit=none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
+FEW = ("--budget", 10, "--set", "fit=none", "--effort", "draft", "--threads", 1)  # Gaussians, too few to show anything
 SAID = "worse"
 
 
 @pytest.fixture(scope="module")
-def three_photos(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """Three views with depth errors like those of a network."""
-    folder = make_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=96, height=64)
-    return gsmerge.read_scene(folder)
+def one_photo(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """The second of three views alone."""
+    folder = make_scene(tmp_path_factory.mktemp("three") / "scene", num_views=3, width=60, height=40)
+    return subset(gsmerge.read_scene(folder), [1])
 
 
-@pytest.fixture(scope="module")
-def one_photo(three_photos: Scene) -> Scene:
-    """The second of them alone."""
-    return subset(three_photos, [1])
-
-
-@pytest.mark.parametrize("effort", ["draft", "fast"])
-def test_without_photos_and_a_fit_networks_keep_what_the_views_show(three_photos: Scene, effort: str) -> None:
+@sweep("effort", ["draft", "fast"])
+def test_without_photos_and_a_fit_networks_keep_what_the_views_show(made_scene: Path, effort: str) -> None:
     """Judged by the photos that the run did not get."""
-    bare = replace(three_photos, images=None, large_photos=None)
-    before = psnr_of(three_photos.gaussians, three_photos)
+    scene = gsmerge.read_scene(made_scene)
+    bare = replace(scene, images=None, large_photos=None)
+    before = psnr_of(scene.gaussians, scene)
     after, alone = (
-        psnr_of(gsmerge.compact(bare, effort=effort, fit="none", checkpoint=name, threads=1).gaussians, three_photos)
+        psnr_of(gsmerge.compact(bare, effort=effort, fit="none", checkpoint=name, threads=1).gaussians, scene)
         for name in ("auto", "none")
     )
     assert after > before - MAX_LOSS
@@ -74,14 +70,14 @@ def test_a_long_fit_or_a_number_that_is_asked_for_changes_no_k(one_photo: Scene,
     assert gsmerge.compact(one_photo, threads=1, **settings).report.options["k"] == 1
 
 
-def test_several_cameras_change_no_k(small_scene: Path) -> None:
-    assert gsmerge.compact(gsmerge.read_scene(small_scene), fit="none", threads=1).report.options["k"] == 1
+def test_several_cameras_change_no_k(smallest_scene: Path) -> None:
+    assert gsmerge.compact(gsmerge.read_scene(smallest_scene), fit="none", threads=1).report.options["k"] == 1
 
 
-def test_a_worse_result_is_named(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_a_worse_result_is_named(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
-    said = run("compact", small_scene, "-o", out, *FEW, code=0)
-    document = json.loads(run("compact", small_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
+    said = run("compact", smallest_scene, "-o", out, *FEW, code=0)
+    document = json.loads(run("compact", smallest_scene, "-o", out, *FEW, "--overwrite", "--json", code=0).out)
     psnr = document["psnr_input_views"]
     assert psnr["after"] < psnr["before"] - 0.5
     assert names(document["worse"], f"{psnr['after']:.2f} dB", f"{psnr['before']:.2f} dB")
@@ -89,16 +85,16 @@ def test_a_worse_result_is_named(small_scene: Path, tmp_path: Path, run: Run) ->
     (line,) = [line for line in said.err.splitlines() if SAID in line]
     assert f": {document['worse']}; " in line
     for option in ("--quiet", "--json"):
-        assert run("compact", small_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
+        assert run("compact", smallest_scene, "-o", out, *FEW, "--overwrite", option, code=0).err == ""
 
 
-def test_strict_ends_with_code_4_and_writes_the_result(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_strict_ends_with_code_4_and_writes_the_result(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "few.ply"
-    said = run("compact", small_scene, "-o", out, *FEW, "--strict", code=4)
+    said = run("compact", smallest_scene, "-o", out, *FEW, "--strict", code=4)
     assert said.err.count(SAID) == 1
-    assert len(gsmerge.read_ply(out).gaussians) == 30
+    assert len(gsmerge.read_ply(out).gaussians) == 10
     better = ("--set", "fit_steps=60", "--threads", 1)
-    assert "warning" not in run("compact", small_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
+    assert "warning" not in run("compact", smallest_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
 
 
 def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run) -> None:
@@ -110,34 +106,32 @@ def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run
     assert any(document["worse"] in level["notes"] for level in document["levels"])
 
 
-def test_what_is_left_out_on_purpose_is_no_loss(small_scene: Path) -> None:
-    scene = gsmerge.read_scene(small_scene)
+def test_what_is_left_out_on_purpose_is_no_loss(smallest_scene: Path) -> None:
+    scene = gsmerge.read_scene(smallest_scene)
     x, y, z = scene.gaussians.means[len(scene.gaussians) // 2]
     report = gsmerge.compact(scene, crop=f"sphere:{x},{y},{z},.3", fit_steps=20, threads=1).report
     assert report.psnr_after < report.psnr_before
     assert report.worse is None
 
 
-@pytest.mark.parametrize(("colors", "red"), [({"FORCE_COLOR": "1"}, True), ({"NO_COLOR": "1"}, False)], ids=str)
-def test_the_warning_is_red(
-    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, colors: dict[str, str], red: bool
-) -> None:
+def test_the_warning_is_red(smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
-    for name, value in colors.items():
-        monkeypatch.setenv(name, value)
-    said = run("compact", small_scene, "-o", tmp_path / "few.ply", *FEW, code=0)
-    before, _, after = said.err.partition("gsmerge: warning: ")
-    assert (before.endswith("\033[31m"), "\033[0m" in after) == (red, red)
+    for name, red in (("FORCE_COLOR", True), ("NO_COLOR", False)):
+        monkeypatch.setenv(name, "1")
+        said = run("compact", smallest_scene, "-o", tmp_path / f"{name}.ply", *FEW, code=0)
+        before, _, after = said.err.partition("gsmerge: warning: ")
+        assert (before.endswith("\033[31m"), "\033[0m" in after) == (red, red)
+        monkeypatch.delenv(name)
 
 
 def test_a_batch_names_worse_results(
-    small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
     out = tmp_path / "out"
-    call = ("batch", small_scene, "-o", out, "--jobs", 1, *FEW)
+    call = ("batch", smallest_scene, "-o", out, "--jobs", 1, *FEW)
     said = run(*call, code=0)
-    assert f"worse: {small_scene}: " in said.out
+    assert f"worse: {smallest_scene}: " in said.out
     assert said.out.splitlines()[-1].count("; 1 worse ") == 1
     assert "warning: 1 of 1 results " in said.err
     (record,) = records(out)
@@ -147,18 +141,18 @@ def test_a_batch_names_worse_results(
     assert SAID in again.err
 
 
-def test_pages_and_documents_of_comparisons_name_worse_results(small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_pages_and_documents_of_comparisons_name_worse_results(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     small = tmp_path / "few.ply"
-    run("compact", small_scene, "-o", small, *FEW, "-q", code=0)
+    run("compact", smallest_scene, "-o", small, *FEW, "-q", code=0)
     pages = [tmp_path / name for name in ("report.html", "report.json", "report.md")]
     said = run(
-        "evaluate", small_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
+        "evaluate", smallest_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
     )
     assert "note: few.ply " in said.err
     (note,) = [note for note in json.loads(pages[1].read_text())["notes"] if SAID in note]
     for page in (pages[0], pages[2]):
         assert note.split("'")[1].removeprefix("s ") in page.read_text()
     page = tmp_path / "view.html"
-    said = run("view", small_scene, small, "-o", page, "--no-open", code=0)
+    said = run("view", smallest_scene, small, "-o", page, "--no-open", code=0)
     assert "note: few.ply " in said.err
     assert "photos worse than" in page.read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import shutil
@@ -12,6 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 FLAGS = (
@@ -67,15 +70,31 @@ class Browser:
         for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
         self.call("Page.navigate", url=url)
-        end = time.monotonic() + PATIENCE
-        while self.run("document.readyState") != "complete" or self.run("location.href") != url:
-            assert time.monotonic() < end, "the page does not load"
+        self.wait(f"document.readyState === 'complete' && location.href === {json.dumps(url)}")
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page, or of its promise."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
+
+    def wait(self, condition: str) -> None:
+        """Until an expression in the page is true: 3D takes a while on a processor that other tests use as well."""
+        end = time.monotonic() + 2 * PATIENCE
+        while not self.run(condition):
+            assert time.monotonic() < end, f"{condition}: {self.run('document.body.innerText')[:500]}"
+            time.sleep(0.05)
+
+    def box(self, element: str) -> dict[str, float]:
+        """Where an element of the page is, pixels."""
+        box: dict[str, float] = self.run(f"JSON.parse(JSON.stringify({element}.getBoundingClientRect()))")
+        return box
+
+    def screenshot(self, x: float, y: float, width: float, height: float) -> np.ndarray:
+        """``[h,w,3]`` what a part of the page shows, in [0, 1]."""
+        clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png", clip=clip)["data"])
+        return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1], np.float32) / 255
 
     def press(self, key: str, *, shift: bool = False, release: bool = True) -> None:
         code = f"Key{key.upper()}" if key.isalpha() and len(key) == 1 else key

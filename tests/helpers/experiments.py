@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
+from gsmerge.kernels import elementary
 from gsmerge.research.charts.measure_run import RunRecord, describe
 
 SCENES = ("apples", "fern", "fox")
 LEVELS = {"apples": 2.0, "fern": 0.0, "fox": -3.0}  # how hard a scene is, dB
 GAINS = {"gsmerge": 24.0, "voxel": 17.0, "random": 12.0, "input": 18.0}
+LN2 = elementary.log(2)
 TIMES = {"gsmerge": 6.0, "voxel": 0.6, "random": 0.1, "input": 0.0}
 
 
@@ -20,8 +21,13 @@ def make_record(scene: str, method: str, settings: dict[str, Any] | None = None,
     views_asked = changes.pop("views_asked", None)
     views = views_asked or 12
     wobble = 0.01 * (SCENES.index(scene) if scene in SCENES else 0)
-    quality = GAINS[method] + LEVELS.get(scene, 0.0) + 0.5 * math.log2(ratio / 0.044) * (method != "input") + wobble
-    quality -= 3 * (settings.get("fit") == "none") + 0.5 * math.log2(12 / views)
+    quality = (
+        GAINS[method]
+        + LEVELS.get(scene, 0.0)
+        + 0.5 * elementary.log(ratio / 0.044) / LN2 * (method != "input")
+        + wobble
+    )
+    quality -= 3 * (settings.get("fit") == "none") + 0.5 * elementary.log(12 / views) / LN2
     seconds = TIMES[method] * (ratio / 0.044) ** 0.2
     label = describe(method, settings, views_asked)
     values: dict[str, Any] = {

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from plyfile import PlyData, PlyElement
-from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms, wxyz_of
+from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
 
-from gsmerge.geometry import quat_to_rotmat
+from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels import elementary
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.pictures import blur
 from gsmerge.types import SH_C0, Scene
 
 
@@ -32,11 +34,11 @@ def smooth_scene(width: int, height: int, K: np.ndarray | None = None) -> Smooth
     for i in range(3):
         c2w[i, :3, :3] = rotation(0.02 * i + 0.1, 0.2 - 0.2 * i, 0.05 * i)
         c2w[i, :3, 3] = (0.6 * i - 0.6, 0.2 * i + 0.1, -0.2 * i - 1.5)
-        depth = 3 + 0.5 * np.sin(x / 9 + i) * np.cos(y / 7) + 1e-4 * rng.random((height, width))
+        depth = 3 + 0.5 * elementary.sin(x / 9 + i) * elementary.cos(y / 7) + 1e-4 * rng.random((height, width))
         u, v = (x + 0.5 + rng.uniform(-0.2, 0.2, x.shape), y + 0.5 + rng.uniform(-0.2, 0.2, x.shape))
         camera = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], -1)
-        world = camera.reshape(-1, 3) @ c2w[i, :3, :3].T + c2w[i, :3, 3]
-        colors = 0.5 + 0.4 * np.sin(2.5 * world + np.array([0, 1, 2]))
+        world = matmul(camera.reshape(-1, 3), c2w[i, :3, :3].T) + c2w[i, :3, 3]
+        colors = 0.5 + 0.4 * elementary.sin(2.5 * world + np.array([0, 1, 2]))
         means.append(world)
         depths.append(depth)
         images.append((colors * 255).round().astype(np.uint8).reshape(height, width, 3))
@@ -54,9 +56,9 @@ def with_intrinsics(tiny: Smooth, K: np.ndarray) -> Smooth:
     """The same pixels and depths, seen through another lens."""
     means = []
     for pose, points in zip(tiny.c2w, tiny.gaussians.means.astype(np.float64).reshape(3, -1, 3), strict=True):
-        camera = (points - pose[:3, 3]) @ pose[:3, :3]
-        rays = camera @ tiny.K.T @ np.linalg.inv(K).T
-        means.append(rays @ pose[:3, :3].T + pose[:3, 3])
+        camera = matmul((points - pose[:3, 3]), pose[:3, :3])
+        rays = matmul(matmul(camera, tiny.K.T), invert(K).T)
+        means.append(matmul(rays, pose[:3, :3].T) + pose[:3, 3])
     moved = np.concatenate(means).astype(np.float32)
     return replace(tiny, K=K, gaussians=replace(tiny.gaussians, means=moved))
 
@@ -77,10 +79,10 @@ def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, norm
              "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]  # fmt: skip
     names = [name for name in names if normals or name[0] != "n"]
     rows = np.zeros(len(g), [(name, normals if name[0] == "n" else "f4") for name in names])
-    columns: dict[str, Any] = {"opacity": np.log(g.opacities / (1 - g.opacities))}
+    columns: dict[str, Any] = {"opacity": elementary.log(g.opacities / (1 - g.opacities))}
     columns |= {name: g.means[:, i] for i, name in enumerate("xyz")}
     columns |= {f"f_dc_{i}": g.sh0[:, 0, i] for i in range(3)}
-    columns |= {f"scale_{i}": np.log(g.scales[:, i]) for i in range(3)}
+    columns |= {f"scale_{i}": elementary.log(g.scales[:, i]) for i in range(3)}
     columns |= {f"rot_{i}": g.quats[:, i] for i in range(4)}
     for name, values in columns.items():
         rows[name] = values
@@ -96,12 +98,12 @@ def turned(
 ) -> np.ndarray:
     """The rows in another world: ``scale * turn @ x + shift``."""
     out = rows.copy()
-    means = scale * np.stack([rows[c] for c in "xyz"], 1) @ turn.T + (0 if shift is None else shift)
+    means = matmul(scale * np.stack([rows[c] for c in "xyz"], 1), turn.T) + (0 if shift is None else shift)
     for i, name in enumerate("xyz"):
         out[name] = means[:, i]
-        out[f"scale_{i}"] = rows[f"scale_{i}"] + np.log(scale)
+        out[f"scale_{i}"] = rows[f"scale_{i}"] + elementary.log(scale)
     quats = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
-    moved = wxyz_of(turn @ quat_to_rotmat(quats).astype(np.float64))
+    moved = rotmat_to_quat(matmul(turn, quat_to_rotmat(quats).astype(np.float64)))
     for i in range(4):
         out[f"rot_{i}"] = moved[:, i]
     return out
@@ -112,16 +114,16 @@ def with_surface_rotations(tiny: Tiny, *, relative_to_camera: bool = False) -> T
     h, w = tiny.height, tiny.width
     grid = tiny.gaussians.means.astype(np.float64).reshape(-1, h, w, 3)
     across, down = np.gradient(grid, axis=2), np.gradient(grid, axis=1)
-    across = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in across])
-    down = np.stack([cv2.GaussianBlur(a, (0, 0), 2.0) for a in down])
+    across = np.stack([blur(a, 2.0) for a in across])
+    down = np.stack([blur(a, 2.0) for a in down])
     normal = np.cross(across, down)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     first = across - (across * normal).sum(-1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     frames = np.stack([first, np.cross(normal, first), normal], -1)
     if relative_to_camera:
-        frames = tiny.c2w[:, None, None, :3, :3].swapaxes(-1, -2) @ frames
-    quats = wxyz_of(frames.reshape(-1, 3, 3)).astype(np.float32)
+        frames = matmul(tiny.c2w[:, None, None, :3, :3].swapaxes(-1, -2), frames)
+    quats = rotmat_to_quat(frames.reshape(-1, 3, 3)).astype(np.float32)
     scales = np.tile(np.array([0.04, 0.03, 0.005], np.float32), (len(quats), 1))
     return replace(tiny, gaussians=replace(tiny.gaussians, quats=quats, scales=scales))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge import Gaussians
+from gsmerge.kernels import elementary
 
 
 def random_gaussians(
@@ -17,7 +18,7 @@ def random_gaussians(
     columns = (
         means,
         rng.normal(size=(n, 4)),
-        np.exp(rng.normal(size=(n, 3)) * jitter + size),
+        elementary.exp(rng.normal(size=(n, 3)) * jitter + size),
         rng.random(n) ** opacity,
         rng.normal(size=(n, 1, 3)),
         rng.normal(size=(n, (degree + 1) ** 2 - 1, 3)) * 0.2,

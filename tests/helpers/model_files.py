@@ -37,6 +37,7 @@ from plyfile import PlyData
 from sharp_files import write_elements
 from tiny_scene import rotation, save_json, write_colmap_binary, write_images, write_inria, write_npz
 
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians
 
 
@@ -67,7 +68,7 @@ def write_points_glb(path: Path) -> None:
 
 def depth_anything(formats: str, folder: Path, *, photos: int = 2) -> Export:
     """Write what the formats of ``export_format`` name, joined by ``-``; the photos are larger than the model's."""
-    scene = made(96, 72)
+    scene = made(48, 36)
     keep = np.stack([depth_map_mask(depth) for depth in scene.depths])
     nested = "npz" in formats  # whose cameras and depths are in another unit
     saver = Saver("gs_ply/0000.ply", frame="scaled" if nested else "same")
@@ -92,9 +93,9 @@ def depth_anything(formats: str, folder: Path, *, photos: int = 2) -> Export:
 
 def lyra(folder: Path) -> Export:
     """Write Lyra 2's: Depth Anything 3's rows but for a border, of half the photos' size; cameras of its own."""
-    scene = made(112, 80)
-    keep = np.zeros((3, 80, 112), bool)
-    keep[:, 2:-2, 3:-3] = True
+    scene = made(64, 48)
+    keep = np.zeros((3, 48, 64), bool)
+    keep[:, 1:-1, 2:-2] = True
     export = save_pixels(Saver("reconstructed_scene.ply"), scene, folder, keep)
     larger = as_photos(scene, 2)
     video = {"w2c_render": np.tile(np.eye(4), (9, 1, 1)), "intrinsics_render": np.tile(np.eye(3), (9, 1, 1))}
@@ -109,7 +110,7 @@ def lyra(folder: Path) -> Export:
 def depth_splat(folder: Path, *, cameras: bool = True, photos: bool = True) -> Export:
     """Write DepthSplat's: Gaussians and photos of a scene in folders by kind."""
     saver = Saver("gaussians/room.ply", "view-fastest", 8, frame="first")
-    scene = replace(made(), names=tuple(f"input_{name}" for name in NAMES))
+    scene = replace(made(64, 48), names=tuple(f"input_{name}" for name in NAMES))
     export = save_pixels(saver, scene, folder)
     if photos:
         write_images(folder / "images/room/color", scene)
@@ -133,8 +134,8 @@ def free_splat(folder: Path) -> Export:
     g = scene.gaussians[:size]
     for view in range(1, 3):
         w2c, more = scene.w2c[view], scene.gaussians[view * size : (view + 1) * size]
-        camera = g.means @ w2c[:3, :3].T + w2c[:3, 3]
-        x, y = np.floor((camera @ scene.K.T)[:, :2] / camera[:, 2:]).astype(int).T
+        camera = matmul(g.means, w2c[:3, :3].T) + w2c[:3, 3]
+        x, y = np.floor(matmul(camera, scene.K.T)[:, :2] / camera[:, 2:]).astype(int).T
         inside = (camera[:, 2] > 0) & (x >= 0) & (x < scene.width) & (y >= 0) & (y < scene.height)
         pixel = np.where(inside, y * scene.width + x, 0)
         near = np.abs(camera[:, 2] - scene.depths[view].reshape(-1)[pixel]) < 0.05 * camera[:, 2]
@@ -159,11 +160,11 @@ def long_lrm(folder: Path, *, order: str = "view-major") -> Export:
     mean = np.eye(4)
     forward, down = scene.c2w[:, :3, 2].mean(0), scene.c2w[:, :3, 1].mean(0)
     mean[:3, 2] = forward / np.linalg.norm(forward)
-    down -= (down @ mean[:3, 2]) * mean[:3, 2]
+    down -= matmul(down, mean[:3, 2]) * mean[:3, 2]
     mean[:3, 1] = down / np.linalg.norm(down)
     mean[:3, 0], mean[:3, 3] = np.cross(mean[:3, 1], mean[:3, 2]), scene.c2w[:, :3, 3].mean(0)
-    move = np.linalg.inv(mean)
-    scale = 1 / np.abs((move @ scene.c2w)[:, :3, 3]).max()
+    move = invert(mean)
+    scale = 1 / np.abs(matmul(move, scene.c2w)[:, :3, 3]).max()
     saver = Saver("gaussians_001.ply", order, rest=45, normals="u1")
     if order == "opacity":  # the most opaque, and some of the others
         saver = replace(saver, least=float(np.quantile(scene.gaussians.opacities, 0.6)))
@@ -184,7 +185,7 @@ def long_lrm(folder: Path, *, order: str = "view-major") -> Export:
 
 def vica_splat(folder: Path) -> Export:
     """Write VicaSplat's: sorted, degree 4, poses without intrinsics as a list."""
-    scene = replace(with_faint(made(64, 64)), names=("0.png", "1.png", "2.png"))
+    scene = replace(with_faint(made(40, 40)), names=("0.png", "1.png", "2.png"))
     export = save_pixels(Saver("gaussians.ply", "opacity", frame="camera", rest=72, least=0.005), scene, folder)
     write_images(folder / "context", scene)
     poses = export.world.move(scene.c2w)
@@ -206,7 +207,7 @@ def re_splat(folder: Path) -> Export:
 
 def vol_splat(folder: Path, *, cameras: bool) -> Export:
     """Write VolSplat's: voxels, padded to the number of pixels, trimmed as if they were a grid, as DepthSplat's."""
-    scene = replace(made(), names=tuple(f"input_{name}" for name in NAMES))
+    scene = replace(made(56, 40), names=tuple(f"input_{name}" for name in NAMES))
     pixels = np.arange(3 * scene.height * scene.width).reshape(3, scene.height, scene.width)
     voxels = merge_voxels(scene, 0.06)
     padding = voxels[np.zeros(max(0, pixels.size - len(voxels)), int)]
@@ -244,14 +245,14 @@ def ffgs(folder: Path) -> Export:
 
 def world_mirror(version: int, folder: Path) -> Export:
     """Write WorldMirror's: voxels with cameras; the first version's ``images`` are squeezed where it cropped."""
-    scene = replace(made(), names=tuple(f"image_{i:04d}.png" for i in (1, 2, 3)))
+    scene = replace(made(40, 30), names=tuple(f"image_{i:04d}.png" for i in (1, 2, 3)))
     saver = Saver("gaussians.ply", raw=True)
     place = folder if version == 1 else folder / "room/20261120_101500"
     export = save_unordered(saver, scene, merge_voxels(scene, 0.06), place)
     if version == 2:
         write_world_mirror(place / "camera_params.json", scene)
         return replace(export, path=place, options=data_set(folder, as_photos(scene, 2), "images"))
-    squeezed = np.stack([cv2.resize(image, (48, 36)) for image in as_photos(scene, 1, border=10).images])
+    squeezed = np.stack([cv2.resize(image, (40, 30)) for image in as_photos(scene, 1, border=10).images])
     write_images(folder / "images", replace(scene, images=squeezed))
     write_images(folder / "images_resized", scene)
     write_colmap_binary(folder / "sparse/0", scene)
@@ -306,7 +307,7 @@ def splatter_image(folder: Path) -> Export:
     saver = Saver("mesh.ply", rest=9, least=0.08)
     pixels = pixel_rows(saver, scene).pixels
     assert pixels is not None
-    world = World(rotation(0, 0, np.pi / 2) @ rotation(-np.pi / 2, 0, 0))
+    world = World(matmul(rotation(0, 0, np.pi / 2), rotation(-np.pi / 2, 0, 0)))
     export = save(finish_rows(saver, scene, pixels, world, scene), folder)
     return replace(export, path=folder / "mesh.ply", options=data_set(folder, scene, "cameras", "images"))
 

@@ -12,11 +12,15 @@ from exports import Smooth, export_rows, save_export, smooth_scene, turned, with
 from tiny_scene import save_json, write_images, write_transforms
 
 from gsmerge.geometry import multiply_quats, normalize, rotmat_to_quat
+from gsmerge.kernels import elementary
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians, Scene
 
 HALF = np.sqrt(0.5)
 # pixelSplat's: the first camera's z becomes up, and all is turned by -45 degrees about it
-UPRIGHT = np.array([[HALF, HALF, 0], [-HALF, HALF, 0], [0, 0, 1]]) @ np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+UPRIGHT = matmul(
+    np.array([[HALF, HALF, 0], [-HALF, HALF, 0], [0, 0, 1]]), np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+)
 NAMES = tuple(f"{i:06d}.png" for i in (4, 17, 30))
 
 
@@ -31,8 +35,8 @@ class World:
     def move(self, c2w: np.ndarray) -> np.ndarray:
         """Return the poses in it."""
         out = c2w.copy()
-        out[:, :3, :3] = self.turn @ c2w[:, :3, :3]
-        out[:, :3, 3] = self.scale * c2w[:, :3, 3] @ self.turn.T + self.shift
+        out[:, :3, :3] = matmul(self.turn, c2w[:, :3, :3])
+        out[:, :3, 3] = matmul(self.scale * c2w[:, :3, 3], self.turn.T) + self.shift
         return out
 
 
@@ -147,11 +151,11 @@ def world_of(frame: str, scene: Smooth, means: np.ndarray) -> World:
     if frame in ("first", "middle"):
         return World(turn)
     if frame == "camera":
-        return World(turn, shift=-turn @ pose[:3, 3])
+        return World(turn, shift=matmul(-turn, pose[:3, 3]))
     if frame == "upright":
         median = np.median(means, 0)
         scale = 1 / np.quantile(np.abs(means - median), 0.95, axis=0).max()
-        return World(UPRIGHT @ turn, scale, -scale * UPRIGHT @ turn @ median)
+        return World(matmul(UPRIGHT, turn), scale, matmul(matmul(-scale * UPRIGHT, turn), median))
     if frame == "scaled":
         return World(scale=1 / 1.7)
     return World()
@@ -181,7 +185,7 @@ def finish_rows(saver: Saver, layered: Smooth, pixels: np.ndarray, world: World,
     true = stored = np.stack([rows[f"rot_{i}"] for i in range(4)], 1)
     if saver.quats == "camera":  # that of the view, turned with the world as if it were one to the world
         size = scene.width * scene.height * saver.layers
-        turns = rotmat_to_quat(world.turn @ scene.w2c[:, :3, :3] @ world.turn.T)[pixels // size]
+        turns = rotmat_to_quat(matmul(matmul(world.turn, scene.w2c[:, :3, :3]), world.turn.T))[pixels // size]
         stored = multiply_quats(turns, true)
     elif saver.quats == "xyzw-root":
         stored = multiply_quats(true, true)[:, [1, 2, 3, 0]]
@@ -235,8 +239,8 @@ def check_cameras(scene: Scene, export: Export) -> None:
     poses = export.world.move(export.scene.c2w)
     layers = len(scene) // len(poses)
     assert layers * len(poses) == len(scene)
-    turns = scene.cameras.viewmats[::layers, :3, :3] @ poses[:, :3, :3]
-    assert np.degrees(np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 0.5
+    turns = matmul(scene.cameras.viewmats[::layers, :3, :3], poses[:, :3, :3])
+    assert np.degrees(elementary.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))).max() < 0.5
     middle = np.median(np.stack([export.rows[name] for name in "xyz"], 1), 0)
     size = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
     assert np.abs(scene.cameras.centres[::layers] - poses[:, :3, 3]).max() < 0.01 * size

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsmerge import Scene
 from gsmerge.geometry import motion_matrices, move_views
+from gsmerge.kernels.matrices import matmul
 
 
 def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:
@@ -18,5 +19,5 @@ def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:
 def disagreeing(scene: Scene, degrees: float = 0.8, shift: float = 0.01, views: slice = slice(None)) -> Scene:
     """The scene with some views moved, each camera with its Gaussians."""
     viewmats = scene.cameras.viewmats.astype(np.float64)
-    viewmats[views] = (random_motions(len(scene), degrees, shift) @ viewmats)[views]
+    viewmats[views] = matmul(random_motions(len(scene), degrees, shift), viewmats)[views]
     return move_views(scene, viewmats)

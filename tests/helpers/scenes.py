@@ -21,7 +21,9 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.facts.views import subset
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit
-from gsmerge.geometry import covariances, normalize, quat_to_rotmat
+from gsmerge.geometry import covariances, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.kernels import elementary
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
@@ -49,7 +51,7 @@ def waves(seed: int = 0, rate: float = 6.0) -> Texture:
     turns, phases = rng.normal(size=(3, 4, 3)) * rate, rng.uniform(0, 6.28, (3, 4))
 
     def texture(points: np.ndarray) -> np.ndarray:
-        swings = np.sin(np.einsum("ckd,nd->nck", turns, points) + phases).sum(-1)
+        swings = elementary.sin(matmul(points, turns.reshape(-1, 3).T).reshape(-1, 3, 4) + phases).sum(-1)
         return 0.5 + 0.11 * swings
 
     return texture
@@ -105,7 +107,7 @@ def arc(num_views: int, width: int = 48, height: int = 36, *, span: float = 0.8,
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     """World to camera, OpenCV axes, y down."""
-    return np.linalg.inv(camera_to_world(eye, target))
+    return invert(camera_to_world(eye, target))
 
 
 def intrinsics(num_views: int, width: int, height: int) -> np.ndarray:
@@ -121,7 +123,7 @@ def views_of(
     assert np.allclose(cameras.Ks, lens.intrinsics)
     packed, actual = shapes.pack([surface.shape for surface in surfaces]), []
     for viewmat in cameras.viewmats.astype(np.float64):
-        c2w = np.linalg.inv(viewmat)
+        c2w = invert(viewmat)
         hits = photograph.trace(packed, c2w, lens, 1)
         assert (hits.ids >= 0).all(), "every ray must meet a surface"
         places = world_points(hits.depth, c2w, lens)
@@ -134,8 +136,8 @@ def views_of(
 def world_points(depth: np.ndarray, c2w: np.ndarray, lens: photograph.Pinhole) -> np.ndarray:
     """World positions ``[h,w,3]`` of pixels' centres at depths ``[h,w]``."""
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(lens.intrinsics).T  # of unit depth
-    return c2w[:3, 3] + depth[..., None] * rays @ c2w[:3, :3].T
+    rays = matmul(np.stack([x, y, np.ones_like(x)], -1), invert(lens.intrinsics).T)  # of unit depth
+    return c2w[:3, 3] + matmul(depth[..., None] * rays, c2w[:3, :3].T)
 
 
 def trace(surfaces: Sequence[Surface], cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -200,10 +202,10 @@ def take_views(scene: Scene, order: Sequence[int]) -> Scene:
 
 def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Gaussians:
     """Gaussians after x -> factor · rotation x + shift, in float64; higher harmonics must be zero."""
-    turns = rotation @ quat_to_rotmat(gaussians.quats.astype(np.float64))
+    turns = matmul(rotation, quat_to_rotmat(gaussians.quats.astype(np.float64)))
     return replace(
         gaussians,
-        means=factor * (gaussians.means.astype(np.float64) @ rotation.T) + shift,
+        means=factor * matmul(gaussians.means.astype(np.float64), rotation.T) + shift,
         quats=rotmat_to_quat(turns).astype(np.float32),
         scales=gaussians.scales * float(factor),
     )
@@ -212,23 +214,10 @@ def move_gaussians(gaussians: Gaussians, rotation: np.ndarray, factor: float, sh
 def move(scene: Scene, rotation: np.ndarray, factor: float, shift: np.ndarray) -> Scene:
     """The scene with its cameras after the same."""
     viewmats = scene.cameras.viewmats.copy()
-    viewmats[:, :3, :3] = viewmats[:, :3, :3] @ rotation.T
-    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ shift
+    viewmats[:, :3, :3] = matmul(viewmats[:, :3, :3], rotation.T)
+    viewmats[:, :3, 3] = factor * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], shift)
     gaussians = move_gaussians(scene.gaussians, rotation, factor, shift)
     return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
-
-
-def rotmat_to_quat(rotmats: np.ndarray) -> np.ndarray:
-    """``[...,4]`` wxyz of rotations ``[...,3,3]``, through the eigenvector of the largest eigenvalue (Bar-Itzhack)."""
-    r = rotmats
-    k = np.zeros((*r.shape[:-2], 4, 4), r.dtype)
-    k[..., 0, 0] = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    for i, j, m in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        k[..., 0, i + 1] = k[..., i + 1, 0] = r[..., m, j] - r[..., j, m]
-        k[..., i + 1, i + 1] = r[..., i, i] - r[..., j, j] - r[..., m, m]
-        k[..., i + 1, j + 1] = k[..., j + 1, i + 1] = r[..., i, j] + r[..., j, i]
-    quats = np.linalg.eigh(k).eigenvectors[..., -1]
-    return np.where(quats[..., :1] < 0, -quats, quats)
 
 
 def random_rotation(seed: int) -> np.ndarray:
@@ -254,7 +243,7 @@ def spoil(gaussians: Gaussians, size: float = 1.0, seed: int = 0) -> Gaussians:
         gaussians,
         means=gaussians.means + unit * noise(gaussians.means, 0.3),
         quats=normalize(gaussians.quats + noise(gaussians.quats, 0.1)),
-        scales=gaussians.scales * np.exp(noise(gaussians.scales, 0.3)),
+        scales=gaussians.scales * elementary.exp(noise(gaussians.scales, 0.3)),
         opacities=(gaussians.opacities + noise(gaussians.opacities, 0.1)).clip(0.1, 0.95),
         sh0=gaussians.sh0 + noise(gaussians.sh0, 0.1) / SH_C0,
     )
@@ -295,7 +284,7 @@ def psnr_of(gaussians: Gaussians, scene: Scene) -> float:
     """PSNR (dB) over all views of a scene with photos."""
     assert scene.images is not None
     image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
-    return float(-10 * np.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
+    return float(-10 * elementary.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
 
 
 def compacted(scene: Scene, **settings: Any) -> CompactResult:
@@ -309,8 +298,9 @@ def compacted(scene: Scene, **settings: Any) -> CompactResult:
 
 
 def plain(scene: Scene, **settings: Any) -> Gaussians:
-    """The merge alone: no networks, no fit."""
-    return compacted(scene, **{"fit": "none", "checkpoint": "none", **settings}).gaussians
+    """The merge alone: no networks, no fit, cameras as they are."""
+    alone = {"fit": "none", "checkpoint": "none", "poses": "fixed"}
+    return compacted(scene, **{**alone, **settings}).gaussians
 
 
 def identical(a: Gaussians, b: Gaussians) -> bool:
@@ -388,7 +378,7 @@ def make_features(
         covars=scales[:, :, None] ** 2 * np.eye(3, dtype=np.float32),
         weights=opacity,
         masses=opacity * scales.prod(1) * (2 * math.pi) ** 1.5,
-        extinctions=-np.log1p(-opacity) * np.sort(scales, 1)[:, 1:].prod(1),
+        extinctions=-elementary.log1p(-opacity) * np.sort(scales, 1)[:, 1:].prod(1),
         gains=np.ones(g, np.float32),
         sh0=(full(colors, g, 3)[:, None] - 0.5) / SH_C0,
         shN=np.zeros((g, (degree + 1) ** 2 - 1, 3), np.float32),

@@ -10,6 +10,8 @@ import numpy as np
 import skimage.data
 import sklearn.datasets
 
+from gsmerge.kernels import elementary
+
 SIDE = 476  # longer side of the photos, pixels; densities are superpixels per SIDE x SIDE pixels
 DENSITIES = (5_000, 12_000, 23_000)
 
@@ -38,7 +40,7 @@ def _means(values: np.ndarray, labels: np.ndarray, sizes: np.ndarray) -> np.ndar
 
 
 def _psnr(image: np.ndarray, other: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean((image - other) ** 2)))
+    return float(-10 * elementary.log10(np.mean((image - other) ** 2)))
 
 
 def proxy_psnr(image: np.ndarray, labels: np.ndarray) -> float:
@@ -77,7 +79,7 @@ def splat_psnr(image: np.ndarray, labels: np.ndarray) -> float:
         bottom, right = int(mean_y[k] + reach_y[k]) + 1, int(mean_x[k] + reach_x[k]) + 1
         v, u = np.ogrid[top : min(bottom, height), left : min(right, width)]
         v, u = v - mean_y[k], u - mean_x[k]
-        weight = np.exp(-0.5 * (xx[k] * v * v - 2 * xy[k] * u * v + yy[k] * u * u) / det[k])[..., None]
+        weight = elementary.exp(-0.5 * (xx[k] * v * v - 2 * xy[k] * u * v + yy[k] * u * u) / det[k])[..., None]
         picture[top:bottom, left:right] += weight * means[k]
         weights[top:bottom, left:right] += weight
     return _psnr(colours, picture / weights)

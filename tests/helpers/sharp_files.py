@@ -12,6 +12,8 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge import Scene
 from gsmerge.geometry import multiply_quats, rotmat_to_quat
+from gsmerge.kernels import elementary
+from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians, grid_ids
 
 COLUMNS = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3)),
@@ -26,7 +28,7 @@ def split_views(scene: Scene, scales: Sequence[float]) -> list[Scene]:
         turn, shift = viewmat[:3, :3], viewmat[:3, 3]
         own = replace(
             g,
-            means=(scale * (g.means @ turn.T + shift)).astype(np.float32),
+            means=(scale * (matmul(g.means, turn.T) + shift)).astype(np.float32),
             quats=multiply_quats(rotmat_to_quat(turn[None])[0], g.quats).astype(np.float32),
             scales=(scale * g.scales).astype(np.float32),
         )
@@ -42,7 +44,13 @@ def write_sharp(path: Path, view: Scene, photo_size: tuple[int, int], photo: Pat
     front = view.gaussians[(np.arange(side)[:, None] * width + columns).reshape(-1)]
     back = replace(front, means=1.1 * front.means, opacities=np.full(len(front), 0.1, np.float32))
     g = Gaussians.concat([front, back])
-    values = [g.means, g.sh0[:, 0], np.log(g.opacities / (1 - g.opacities))[:, None], np.log(g.scales), g.quats]
+    values = [
+        g.means,
+        g.sh0[:, 0],
+        elementary.log(g.opacities / (1 - g.opacities))[:, None],
+        elementary.log(g.scales),
+        g.quats,
+    ]
     rows = np.zeros(len(g), [(name, "f4") for name in COLUMNS])
     for name, column in zip(COLUMNS, np.concatenate(values, 1).T, strict=True):
         rows[name] = column

@@ -16,6 +16,7 @@ from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.geometry import normalize
 from gsmerge.io import read_gaussians
+from gsmerge.kernels import elementary
 from gsmerge.types import SH_C0
 
 
@@ -60,7 +61,7 @@ def read_spz(path: Path) -> Gaussians:
     means = [[int.from_bytes(r[i : i + 3], "little", signed=True) / 2**fraction for i in (0, 3, 6)] for r in take(9)]
     opacities = [r[0] / 255 for r in take(1)]
     colors = [[0.5 + SH_C0 * (v / 255 - 0.5) / 0.15 for v in r] for r in take(3)]
-    scales = [[np.exp(v / 16 - 10) for v in r] for r in take(3)]
+    scales = [[elementary.exp(v / 16 - 10) for v in r] for r in take(3)]
     quats = []
     for row in take(4):
         word = int.from_bytes(row, "little")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,8 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.geometry import normalize
+from gsmerge.geometry import normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import CameraFile, write_ply
+from gsmerge.kernels import elementary
+from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -34,7 +37,7 @@ class Tiny:
 
     @property
     def w2c(self) -> np.ndarray:
-        return np.linalg.inv(self.c2w)
+        return invert(self.c2w)
 
     def save(self, folder: Path, *, cameras: bool = True, images: bool = True) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
@@ -47,8 +50,10 @@ class Tiny:
 
 
 def rotation(x: float, y: float, z: float) -> np.ndarray:
-    matrix, _ = cv2.Rodrigues(np.array([x, y, z], np.float64))
-    return matrix
+    """``[3,3]`` of a rotation vector, radians."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    half = elementary.sin(angle / 2) / angle if angle else 0.0
+    return quat_to_rotmat(np.array([elementary.cos(angle / 2), half * x, half * y, half * z]))
 
 
 def make_tiny(width: int = 20, height: int = 14) -> Tiny:
@@ -61,10 +66,10 @@ def make_tiny(width: int = 20, height: int = 14) -> Tiny:
     y, x = np.mgrid[:height, :width]
     means = []
     for pose in c2w:
-        depth = 2 + 0.5 * np.sin(x / 3) + 0.3 * rng.random((height, width))
+        depth = 2 + 0.5 * elementary.sin(x / 3) + 0.3 * rng.random((height, width))
         u, v = (x + 0.5 + rng.uniform(-0.2, 0.2, x.shape), y + 0.5 + rng.uniform(-0.2, 0.2, x.shape))
         camera = np.stack([(u - K[0, 2]) / K[0, 0] * depth, (v - K[1, 2]) / K[1, 1] * depth, depth], -1)
-        means.append(camera.reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3])
+        means.append(matmul(camera.reshape(-1, 3), pose[:3, :3].T) + pose[:3, 3])
     n = 3 * width * height
     images = rng.integers(0, 256, (3, height, width, 3), np.uint8)
     quats = normalize(rng.normal(size=(n, 4)).astype(np.float32))
@@ -87,7 +92,7 @@ def write_images(folder: Path, tiny: Tiny) -> None:
 
 
 def frames_of(tiny: Tiny) -> dict:
-    matrices = (tiny.c2w @ FLIP).tolist()
+    matrices = matmul(tiny.c2w, FLIP).tolist()
     frames = [{"file_path": f"images/{n}", "transform_matrix": m} for n, m in zip(tiny.names, matrices, strict=True)]
     K = tiny.K
     sizes = {"w": tiny.width, "h": tiny.height}
@@ -98,17 +103,6 @@ def write_transforms(path: Path, tiny: Tiny) -> None:
     path.write_text(json.dumps(frames_of(tiny)))
 
 
-def wxyz_of(matrices: np.ndarray) -> np.ndarray:
-    """``[n,3,3]`` rotations -> ``[n,4]``, one after the other."""
-    quats = []
-    for matrix in matrices:
-        vector = cv2.Rodrigues(np.ascontiguousarray(matrix))[0][:, 0]
-        angle = float(np.linalg.norm(vector))
-        axis = vector / angle if angle > 1e-12 else np.zeros(3)
-        quats.append([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
-    return np.array(quats)
-
-
 def write_colmap_text(folder: Path, tiny: Tiny, model: str = "PINHOLE", extra: str = "") -> None:
     folder.mkdir(parents=True, exist_ok=True)
     K = tiny.K
@@ -116,7 +110,7 @@ def write_colmap_text(folder: Path, tiny: Tiny, model: str = "PINHOLE", extra: s
     (folder / "cameras.txt").write_text(f"# comment\n7 {model} {tiny.width} {tiny.height} {params}{extra}\n")
     lines = ["# Image list with two lines of data per image:", ""]
     for i, (name, pose) in enumerate(zip(tiny.names, tiny.w2c, strict=True)):
-        numbers = " ".join(repr(float(v)) for v in (*wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3]))
+        numbers = " ".join(repr(float(v)) for v in (*rotmat_to_quat(pose[None, :3, :3])[0], *pose[:3, 3]))
         lines += [f"{i + 4} {numbers} 7 {name}", "" if i == 0 else "10.5 3.5 -1 4.0 4.0 12 " * 3]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     (folder / "points3D.txt").write_text("")
@@ -130,7 +124,7 @@ def write_colmap_binary(folder: Path, tiny: Tiny, model: int = 1, extra: tuple[f
     (folder / "cameras.bin").write_bytes(head + struct.pack(f"<{len(params)}d", *params))
     data = struct.pack("<Q", len(tiny.names))
     for i, (name, pose) in enumerate(zip(tiny.names, tiny.w2c, strict=True)):
-        data += struct.pack("<i7di", i + 4, *wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3], 7)
+        data += struct.pack("<i7di", i + 4, *rotmat_to_quat(pose[None, :3, :3])[0], *pose[:3, 3], 7)
         data += name.encode() + b"\0" + struct.pack("<Q", i) + struct.pack("<ddq", 1.0, 2.0, -1) * i
     (folder / "images.bin").write_bytes(data)
     (folder / "rigs.bin").write_bytes(b"rigs")

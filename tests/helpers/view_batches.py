@@ -11,6 +11,7 @@ import scenes
 
 from gsmerge import Compactor, Scene
 from gsmerge.fit import FitOptions
+from gsmerge.kernels import elementary
 from gsmerge.stages.merge import take
 from gsmerge.states.decode import decode_state
 from gsmerge.states.state import DividedGroups, GroupSet, Learned, State
@@ -154,12 +155,12 @@ def random_gaussians(count: int, seed: int, *, size: tuple[float, float] = (0.01
     """Gaussians of any shape, turned at random, before and beside the cameras of :func:`scenes.arc`."""
     rng = np.random.default_rng(seed)
     turns = rng.normal(size=(count, 4))
-    low, high = np.log(size)
+    low, high = elementary.log(size)
 
     columns = (
         rng.uniform([-4, -4, -2], [4, 4, 6], (count, 3)),
         turns / np.linalg.norm(turns, axis=1, keepdims=True),
-        np.exp(rng.uniform(low, high, (count, 3))),
+        elementary.exp(rng.uniform(low, high, (count, 3))),
         rng.uniform(0.05, 0.99, count),
         rng.uniform(-1, 1, (count, 1, 3)) / SH_C0 / 2,
         rng.normal(size=(count, (degree + 1) ** 2 - 1, 3)) / 9,

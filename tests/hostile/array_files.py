@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.kernels.matrices import invert
+
 from .case import (
     EITHER,
     HEIGHT,
@@ -52,7 +54,7 @@ def arrays_of(folder: Path, kind: str) -> Arrays:
     if kind == "views.npz":
         return {"c2w": c2w, "K": Ks, "images": images}
     return {
-        "extrinsics": np.linalg.inv(c2w)[:, :3],
+        "extrinsics": invert(c2w)[:, :3],
         "intrinsics": Ks,
         "image": images,
         "depth": np.ones((VIEWS, HEIGHT, WIDTH), np.float32),

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tiny_scene import wxyz_of
+
+from gsmerge.geometry import rotmat_to_quat
+from gsmerge.kernels.matrices import invert
 
 from .camera_files import set_first
 from .case import EITHER, HEIGHT, READ, REFUSED, WIDTH, Case, Spoil, names, sparse, without_transforms
@@ -49,7 +51,7 @@ def world_mirror(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
 
 def long_lrm(c2w: np.ndarray, K: np.ndarray) -> dict[str, Any]:
     common = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": WIDTH, "h": HEIGHT}
-    w2c = np.linalg.inv(c2w)
+    w2c = invert(c2w)
     frames = [{"file_path": name, "w2c": pose.tolist(), **common} for name, pose in zip(names(), w2c, strict=True)]
     return {"frames": frames}
 
@@ -101,7 +103,7 @@ def many_numbers(folder: Path) -> None:
 def colmap(c2w: np.ndarray, K: np.ndarray, *, text: bool) -> tuple[bytes, bytes]:
     """The two files of a model, as text or binary."""
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-    poses = [np.array([*wxyz_of(pose[None, :3, :3])[0], *pose[:3, 3]]) for pose in np.linalg.inv(c2w)]
+    poses = [np.array([*rotmat_to_quat(pose[None, :3, :3])[0], *pose[:3, 3]]) for pose in invert(c2w)]
     if text:
         lines = [
             f"{i} {' '.join(map(repr, pose.tolist()))} 1 {name}.png\n\n"

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.kernels.matrices import matmul
+
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEWS, WIDTH, HEIGHT = 3, 24, 16
 
@@ -41,7 +43,7 @@ READ, USAGE, REFUSED, EITHER = (0,), (2,), (3,), (0, 3)
 def cameras_of(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world poses ``[v,4,4]`` with OpenCV axes and intrinsics ``[3,3]`` of the unspoiled scene."""
     data = json.loads((folder / "transforms.json").read_text())
-    c2w = np.array([frame["transform_matrix"] for frame in data["frames"]]) @ FLIP
+    c2w = matmul(np.array([frame["transform_matrix"] for frame in data["frames"]]), FLIP)
     K = np.array([[data["fl_x"], 0, data["cx"]], [0, data["fl_y"], data["cy"]], [0, 0, 1.0]])
     return c2w, K
 

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 import torch
 
+from gsmerge.kernels.matrices import invert
+
 from .array_files import MARKER, Payload
 from .case import EITHER, HEIGHT, READ, VIEWS, WIDTH, Case, Spoil, names, sparse, without_transforms
 
@@ -30,7 +32,7 @@ def entry_of(folder: Path) -> dict[str, Any]:
     """The scene as a chunk has it."""
     c2w, K = without_transforms(folder)
     head = [K[0, 0] / WIDTH, K[1, 1] / HEIGHT, K[0, 2] / WIDTH, K[1, 2] / HEIGHT, 0, 0]
-    rows = np.concatenate([np.tile(head, (VIEWS, 1)), np.linalg.inv(c2w)[:, :3].reshape(VIEWS, 12)], 1)
+    rows = np.concatenate([np.tile(head, (VIEWS, 1)), invert(c2w)[:, :3].reshape(VIEWS, 12)], 1)
     files = [cv2.imread(str(folder / "images" / f"{name}.png")) for name in names()]
     images = [torch.from_numpy(cv2.imencode(".jpg", image)[1].reshape(-1).copy()) for image in files]
     return {"key": "scene", "cameras": torch.from_numpy(rows).float(), "images": images}
@@ -175,26 +177,19 @@ def _shapes() -> dict[str, Case]:
     no_numbers, no_tensors, objects = "cameras of numbers", "images as tensors", "objects"
     cameras: dict[str, tuple[Any, str]] = {
         "17 columns": (zeros[:, :17].clone(), f"{shape} [3, 17]"),
-        "one row": (torch.zeros(18), f"{shape} [18]"),
-        "text": ("many", f"{shape} str"),
-        "a list": ([[0.0] * 18] * VIEWS, f"{shape} list"),
         "None": (None, ""),
         "no rows": (torch.zeros(0, 18), "10000 cameras, found 0"),
         "2^40 rows": (torch.zeros(1, 18).expand(2**40, 18), "10000 cameras"),
         "integers": (zeros.int(), no_numbers),
-        "bool": (zeros.bool(), no_numbers),
         "bfloat16": (zeros.bfloat16(), no_numbers),
-        "complex": (zeros.to(torch.complex64), no_numbers),
         "sparse": (zeros.to_sparse(), objects),
         "no values": (torch.empty(VIEWS, 18, device="meta"), objects),
         "NaN": (torch.full((VIEWS, 18), torch.nan), "finite"),
         "1e38": (torch.full((VIEWS, 18), 1e38), ""),
-        "rows that are one row": (torch.zeros(1, 18).expand(VIEWS, 18), "expanded"),
         "rows that overlap": (torch.zeros(99).as_strided((VIEWS, 18), (9, 1)), "overlapping"),
         "rows 2^40 apart": (tensor((VIEWS, 18), (2**40, 1)), "damaged"),
         "100,000 axes": (tensor((1,) * 100_000, (1,) * 100_000), objects),
         "fewer strides than axes": (tensor((VIEWS, 18), (18,)), objects),
-        "-1 rows": (tensor((-1, 18), (18, 1)), objects),
         "a shape of text": (tensor("ab", (18, 1)), objects),
         "a start before the storage": (tensor((VIEWS, 18), (18, 1), -1), objects),
         "more about it": (tensor((VIEWS, 18), (18, 1), 0, {"neg": True}), objects),
@@ -204,12 +199,10 @@ def _shapes() -> dict[str, Case]:
     }
     images: dict[str, tuple[Any, str]] = {
         "too few": ([byte], "found 1"),
-        "one text": ("abc", "found str"),
         "empty": ([byte[:0].clone()] * VIEWS, "decoded"),
         "2^40 bytes": ([byte.expand(2**40)] * VIEWS, no_tensors),
         "floats": ([torch.zeros(9)] * VIEWS, no_tensors),
         "no values": ([torch.empty(9, dtype=torch.uint8, device="meta")] * VIEWS, objects),
-        "numbers": ([1] * VIEWS, no_tensors),
         "zeros": ([byte.repeat(99)] * VIEWS, "decoded"),
     }
     lists: dict[str, Any] = {
@@ -267,10 +260,7 @@ def _structures() -> dict[str, Case]:
     """Structures that ask for more than they are, and archives that say what is not."""
     one_hash = {2**61 * i - i: None for i in range(1, 1000)}
     contents: dict[str, tuple[bytes, str]] = {
-        "6 GB by an instruction": (b"\x80\x05\x96" + struct.pack("<Q", 6 << 30) + b".", "instruction"),
-        "text of 4 GB": (b"\x80\x02X\xff\xff\xff\xff.", "end"),
         "tuples 60 deep as a key": (b"\x80\x02})" + b"2\x86" * 60 + b"K\x01s.", "instruction"),
-        "tuples 100,000 deep as a key": (b"\x80\x02})" + b"\x85" * 100_000 + b"Ns.", "keys"),
         "nested tuples as a key": (b"\x80\x02}" + NESTED + b"Ns.", "keys"),
         "nested tuples as a name": (b"\x80\x04" + NESTED + b"\x8c\1a\x93.", "str"),
         "nested tuples as a storage": (
@@ -278,13 +268,6 @@ def _structures() -> dict[str, Case]:
         ),
         "a list in itself": (b"\x80\x02]q\0h\0a.", "list"),
         "numbers of one hash as keys": (pickle.dumps(one_hash, 2), "keys"),
-        "a key of a dictionary twice": (b"\x80\x02}" + 2 * (b"X\x10\x27\0\0" + b"a" * 10_000 + b"Ns") + b".", "again"),
-        "a million lists": (b"\x80\x02" + b"]" * 10**6, "steps"),
-        "a million marks": (b"\x80\x02" + b"(" * 10**6, "steps"),
-        "a memo without an end": (b"\x80\x02]r\xff\xff\xff\xff.", "list"),
-        "more values than one": (b"\x80\x02NN.", "objects"),
-        "no value": (b"\x80\x02.", "objects"),
-        "marks without an end": (b"\x80\x02(N.", "objects"),
     }  # fmt: skip
     cases = {
         word: Case(with_pickle(lambda *_, c=content: c), says=(says,)) for word, (content, says) in contents.items()

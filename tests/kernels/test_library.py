@@ -140,9 +140,9 @@ def test_a_wheel_without_sources_is_not_asked_for_them(monkeypatch: pytest.Monke
     assert ctypes.c_char_p.in_dll(load_library(), "sources_hash").value == hash_sources().encode()
 
 
-def test_the_command_line_says_it_in_one_line(tmp_path: Path, made_scene: Path) -> None:
+def test_the_command_line_says_it_in_one_line(tmp_path: Path, small_scene: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "gsmerge", "compact", str(made_scene), "-o", str(tmp_path / "x.ply")],
+        [sys.executable, "-m", "gsmerge", "compact", str(small_scene), "-o", str(tmp_path / "x.ply")],
         capture_output=True, text=True, check=False, env={**os.environ, "GSMERGE_TARGET": "v5"},
     )  # fmt: skip
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -11,7 +11,6 @@ from scenes import make_features
 from skimage.measure import label as connected_parts
 
 from gsmerge.pooling import Members
-from gsmerge.runtime.threads import use_threads
 from gsmerge.stages.decode import split_counts
 from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
 from gsmerge.types import FeatureGaussians, Groups
@@ -56,27 +55,6 @@ def test_counts_are_exact_and_nest(seed: int, num_views: int, colours: int, low:
     assert is_union_of(coarse, fine)
     assert is_union_of(fine, tree.groups)
     assert (np.diff(tree.distortions) >= 0).all()
-
-
-@FEW
-@given(seeds, st.integers(1, 5))
-def test_more_than_there_is_leaves_the_superpixels(seed: int, colours: int) -> None:
-    tree = random_tree(seed, 2, colours)
-    groups = cut_tree(tree, len(tree) + 10)
-    assert groups.counts == tree.groups.counts
-    assert is_union_of(tree.groups, groups)
-
-
-@settings(max_examples=5, deadline=None, derandomize=True)
-@given(seeds)
-def test_threads_change_nothing(seed: int) -> None:
-    actual = []
-    for threads in (1, 3):
-        with use_threads(threads):
-            tree = random_tree(seed, 4, 3)
-            actual.append((tree.distortions, cut_tree(tree, (len(tree) + 4) // 2).labels))
-    np.testing.assert_array_equal(actual[0][0], actual[1][0])
-    assert np.array_equal(actual[0][1], actual[1][1])
 
 
 def random_groups(seed: int) -> tuple[FeatureGaussians, Members]:

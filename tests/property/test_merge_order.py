@@ -1,4 +1,4 @@
-"""Pooling and merging do not depend on order, place, orientation or unit."""
+"""Merging does not depend on order, place, orientation or unit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features, random_rotation
 
-from gsmerge.pooling import Members, pool_members
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take
@@ -17,60 +16,6 @@ from gsmerge.types import FeatureGaussians, Matches
 
 FEW = settings(max_examples=20, deadline=None, derandomize=True)
 seeds = st.integers(0, 2**32 - 1)
-
-
-def random_members(rng: np.random.Generator, count: int) -> Members:
-    columns = (
-        rng.normal(size=(count, 3)), rng.normal(size=(count, 4)), np.exp(rng.normal(size=(count, 3)) - 3),
-        rng.uniform(0, 1, count), rng.normal(size=(count, 1, 3)), rng.normal(size=(count, 3, 3)),
-        rng.uniform(0.01, 0.03, count),
-    )  # fmt: skip
-    return Members(*(np.ascontiguousarray(c, np.float32) for c in columns))
-
-
-@FEW
-@given(seeds, st.integers(1, 80))
-def test_order_of_members(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    members, starts = random_members(rng, count), np.array([0, count])
-    one = pool_members(members, starts, np.arange(count))
-    other = pool_members(members, starts, rng.permutation(count))
-    for name in ("means", "covars", "weights", "masses", "extinctions", "footprints", "sh"):
-        np.testing.assert_allclose(getattr(other, name), getattr(one, name), rtol=1e-5, atol=1e-5, err_msg=name)
-
-
-@FEW
-@given(seeds, st.integers(2, 40), st.floats(-3, 3))
-def test_pooling_commutes_with_similarities(seed: int, count: int, exponent: float) -> None:
-    rng = np.random.default_rng(seed)
-    members, starts, ids = random_members(rng, count), np.array([0, count]), np.arange(count)
-    factor, turn = 10.0**exponent, random_rotation(seed)
-    quat = rotation_to_quat(turn)
-    moved = replace(
-        members,
-        means=(factor * members.means @ turn.T).astype(np.float32),
-        quats=multiply(quat, members.quats).astype(np.float32),
-        scales=(factor * members.scales).astype(np.float32),
-        footprints=(factor * members.footprints).astype(np.float32),
-    )
-    one, other = pool_members(members, starts, ids), pool_members(moved, starts, ids)
-    np.testing.assert_allclose(other.means / factor, one.means @ turn.T, atol=1e-5)
-    np.testing.assert_allclose(other.covars / factor**2, turn @ one.covars @ turn.T, atol=1e-5)
-    np.testing.assert_allclose(other.weights, one.weights)
-    np.testing.assert_allclose(other.extinctions, factor**2 * one.extinctions, rtol=1e-5)
-    np.testing.assert_allclose(other.masses, factor**3 * one.masses, rtol=1e-5)
-
-
-def rotation_to_quat(turn: np.ndarray) -> np.ndarray:
-    from scenes import rotmat_to_quat
-
-    return rotmat_to_quat(turn)
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of one quaternion with many."""
-    w, v = b[:, :1], b[:, 1:].astype(float)
-    return np.concatenate([a[0] * w - v @ a[1:, None], a[0] * v + w * a[1:] + np.cross(a[1:], v)], 1)
 
 
 def random_features(rng: np.random.Generator, count: int) -> FeatureGaussians:

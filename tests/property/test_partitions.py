@@ -89,7 +89,7 @@ def test_any_compactness(picture: str, compactness: float) -> None:
         assert_partition(labels, height, width, count)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     height=st.integers(1, 20),
     width=st.integers(1, 20),

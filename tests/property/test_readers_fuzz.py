@@ -13,7 +13,7 @@ import pytest
 from fuzz.mutate import mutate
 from fuzz.targets import TARGETS, seeds_of
 
-EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "40"))
+EXAMPLES = int(os.environ.get("GSMERGE_FUZZ_EXAMPLES", "20"))
 FINDINGS = sorted((Path(__file__).parents[1] / "fuzz" / "findings").glob("*"))
 
 

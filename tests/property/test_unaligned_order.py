@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -21,9 +20,9 @@ from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Groups
 
-FEW = settings(max_examples=8, deadline=None, derandomize=True)
-ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.005)
-TURNED = scenes.make_scene(scenes.room(), scenes.arc(4, 40, 30), noise=0.02, opacity=(0.05, 0.95), seed=3)
+FEW = settings(max_examples=3, deadline=None, derandomize=True)
+ROOM = scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24), noise=0.005)
+TURNED = scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24), noise=0.02, opacity=(0.05, 0.95), seed=3)
 
 
 @cache
@@ -67,7 +66,7 @@ def test_each_gaussian_is_in_at_most_one_superpixel(count: int) -> None:
 @given(st.integers(0, 1000), st.sampled_from([{}, {"k": 2}, {"budget": 200}]))
 def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
     one, other = (
-        compact(scene, superpixels="10%", fit="none", **options).gaussians
+        compact(scene, superpixels="10%", fit="none", poses="fixed", **options).gaussians
         for scene in (unaligned_scenes.without_order(ROOM), unaligned_scenes.shuffled(ROOM, seed))
     )
     assert abs(len(one) - len(other)) <= 2
@@ -77,8 +76,8 @@ def test_permuted_gaussians_merge_alike(seed: int, options: dict) -> None:
 @sweep("options", [{"fit_steps": 12, "budget": 150}, {"budget": "auto"}], ids=str)
 def test_threads_change_no_bit(options: dict) -> None:
     scene = unaligned_scenes.voxels(ROOM, 0.06)
-    actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 2, 8)]
-    assert all(scenes.identical(a, b) for a, b in itertools.pairwise(actual))
+    actual = [compact(scene, superpixels="10%", threads=threads, **options).gaussians for threads in (1, 3)]
+    assert scenes.identical(*actual)
 
 
 @FEW
@@ -90,7 +89,7 @@ def test_similarity(seed: int, exponent: float) -> None:
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)
     moved = scenes.move(ROOM, *transform)
     one, other = (
-        compact(unaligned_scenes.without_order(scene), superpixels="10%", fit="none").gaussians
+        compact(unaligned_scenes.without_order(scene), superpixels="10%", fit="none", poses="fixed").gaussians
         for scene in (ROOM, moved)
     )
     expected = scenes.move_gaussians(one, *transform)

@@ -18,7 +18,7 @@ from gsmerge.raster.photos import scene_photos
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(5, 32, 24), noise=0.01)
+    return scenes.make_scene(scenes.room(), scenes.arc(5, 24, 18), noise=0.01)
 
 
 @pytest.mark.parametrize(
@@ -31,11 +31,10 @@ def scene() -> Scene:
 )
 def test_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any]) -> None:
     actual = []
-    for at_once in (1, 2, 100):
+    for at_once in (2, 100):
         monkeypatch.setattr("gsmerge.runtime.threads.AT_ONCE", at_once)
         actual.append(scenes.compacted(scene, **settings).gaussians)
-    assert scenes.identical(actual[0], actual[1])
-    assert scenes.identical(actual[0], actual[2])
+    assert scenes.identical(*actual)
 
 
 def test_colours_are_fitted_one_view_at_a_time_or_all(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,11 @@ from sweeps import sweep
 from unaligned_scenes import shuffled
 
 import gsmerge
+from gsmerge.kernels import elementary
 from gsmerge.networks.options import Bounds
 from gsmerge.types import SH_C0
 
-PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
+PLAIN = {"fit": "none", "match": "none", "superpixels": 100, "poses": "fixed"}
 
 
 @sweep(
@@ -33,9 +33,9 @@ PLAIN = {"fit": "none", "match": "none", "superpixels": 100}
     ids=str,
 )
 def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: dict[str, object]) -> None:
-    scene = make_scene(room(), arc(3))
+    scene = make_scene(room(), arc(2, 32, 24))
     path = written(tmp_path / "a.safetensors", untrained())
-    chosen = {"superpixels": 80, "fit": "none", **settings}
+    chosen = {"superpixels": 80, "fit": "none", "poses": "fixed", **settings}
     plain, networks = (
         gsmerge.compact(scene, **chosen, checkpoint="none"),
         gsmerge.compact(scene, **chosen, checkpoint=str(path)),
@@ -47,8 +47,8 @@ def test_untrained_networks_are_the_analytic_pipeline(tmp_path: Path, settings: 
 
 
 def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
-    scene = make_scene(room(), arc(3))
-    chosen = {"fit": "none", "superpixels": "10%"}
+    scene = make_scene(room(), arc(3, 32, 24))
+    chosen = {"fit": "none", "superpixels": "10%", "poses": "fixed"}
     path = written(tmp_path / "a.safetensors", untrained())
     unaligned = shuffled(scene)
     plain = gsmerge.compact(unaligned, **chosen, checkpoint=str(path))  # which assigns rows by their centres
@@ -59,7 +59,7 @@ def test_scenes_in_no_order_and_repeated_runs(tmp_path: Path) -> None:
     assert identical(one.gaussians, gsmerge.compact(unaligned, **chosen, checkpoint=str(path), threads=3).gaussians)
 
 
-@pytest.mark.parametrize("settings", [{}, {"quality": "15dB"}, {"levels": 2}], ids=str)
+@sweep("settings", [{"levels": 2}, {}, {"quality": "15dB"}], ids=str)
 def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: dict[str, object]) -> None:
     scene = make_scene(room(), arc(2))
     path = written(tmp_path / "a.safetensors", noisy())
@@ -110,6 +110,6 @@ def test_weights_a_hundred_times_as_large_stay_within_the_bounds(tmp_path: Path,
     stages = 1.5 if k == 1 else 1.0  # refiner and head; children are pooled anew, so the refiner does not reach them
     assert np.abs(np.log(b.scales) - np.log(a.scales)).max() <= stages * bounds.size * 1.001
     assert np.abs(SH_C0 * (b.sh0 - a.sh0)).max() <= stages * bounds.color * 1.001
-    largest = a.scales.max(1) * (2 + stages * math.exp(bounds.size))  # encoder, refiner, head
+    largest = a.scales.max(1) * (2 + stages * elementary.exp(bounds.size))  # encoder, refiner, head
     assert (np.linalg.norm(b.means - a.means, axis=1) <= 3**0.5 * 2 * largest).all()
     assert np.abs(b.means - a.means).max() > 0

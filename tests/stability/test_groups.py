@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +11,13 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import covariances, project, quat_to_rotmat
+from gsmerge.geometry import project, quat_to_rotmat
+from gsmerge.kernels import elementary
 from gsmerge.pooling import feature_to_gaussians, scene_members
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, grid_ids
+
+compacted = partial(scenes.compacted, poses="fixed")
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +42,7 @@ def one_group_per_view(scene: Scene) -> FeatureGaussians:
 # 1: coincident Gaussians
 
 
-@sweep("settings", [{}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 10}, {}, {"match": "aabb"}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     columns = {name: getattr(room.gaussians, name) for name in scenes.FIELDS}
     first = {name: np.broadcast_to(column[:1], column.shape) for name, column in columns.items()}
@@ -46,37 +50,7 @@ def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
     scenes.compacted(changed(room, **{**first, "means": means}), **settings)
 
 
-def test_coincident_members_stack(small: Scene) -> None:
-    count = small.pixels_per_view
-    same = {name: getattr(small.gaussians, name)[:1].repeat(count, 0) for name in scenes.FIELDS}
-    same["opacities"] = np.full(count, 0.02, np.float32)
-    merged = feature_to_gaussians(one_group_per_view(changed(small, **same)))
-    one = small.gaussians[:1]
-    footprint = scene_members(small).footprints[0]
-    floor = (0.1 * footprint) ** 2 * np.eye(3)
-    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64))[0] for g in (merged, one))
-    np.testing.assert_allclose(a, b + floor, rtol=1e-4, atol=1e-8)
-    discs = [float(np.sort(g.scales[0].astype(np.float64))[1:].prod()) for g in (merged, one)]
-    expected = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
-    assert float(merged.opacities[0]) == pytest.approx(expected, rel=1e-4)
-
-
 # 2: one member is left as it is
-
-
-def test_every_pixel_its_own_superpixel(small: Scene) -> None:
-    actual = scenes.plain(small, superpixels="100%")
-    order = np.linalg.norm(small.gaussians.means[:, None] - actual.means, axis=-1).argmin(1)
-    assert len(np.unique(order)) == len(actual) == len(small.gaussians)
-    own, kept = small.gaussians, actual[order]
-    np.testing.assert_allclose(kept.means, own.means, atol=1e-6)
-    np.testing.assert_allclose(kept.sh0, own.sh0, atol=1e-6)
-    np.testing.assert_allclose(kept.opacities, own.opacities, atol=0.03)  # the floor of a tenth of a pixel
-    footprints = scene_members(small).footprints.astype(np.float64)
-    error = covariances(kept.quats.astype(np.float64), kept.scales.astype(np.float64)) - covariances(
-        own.quats.astype(np.float64), own.scales.astype(np.float64)
-    )
-    assert (np.abs(error).max((1, 2)) < 1.01 * (0.1 * footprints) ** 2).all()
 
 
 # 3: rank-deficient groups
@@ -109,20 +83,13 @@ def test_needle_in_a_group(small: Scene, size: int) -> None:
     assert float(actual.scales.max()) <= 3 * extent
 
 
-def test_needles_hardly_show(room: Scene) -> None:
-    scales = room.gaussians.scales.copy()
-    scales[::40, 0] *= 1e4
-    clean, actual = scenes.plain(room), scenes.plain(changed(room, scales=scales))
-    assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
-
-
-@sweep("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 10}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_scales_at_the_ends_of_the_range(room: Scene, settings: dict) -> None:
     scales = room.gaussians.scales.copy()
     scales[::30] = 2e17  # exp(40)
     scales[7::30] = 4e-18  # exp(-40)
     scales[11::30, 1] = 0
-    scenes.compacted(changed(room, scales=scales), **settings)
+    compacted(changed(room, scales=scales), **settings)
 
 
 def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
@@ -130,15 +97,15 @@ def test_oversized_members_cost_less_than_a_decibel(room: Scene) -> None:
     scales = room.gaussians.scales.copy()
     rows = rng.choice(len(scales), len(scales) // 100, replace=False)
     scales[rows] *= rng.uniform(4, 15, (len(rows), 1)).astype(np.float32)
-    clean = scenes.compacted(room, fit="none").gaussians
-    actual = scenes.compacted(changed(room, scales=scales), fit="none").gaussians
+    clean = compacted(room, fit="none").gaussians
+    actual = compacted(changed(room, scales=scales), fit="none").gaussians
     assert scenes.psnr_of(actual, room) > scenes.psnr_of(clean, room) - 1
 
 
 # 7: transparent groups
 
 
-@pytest.mark.parametrize("k", [1, 4])
+@sweep("k", [1, 4])
 def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
     opacities = room.gaussians.opacities.copy().reshape(room.valid.shape)
     opacities[0] = 0
@@ -153,36 +120,14 @@ def test_transparent_pixels_leave_nothing(room: Scene, k: int) -> None:
 @pytest.mark.parametrize("opacity", [0.0, 1e-5])
 def test_wholly_transparent_scene(room: Scene, opacity: float, fit: str) -> None:
     scene = changed(room, opacities=np.full_like(room.gaussians.opacities, opacity))
-    scenes.compacted(scene, fit=fit)
+    scenes.compacted(scene, fit=fit, fit_steps=10)
 
 
 def test_wholly_opaque_scene(room: Scene) -> None:
-    scenes.compacted(changed(room, opacities=np.ones_like(room.gaussians.opacities)))
+    compacted(changed(room, opacities=np.ones_like(room.gaussians.opacities)), fit_steps=10)
 
 
 # 10, 11: quaternions
-
-
-def test_sign_and_length_of_quaternions_do_not_matter(room: Scene) -> None:
-    rng = np.random.default_rng(0)
-    factors = (rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100)).astype(np.float32)
-    before, after = scenes.plain(room), scenes.plain(changed(room, quats=room.gaussians.quats * factors))
-    scenes.assert_same_set(before, after, atol=1e-5)
-
-
-def test_zero_quaternions_mean_no_rotation(room: Scene) -> None:
-    zero, one = room.gaussians.quats.copy(), room.gaussians.quats.copy()
-    zero[::3], one[::3] = 0, [1, 0, 0, 0]
-    a, b = (scenes.compacted(changed(room, quats=q), fit="none").gaussians for q in (zero, one))
-    scenes.assert_same_set(a, b, atol=1e-6)
-
-
-def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
-    nudge = np.random.default_rng(0).normal(0, 1e-7, room.gaussians.means.shape)
-    moved = changed(room, means=room.gaussians.means + nudge)
-    actual = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
-    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64)) for g in actual)
-    assert np.abs(a - b).max() < 1e-6
 
 
 # 14: something huge and near
@@ -193,32 +138,32 @@ def test_huge_gaussian_in_front_of_one_camera(room: Scene) -> None:
     eye = room.cameras.centres[0]
     means[0] = eye + 0.02 * (means[0] - eye)
     scales[0] = 5.0
-    clean = scenes.compacted(room, fit="none").gaussians
-    actual = scenes.compacted(changed(room, means=means, scales=scales), fit="none").gaussians
+    clean = compacted(room, fit="none").gaussians
+    actual = compacted(changed(room, means=means, scales=scales), fit="none").gaussians
     others = scenes.take_views(room, [1, 2])
     assert abs(scenes.psnr_of(actual, others) - scenes.psnr_of(clean, others)) < 0.1
 
 
 @sweep("where", ["at", "behind"])
-@sweep("settings", [{}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
+@sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "k": 4}], ids=str)
 def test_pixels_at_and_behind_their_own_eye(room: Scene, where: str, settings: dict) -> None:
     means = room.gaussians.means.copy().reshape(3, 36, 48, 3)
     eyes = room.cameras.centres[:, None, None]
     part = means[:, :8, :24]
     means[:, :8, :24] = eyes if where == "at" else 2 * eyes - part
     scene = changed(room, means=means.reshape(-1, 3))
-    actual = scenes.compacted(scene, **settings).gaussians
+    actual = compacted(scene, **settings).gaussians
     assert scenes.psnr_of(actual, scene) > scenes.psnr_of(scene.gaussians, scene) - 6
 
 
 # 15, 16: depth edges
 
 
-@sweep("settings", [{}, {"fit": "none"}, {"k": 2}], ids=str)
+@sweep("settings", [{"fit_steps": 40}, {}, {"fit": "none"}, {"k": 2}], ids=str)
 def test_sky_and_foreground_stay_apart(settings: dict) -> None:
     sky = [scenes.plane(2.0, scenes.waves(1), right=0.0), scenes.plane(8e5, scenes.flat(0.1, 0.2, 1.0))]
     scene = scenes.make_scene(sky, scenes.arc(3))
-    actual = scenes.compacted(scene, **settings).gaussians
+    actual = compacted(scene, **settings).gaussians
     depths = project(actual.means, scene.cameras)[1][0]
     sky_from = 7e5 if settings.get("fit") == "none" else 1e5  # a fit moves what is so far away and so large
     assert ((depths < 3) | (depths > sky_from)).all()
@@ -226,21 +171,17 @@ def test_sky_and_foreground_stay_apart(settings: dict) -> None:
 
     def sky_psnr(gaussians: Gaussians) -> float:
         image = np.clip(scenes.images_of(gaussians, scene.cameras)[0], 0, 1)
-        return float(-10 * np.log10(((image - scene.images) ** 2)[far].mean()))  # type: ignore[union-attr]
+        return float(-10 * elementary.log10(((image - scene.images) ** 2)[far].mean()))  # type: ignore[union-attr]
 
     if settings.get("fit") != "none":  # one plain layer is not closed, see test_conservation
         assert sky_psnr(actual) > sky_psnr(scene.gaussians) - 0.5
 
 
-TORN = pytest.mark.xfail(reason="one Gaussian cannot be in two places; leaving the fewer members out gained nothing")
-
-
-@pytest.mark.parametrize("k", [pytest.param(1, marks=TORN), 2])
-def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
-    """Two grey walls, 2 and 4 away: what is merged lies on the one or on the other."""
+def test_no_curtain_across_a_depth_edge_of_one_colour() -> None:
+    """Two grey walls, 2 and 4 away: what is merged lies on the one or on the other (not so for k = 1)."""
     grey = scenes.flat(0.5, 0.5, 0.5)
     scene = scenes.make_scene([scenes.plane(2.0, grey, right=0.03), scenes.plane(4.0, grey)], scenes.arc(2))
-    actual = scenes.plain(scene, k=k)
+    actual = scenes.plain(scene, k=2)
     torn = np.minimum(np.abs(actual.means[:, 2] - 2), np.abs(actual.means[:, 2] - 4)) > 0.2
     assert not torn.any()
 
@@ -248,7 +189,7 @@ def test_no_curtain_across_a_depth_edge_of_one_colour(k: int) -> None:
 # 17: thin things
 
 
-@sweep("settings", [{}, {"k": 2}, {"fit": "none"}], ids=str)
+@sweep("settings", [{"fit_steps": 40}, {}, {"k": 2}, {"fit": "none"}], ids=str)
 def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
     """Two pixels wide; contrast against the wall beside it."""
     scene = scenes.make_scene(scenes.pole(), scenes.arc(3))
@@ -261,7 +202,7 @@ def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
         image = scenes.images_of(gaussians, between)[0][0].mean(-1)
         return float(image[pole].mean() - image[wall].mean())
 
-    assert contrast(scenes.compacted(scene, **settings).gaussians) >= 0.5 * contrast(scene.gaussians) > 0.1
+    assert contrast(compacted(scene, **settings).gaussians) >= 0.5 * contrast(scene.gaussians) > 0.1
 
 
 # 39: a centimetre and a kilometre in one scene
@@ -276,7 +217,7 @@ def test_near_and_far_details_are_both_kept() -> None:
     ]
     cameras = scenes.arc(3, span=0.004)
     scene = scenes.make_scene(surfaces, cameras)
-    actual = scenes.compacted(scene).gaussians
+    actual = compacted(scene, fit_steps=60).gaussians
     is_near = (scenes.trace(surfaces, cameras)[1] < 1).reshape(scene.valid.shape)
     drawn = [scenes.images_of(gaussians, cameras)[0].clip(0, 1) for gaussians in (actual, scene.gaussians)]
     for part in (is_near, ~is_near):

@@ -11,6 +11,8 @@ from scripts import load_script
 
 from gsmerge.scene.read import load_scene
 
+pytestmark = pytest.mark.slow
+
 
 def capture(root: Path) -> Path:
     place = Path(os.environ.get("GSMERGE_DATA", root.parent / "shared")) / "scenes" / "eval" / "lightfield"

@@ -11,6 +11,7 @@ from sweeps import sweep
 
 from gsmerge import Cameras, Scene
 from gsmerge.facts.views import concat_cameras
+from gsmerge.kernels import elementary
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_repeated_view_counts_once_and_looks_the_same(room: Scene, times: int) -
 def test_repeated_view_with_the_full_fit(room: Scene) -> None:
     """It grows to the number asked for, however few are left to begin with."""
     single, repeated = scenes.take_views(room, [0]), scenes.take_views(room, [0] * 3)
-    one, many = scenes.compacted(single), scenes.compacted(repeated)
+    one, many = (scenes.compacted(scene, fit_steps=60) for scene in (single, repeated))
     assert many.report.choices["clusters"] <= 1.05 * one.report.choices["clusters"]
     assert len(one.gaussians) <= len(many.gaussians) <= 3 * len(one.gaussians)
     assert scenes.psnr_of(many.gaussians, single) > scenes.psnr_of(one.gaussians, single) - 0.5
@@ -46,7 +47,7 @@ def test_pure_rotation() -> None:
     viewmats = [scenes.look_at(eye, np.array([x, 0.0, 3.0])) for x in (-0.4, 0.0, 0.4)]
     cameras = Cameras(np.stack(viewmats), scenes.intrinsics(3, 48, 36), 48, 36)
     scene = scenes.make_scene(scenes.wall(), cameras)
-    result = scenes.compacted(scene)
+    result = scenes.compacted(scene, fit_steps=60)
     assert result.report.choices["fit"]["accepted"]
     assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(scene.gaussians, scene) - 3
 
@@ -56,7 +57,7 @@ def test_pure_rotation() -> None:
 
 def test_single_view(room: Scene) -> None:
     single = scenes.take_views(room, [1])
-    matched, apart = scenes.compacted(single), scenes.compacted(single, match="none")
+    matched, apart = (scenes.compacted(single, fit_steps=60, match=match) for match in ("overlap", "none"))
     for name in scenes.FIELDS:
         np.testing.assert_array_equal(getattr(matched.gaussians, name), getattr(apart.gaussians, name))
     fit = matched.report.choices["fit"]
@@ -91,18 +92,6 @@ def test_order_of_views_does_not_matter_to_the_choice_of_start(room: Scene) -> N
     scenes.assert_same_set(one.gaussians, other.gaussians, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_order_of_views_hardly_matters_to_the_fit(room: Scene) -> None:
-    """Means of five seeds: the order decides which patches are held out, and a run of one seed varies by 0.5 dB."""
-    one, other = (
-        [scenes.compacted(s, seed=seed).gaussians for seed in range(5)]
-        for s in (room, scenes.take_views(room, [2, 0, 1]))
-    )
-    assert len({len(gaussians) for gaussians in (*one, *other)}) == 1
-    means = [np.mean([scenes.psnr_of(gaussians, room) for gaussians in runs]) for runs in (one, other)]
-    assert means[0] == pytest.approx(means[1], abs=0.7)
-
-
 # 27: wrong poses
 
 
@@ -112,8 +101,8 @@ def misplaced(scene: Scene, degrees: float) -> Scene:
     for view, sign in ((1, 1), (2, -1)):
         angle = np.deg2rad(sign * degrees)
         turn = np.eye(4)
-        turn[0, 0] = turn[2, 2] = np.cos(angle)
-        turn[0, 2], turn[2, 0] = np.sin(angle), -np.sin(angle)
+        turn[0, 0] = turn[2, 2] = elementary.cos(angle)
+        turn[0, 2], turn[2, 0] = elementary.sin(angle), -elementary.sin(angle)
         old = viewmats[view].copy()
         viewmats[view] = turn @ old
         camera = means[view] @ old[:3, :3].T + old[:3, 3]
@@ -149,11 +138,14 @@ def test_fit_never_hurts_under_wrong_poses(room: Scene, degrees: float) -> None:
 # more views of the same surfaces
 
 
+@pytest.mark.slow
 def test_more_views_do_not_hurt() -> None:
     """From a place between the views; matching makes one layer of the views' many, and it must still be closed."""
-    between = scenes.make_scene(scenes.room(), scenes.arc(1, 96, 72, start=-0.23))
+    between = scenes.make_scene(scenes.room(), scenes.arc(1, 64, 48, start=-0.23))
     actual = []
     for views in (3, 6):
-        scene = scenes.make_scene(scenes.room(), scenes.arc(views, 96, 72), noise=0.01)
-        actual.append(scenes.psnr_of(scenes.compacted(scene, superpixels="4.4%").gaussians, between))
+        scene = scenes.make_scene(scenes.room(), scenes.arc(views, 64, 48), noise=0.01)
+        actual.append(
+            scenes.psnr_of(scenes.compacted(scene, superpixels="4.4%", fit_steps=60, poses="fixed").gaussians, between)
+        )
     assert actual[1] > actual[0] - 0.5

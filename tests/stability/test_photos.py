@@ -15,13 +15,14 @@ from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.prepare import PrepareOptions, prepare
 from gsmerge.facts.views import subset
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.kernels import elementary
 from gsmerge.runtime.record import record_run
 from gsmerge.states.extend import extend
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]
-VIEWS, WIDTH, HEIGHT = 6, 96, 72
-FIT = {"budget": 300, "fit_steps": 60, "checkpoint": "none"}
+VIEWS, WIDTH, HEIGHT = 6, 48, 36
+FIT = {"budget": 150, "fit_steps": 40, "checkpoint": "none", "poses": "fixed"}
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +42,18 @@ def novel_psnr(gaussians: Gaussians, *, aligned: bool = False) -> float:
     image = np.clip(scenes.images_of(gaussians, camera)[0][0], 0, 1)
     if aligned:
         image = image * (image * truth).sum((0, 1)) / (image * image).sum((0, 1))
-    return float(-10 * np.log10(((image - truth) ** 2).mean()))
+    return float(-10 * elementary.log10(((image - truth) ** 2).mean()))
 
 
 def band(photos: Photos) -> Photos:
     out = photos.copy()
-    out[::2, 50:] = (0.9, 0.8, 0.1)
+    out[::2, 25:] = (0.9, 0.8, 0.1)
     return out
 
 
 def ellipse() -> np.ndarray:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    return ((y - 35.5) / 30) ** 2 + ((x - 47.5) / 40) ** 2 < 1
+    return ((y - 17.5) / 15) ** 2 + ((x - 23.5) / 20) ** 2 < 1
 
 
 def masked(photos: Photos) -> Photos:
@@ -61,14 +62,14 @@ def masked(photos: Photos) -> Photos:
 
 def bars(photos: Photos) -> Photos:
     out = photos.copy()
-    out[:, :10] = out[:, -10:] = 0
+    out[:, :5] = out[:, -5:] = 0
     return out
 
 
 def letterbox(photos: Photos) -> Photos:
     """Every second row, between bars."""
     out = np.zeros_like(photos)
-    out[:, 18:54] = photos.reshape(VIEWS, 36, 2, WIDTH, 3).mean(2)
+    out[:, 9:27] = photos.reshape(VIEWS, 18, 2, WIDTH, 3).mean(2)
     return out
 
 
@@ -89,14 +90,15 @@ def bgr(photos: Photos) -> Photos:
 
 
 CASES = [
-    (band, 0.5, ("3 of 6", "part")), (masked, 0.5, ("6 of 6", "part")), (bars, 0.5, ("6 of 6", "part")),
+    (band, 0.5, ("3 of 6", "part")), (linear, 0.5, ("6 of 6", "tone")),
+    (masked, 0.5, ("6 of 6", "part")), (bars, 0.5, ("6 of 6", "part")),
     (letterbox, 4.0, ("bars", "25 %")),  # half of its rows are gone
-    (linear, 0.5, ("6 of 6", "tone")), (half, 0.5, ("6 of 6", "tone")), (gamma, 0.5, ("6 of 6", "tone")),
+    (half, 0.5, ("6 of 6", "tone")), (gamma, 0.5, ("6 of 6", "tone")),
     (bgr, 0.1, ("red", "blue")),
 ]  # fmt: skip
 
 
-@sweep(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None), often=3)
+@sweep(("change", "loss", "note"), CASES, ids=lambda case: getattr(case, "__name__", None), often=2)
 def test_photos_are_mended(
     room: Scene, sound: CompactResult, change: Change, loss: float, note: tuple[str, ...]
 ) -> None:
@@ -130,7 +132,7 @@ def test_some_photos_in_another_order_of_channels(room: Scene, odd: list[int], a
     assert noted(record.notes, "red", "blue", room.names[1])
 
 
-@pytest.mark.parametrize("aligned", [True, False])
+@sweep("aligned", [True, False])
 def test_a_photo_of_another_white_balance_keeps_its_channels(room: Scene, aligned: bool) -> None:
     images = room.images.copy()
     images[1] = (images[1] * np.float32([0.5, 1, 1.6])).clip(0, 1)
@@ -155,7 +157,7 @@ def exposed(room: Scene, gains: np.ndarray) -> Scene:
 
 def random_gains(channels: int) -> np.ndarray:
     rng = np.random.default_rng(3)
-    return np.exp(rng.uniform(np.log(0.6), np.log(1.5), (VIEWS, channels))) * np.ones(3)
+    return elementary.exp(rng.uniform(elementary.log(0.6), elementary.log(1.5), (VIEWS, channels))) * np.ones(3)
 
 
 @sweep("channels", [3, 1], ids=["white balance", "exposure"])
@@ -211,7 +213,7 @@ def test_exposure_that_drifts_stays_unless_asked(room: Scene) -> None:
 def test_masks_weigh_the_fit_and_the_scores(room: Scene, sound: CompactResult) -> None:
     """Rubbish outside the masks, in photos and Gaussians alike, in every second view."""
     inside = np.full((VIEWS, HEIGHT, WIDTH), True)
-    inside[::2, 50:] = False
+    inside[::2, 25:] = False
     images = np.where(inside[..., None], room.images, np.float32([0.9, 0.1, 0.9])).astype(np.float32)
     sh0 = rgb_to_sh0(images.reshape(-1, 1, 3)).astype(np.float32)
     spoilt = replace(room, images=images, gaussians=replace(room.gaussians, sh0=sh0))
@@ -230,7 +232,7 @@ def test_a_black_photo_under_masks_is_left_out(room: Scene) -> None:
 
 def test_masks_follow_pictures_that_bars_are_cut_from(room: Scene) -> None:
     masks = np.zeros((VIEWS, HEIGHT, WIDTH), bool)
-    masks[:, 18:54] = True
+    masks[:, 9:27] = True
     prepared = prepare(replace(room, images=letterbox(room.images), masks=masks))
     assert prepared.scene.masks is not None
     assert prepared.scene.masks.all()
@@ -238,14 +240,14 @@ def test_masks_follow_pictures_that_bars_are_cut_from(room: Scene) -> None:
 
 def test_covered_pixels_without_a_gaussian_get_the_nearest_colour(room: Scene) -> None:
     missing = np.zeros((VIEWS, HEIGHT, WIDTH), bool)
-    missing[:, 66:] = True
+    missing[:, 33:] = True
     ids = np.where(missing.reshape(-1), -1, room.pixel_ids).astype(np.int32)
     sh0 = np.where(missing.reshape(-1, 1, 1), np.float32(0), room.gaussians.sh0)
     scene = replace(room, gaussians=replace(room.gaussians, sh0=sh0), pixel_ids=ids, missing=missing)
     mended = prepare(replace(scene, images=band(room.images))).scene.images
     assert mended is not None
-    assert np.abs(mended[::2, 66:] - room.images[::2, 66:]).mean() < 0.1
-    assert not (mended[::2, 66:] == 0.5).all(-1).any()
+    assert np.abs(mended[::2, 33:] - room.images[::2, 33:]).mean() < 0.1
+    assert not (mended[::2, 33:] == 0.5).all(-1).any()
 
 
 def test_batches_of_views_keep_the_exposure_of_the_photos(room: Scene) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import scenes
 from sweeps import sweep
 
@@ -79,7 +80,8 @@ SCENES: dict[str, Callable[[], Scene]] = {
 }
 
 
-@sweep("name", SCENES, often=2)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_no_fog_and_no_holes(name: str, floor: Callable[..., None]) -> None:
     """After the default fit; the floor is of the share of emptiness that is left, far from the outline."""
     scene = SCENES[name]()

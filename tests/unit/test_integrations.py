@@ -17,7 +17,7 @@ from gsmerge.types import as_array
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
-FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
+FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none", "poses": "fixed"}
 SIZES = np.array([48, 36, 1.0])[:, None]
 
 

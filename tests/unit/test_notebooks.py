@@ -7,6 +7,7 @@ import gc
 import html
 import pickle
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,19 +20,24 @@ import gsmerge
 
 
 @pytest.fixture(scope="module")
-def scene(made_scene: Path) -> gsmerge.Scene:
-    return gsmerge.read_scene(made_scene)
+def tiny_scene(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_scene(tmp_path_factory.mktemp("tiny") / "scene", num_views=3, width=32, height=24)
+
+
+@pytest.fixture(scope="module")
+def scene(tiny_scene: Path) -> gsmerge.Scene:
+    return gsmerge.read_scene(tiny_scene)
 
 
 @pytest.fixture(scope="module")
 def result(scene: gsmerge.Scene) -> gsmerge.CompactResult:
-    return gsmerge.compact(scene, effort="draft", budget=300, levels=2)
+    return gsmerge.compact(scene, effort="draft", budget=100, levels=2)
 
 
-def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.CompactResult, made_scene: Path) -> None:
+def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.CompactResult, tiny_scene: Path) -> None:
     views, size = len(scene), f"{scene.cameras.width} x {scene.cameras.height}"
-    file = gsmerge.read_ply(made_scene / "scene.ply")
-    cameras = gsmerge.read_cameras(made_scene / "transforms.json")
+    file = gsmerge.read_ply(tiny_scene / "scene.ply")
+    cameras = gsmerge.read_cameras(tiny_scene / "transforms.json")
     options = gsmerge.EvaluateOptions(lpips=(), fog=False)
     compactor = gsmerge.Compactor(superpixels="2%", checkpoint="none")
     compactor.extend(scene)
@@ -41,9 +47,9 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
         (scene.cameras, (str(views), size)),
         (gsmerge.Views(scene.cameras, scene.images, scene.names), (str(views), size)),
         (gsmerge.render(scene.gaussians, scene.cameras[[0]], with_depths=True), ("1", size, "depths")),
-        (result, ("300", size, "1 coarser")),
-        (result.report, (f"{scene.num_gaussians:,} -> 300", "dB")),
-        (file, (f"{len(scene.gaussians):,}", str(made_scene / "scene.ply"))),
+        (result, ("100", size, "1 coarser")),
+        (result.report, (f"{scene.num_gaussians:,} -> 100", "dB")),
+        (file, (f"{len(scene.gaussians):,}", str(tiny_scene / "scene.ply"))),
         (cameras, (str(views), cameras.path, cameras.source)),
         (compactor, ("Feature Gaussians", f"{views} views")),
         (compactor.state, ("Feature Gaussians", f"{views} views")),
@@ -60,7 +66,7 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
 
 def test_results_show_their_report_and_a_picture(scene: gsmerge.Scene, result: gsmerge.CompactResult) -> None:
     text = result._repr_html_()
-    assert f"{scene.num_gaussians:,} -&gt; 300" in text
+    assert f"{scene.num_gaussians:,} -&gt; 100" in text
     packed = re.search(r'src="data:image/png;base64,([^"]+)"', text)
     assert packed is not None
     picture = cv2.imdecode(np.frombuffer(base64.b64decode(packed[1]), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
@@ -73,7 +79,7 @@ def test_a_result_shows_its_scene_beside_it(
     scene: gsmerge.Scene, result: gsmerge.CompactResult, tmp_path: Path
 ) -> None:
     page = result.show()
-    assert re.match(r"Page\(0.98 % of the Gaussians, \d.\d dB closer to the photos, \d", repr(page))
+    assert re.match(r"Page\(4.3 % of the Gaussians, \d.\d dB closer to the photos, \d", repr(page))
     shown = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*" allowfullscreen></iframe>', page._repr_html_())
     assert shown is not None
     assert html.unescape(shown[1]) == page.text
@@ -90,23 +96,23 @@ def test_a_light_page_lacks_the_scenes_own_gaussians(scene: gsmerge.Scene, resul
     assert re.findall('id="(splats-.)"', light) == ["splats-1"]
 
 
-def test_a_result_does_not_keep_its_scene(made_scene: Path, result: gsmerge.CompactResult) -> None:
+def test_a_result_does_not_keep_its_scene(tiny_scene: Path, result: gsmerge.CompactResult) -> None:
     copy = pickle.loads(pickle.dumps(result))
-    assert repr(copy.show()).startswith("Page(300 Gaussians")  # alone: the other process has no scene
-    assert "dB closer" in repr(copy.show(made_scene)) or "dB farther" in repr(copy.show(made_scene))
-    other = gsmerge.compact(made_scene, effort="draft", budget=300)
-    assert other.scene == made_scene
-    held = gsmerge.compact(gsmerge.read_scene(made_scene), effort="draft", budget=300)
+    assert repr(copy.show()).startswith("Page(100 Gaussians")  # alone: the other process has no scene
+    assert "dB closer" in repr(copy.show(tiny_scene)) or "dB farther" in repr(copy.show(tiny_scene))
+    other = gsmerge.compact(tiny_scene, effort="draft", budget=100)
+    assert other.scene == tiny_scene
+    held = gsmerge.compact(gsmerge.read_scene(tiny_scene), effort="draft", budget=100)
     gc.collect()
     assert not isinstance(held.scene, str | Path)
     assert held.scene is not None
     assert held.scene() is None
 
 
-def test_views_are_of_paths_gaussians_and_results(made_scene: Path, scene: gsmerge.Scene, tmp_path: Path) -> None:
-    few = scene.gaussians[::10]
+def test_views_are_of_paths_gaussians_and_results(tiny_scene: Path, scene: gsmerge.Scene, tmp_path: Path) -> None:
+    few = scene.gaussians[::5]
     gsmerge.write_ply(tmp_path / "few.ply", few)
-    pages = [gsmerge.view(made_scene, {"few": one}) for one in (few, tmp_path / "few.ply")]
+    pages = [gsmerge.view(tiny_scene, {"few": one}) for one in (few, tmp_path / "few.ply")]
     assert repr(pages[0]).split(",")[:2] == repr(pages[1]).split(",")[:2]
     assert "few" in pages[0].text
     alone = gsmerge.view(gsmerge.Scene(few, scene.cameras[[]], None, None, ()))

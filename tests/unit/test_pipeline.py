@@ -8,11 +8,11 @@ import pytest
 import scenes
 import unaligned_scenes
 from messages import refuses
-from sweeps import sweep
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.facts.views import pick_views
+from gsmerge.kernels import elementary
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
@@ -53,7 +53,7 @@ def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
     assert before.covered is not None
     assert before.covered.share == pytest.approx(some.stored.mean(), abs=0.02)
     images = scenes.images_of(some.file_gaussians, some.cameras)[0].clip(0, 1)
-    inside = -10 * np.log10(np.square(images - some.images)[some.stored].mean())
+    inside = -10 * elementary.log10(np.square(images - some.images)[some.stored].mean())
     assert before.covered.before == pytest.approx(inside, abs=0.5)  # the mean over views, not over pixels
     assert before.covered.before > before.psnr_before + 3
     assert scenes.compacted(scene, fit="none").report.covered is None
@@ -117,14 +117,13 @@ def test_without_photos_and_pixels_nothing_is_measured(scene: Scene) -> None:
 
 def test_options_and_settings_combine(scene: Scene) -> None:
     options = CompactOptions().with_settings({"fit": "none"})
-    one = compact(scene, options, superpixels=30)
-    two = compact(scene, superpixels=30, fit="none")
+    one, two = compact(scene, options, superpixels=30), compact(scene, superpixels=30, fit="none")
     assert np.array_equal(one.gaussians.means, two.gaussians.means)
     assert one.report.options == two.report.options
 
 
 @pytest.mark.parametrize("match", ["overlap", "aabb", "none"])
-@pytest.mark.parametrize("k", [1, 2, 4])
+@pytest.mark.parametrize("k", [1, 4])
 def test_count_is_what_was_asked_for(scene: Scene, match: str, k: int) -> None:
     actual = scenes.compacted(scene, superpixels=40, match=match, k=k, **UNFITTED)
     assert len(actual.gaussians) <= 3 * 40 * k
@@ -132,31 +131,24 @@ def test_count_is_what_was_asked_for(scene: Scene, match: str, k: int) -> None:
         assert len(actual.gaussians) >= 0.95 * 3 * 40 * k
 
 
-@pytest.mark.parametrize("superpixels", [1, 2, 3, 768])
+@pytest.mark.parametrize("superpixels", [1, 2, 768])
 def test_extreme_numbers_of_superpixels(scene: Scene, superpixels: int) -> None:
-    assert len(scenes.compacted(scene, superpixels=superpixels).gaussians) <= 3 * superpixels
+    assert len(scenes.compacted(scene, superpixels=superpixels, fit_steps=12).gaussians) <= 3 * superpixels
 
 
-@pytest.mark.parametrize("size", [(1, 1), (7, 5), (16, 16), (40, 1), (1, 40)])
-@pytest.mark.parametrize("views", [1, 3])
+@pytest.mark.parametrize(("views", "size"), [(1, (1, 1)), (3, (1, 1)), (3, (7, 5)), (1, (40, 1)), (3, (1, 40))])
 def test_tiny_images(size: tuple[int, int], views: int) -> None:
-    scenes.compacted(scenes.make_scene(scenes.wall(), scenes.arc(views, *size)))
+    scenes.compacted(scenes.make_scene(scenes.wall(), scenes.arc(views, *size)), fit_steps=60)
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
 def test_every_segmentation(scene: Scene, segmentation: str) -> None:
-    assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40).gaussians) <= 120
-
-
-@sweep("degree", [1, 2, 3, 4])
-def test_harmonics_keep_their_degree(degree: int) -> None:
-    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
-    assert scenes.compacted(scene, k=2).gaussians.sh_degree == degree
+    assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40, **UNFITTED).gaussians) <= 120
 
 
 def test_result_can_be_used_like_any_array_or_tensor(scene: Scene, torch: Any) -> None:
     """Changed in place, and as tensors differentiated through."""
-    actual = compact(scene).gaussians
+    actual = compact(scene, fit_steps=12).gaussians
     for name in scenes.FIELDS:
         array = getattr(actual, name)
         array += 0
@@ -194,15 +186,14 @@ def test_double_precision_input(scene: Scene) -> None:
     doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.astype(np.float64))
     actual = [scenes.compacted(s, fit="none").gaussians for s in (doubled, scene)]
     scenes.assert_same_set(*actual, atol=1e-4)
-    assert scenes.psnr_of(scenes.compacted(doubled).gaussians, scene) == pytest.approx(
-        scenes.psnr_of(scenes.compacted(scene).gaussians, scene), abs=1.5
-    )
+    fitted = [scenes.compacted(one, fit_steps=12).gaussians for one in (doubled, scene)]
+    assert scenes.psnr_of(fitted[0], scene) == pytest.approx(scenes.psnr_of(fitted[1], scene), abs=0.5)
 
 
 def test_input_is_left_alone(scene: Scene) -> None:
     before = [getattr(scene.gaussians, name).copy() for name in scenes.FIELDS]
     images = scene.images.copy()
-    compact(scene)
+    compact(scene, fit_steps=12)
     assert all(np.array_equal(getattr(scene.gaussians, n), b) for n, b in zip(scenes.FIELDS, before, strict=True))
     assert np.array_equal(scene.images, images)
 
@@ -212,9 +203,6 @@ def test_wrong_settings_are_refused(scene: Scene) -> None:
         compact(scene, superpixels=32 * 24 + 1)
     with refuses(ValueError, "threads", 0):
         compact(scene, threads=0)
-
-
-def test_wrong_settings_are_refused_before_any_stage(scene: Scene) -> None:
     calls: list[str] = []
     with refuses(ValueError, "k", "1 to 8", 0):
         compact(scene, k=0, progress=lambda name, *_: calls.append(name))
@@ -229,7 +217,7 @@ def test_networks_correct_what_no_fit_corrects(scene: Scene) -> None:
         assert scenes.identical(actual.gaussians, alone.gaussians)
 
 
-@pytest.mark.parametrize("k", [1, 2, 4, 8])
+@pytest.mark.parametrize("k", [1, 8])
 def test_a_budget_is_met_whatever_k_is_and_however_the_fit_grows(scene: Scene, k: int) -> None:
     actual = scenes.compacted(scene, k=k, budget=300, fit_steps=160)
     assert actual.report.choices["fit"]["accepted"]

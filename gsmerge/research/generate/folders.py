@@ -17,8 +17,9 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import remove_stale, temporary_path
+from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
-from gsmerge.research.generate.shapes import compose, invert
+from gsmerge.research.generate.shapes import invert
 from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_scene
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras
@@ -161,7 +162,7 @@ def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> Non
         name = f"images/view_{i:0{digits}d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
         (folder / name).write_bytes(data.tobytes())
-        c2w = compose(invert(cameras.viewmats[i]), FLIP)
+        c2w = matmul(invert(cameras.viewmats[i]), FLIP)
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})
     K = cameras.Ks[0]
     shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.pictures import blur, convolve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
@@ -126,16 +127,19 @@ def edge_mask(depth: Array) -> Float:
     inverse = (1 / depth).astype(np.float32)
     square = np.ones((3, 3), np.uint8)
     jump = log(cv2.dilate(inverse, square) / cv2.erode(inverse, square))
-    middle = cv2.GaussianBlur(inverse, (0, 0), 1.0)  # slanted planes are smooth in inverse depth
+    middle = blur(inverse, 1.0)  # slanted planes are smooth in inverse depth
     bend = np.abs(middle / inverse - 1)
     return np.clip((np.minimum(jump / 2, 4 * bend) - 0.01) / 0.09, 0, 1).astype(np.float32)
+
+
+FLAT = np.full(7, 1 / 7, np.float32)  # a filter: the mean of 7 pixels
 
 
 def texture_mask(image: Float) -> Float:
     """Rate pixels ``[h,w]`` by texture: 0 in flat areas of a photo, 1 where it has detail."""
     grey = image.mean(2)
-    mean = cv2.blur(grey, (7, 7))
-    deviation = np.sqrt(np.maximum(cv2.blur(grey * grey, (7, 7)) - mean * mean, 0))
+    mean, square = (convolve(one, FLAT, FLAT) for one in (grey, grey * grey))
+    deviation = np.sqrt(np.maximum(square - mean * mean, 0))
     return np.clip(deviation / 0.05, 0, 1)
 
 
@@ -151,7 +155,7 @@ def predict_depth(seen: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     depth, beyond = np.minimum(seen.depth, far), seen.depth > far
     blank = 1 - texture_mask(seen.image)
     edge = edge_mask(depth)
-    soft = cv2.GaussianBlur(1 / depth, (0, 0), noise.bleed_width)
+    soft = blur(1 / depth, noise.bleed_width)
     near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
     bled = 1 / (1 / depth + noise.bleed * near_edge * (soft - 1 / depth))
     worse = 1 + noise.blank * blank + 3 * beyond
@@ -207,7 +211,7 @@ def pixel_gaussians(seen: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     scales[oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(oversized.sum()), 1))
     opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
     opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
-    image = cv2.GaussianBlur(seen.image, (0, 0), noise.color_blur) if noise.color_blur > 0.2 else seen.image
+    image = blur(seen.image, noise.color_blur) if noise.color_blur > 0.2 else seen.image
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
     means = means.astype(np.float32)
     sh0, shN = _harmonics(colors, means, seen.c2w[:3, 3], noise, rng)

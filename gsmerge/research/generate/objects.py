@@ -248,7 +248,7 @@ def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) 
     taken: list[Array] = []
     for _ in range(count * 4):
         at = rng.uniform(-1, 1, 2) * half
-        if len(taken) < count and all(np.hypot(*(at - other)) > 0.16 for other in taken):
+        if len(taken) < count and all(norm(at - other) > 0.16 for other in taken):
             taken.append(at)
             out += place(small_object(pal), (at[0], -height, at[1]), yaw=rng.uniform(0, 2 * np.pi))
     for _ in range(rng.integers(0, count // 2 + 1)):

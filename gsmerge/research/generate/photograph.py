@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
+from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.shapes import (
     Array,
     Shape,
@@ -102,8 +103,8 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     """Compute boxes x0, y0, x1, y1 ``[m,4]``, in samples, that contain each shape's image."""
     half = bounds(shapes)
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = np.einsum("mij,mcj->mci", shapes.rotations, half[:, None] * signs) + shapes.centres[:, None]
-    local = np.einsum("mci,ij->mcj", corners - c2w[:3, 3], c2w[:3, :3])
+    corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
+    local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
     a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
     with np.errstate(divide="ignore", invalid="ignore"):  # where an edge passes the near plane

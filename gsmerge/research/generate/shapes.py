@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
 from gsmerge.kernels.elementary import cos, sin
+from gsmerge.kernels.matrices import matmul
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -50,12 +51,7 @@ def norm(vector: Array) -> float:
 
 def rotate(points: Array, rotation: Array) -> Array:
     """Rotate points ``[n,3]``, with the same bits on every processor."""
-    return np.einsum("nk,ik->ni", points, rotation)
-
-
-def compose(a: Array, b: Array) -> Array:
-    """Multiply two small matrices, with the same bits on every processor."""
-    return np.einsum("ik,kj->ij", a, b)
+    return matmul(points, rotation.T)
 
 
 def invert(motion: Array) -> Array:
@@ -131,7 +127,7 @@ def place(
     rotation = axis_rotation(1, yaw) if rotation is None else rotation
     offset = np.asarray(at, float)
     return [
-        replace(s, centre=(rotation * s.centre).sum(1) + offset, rotation=compose(rotation, s.rotation)) for s in shapes
+        replace(s, centre=(rotation * s.centre).sum(1) + offset, rotation=matmul(rotation, s.rotation)) for s in shapes
     ]
 
 

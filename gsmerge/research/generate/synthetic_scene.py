@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -14,6 +13,8 @@ import numpy as np
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import STYLES
 from gsmerge.research.generate.photograph import (
@@ -30,7 +31,7 @@ from gsmerge.research.generate.photograph import (
     radiance,
     trace,
 )
-from gsmerge.research.generate.shapes import Array, compose, invert, norm
+from gsmerge.research.generate.shapes import Array, invert, norm
 from gsmerge.research.generate.textures import Palette
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.setting import Settings, setting
@@ -199,7 +200,7 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         hits = trace(scene.shapes, poses[i], lens, 1)
         depth = np.minimum(hits.depth, FAR) * noise.unit
         estimate = _perturb_pose(moved[i], noise, float(np.median(depth)), deviation)
-        normals = np.einsum("hwk,ik->hwi", hits.normals, world[:3, :3]).astype(np.float32)
+        normals = matmul(hits.normals, world[:3, :3].T).astype(np.float32)
         seen = image if large == lens else cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
         predicted = pixel_gaussians(TrueView(seen, depth, normals, estimate), lens, noise, np.random.default_rng(seed))
         return image, estimate, predicted
@@ -225,7 +226,7 @@ def _find_stage(
     rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
 ) -> tuple[LitStage, Pose]:
     """Draw a stage and a path through it on which all views are usable; after too many tries, return the last."""
-    side = 1 << min(max(int(math.log2(1.6 * max(lens.width, lens.height))), 7), 10)  # of the textures, pixels
+    side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # of the textures, pixels
     for _ in range(STAGE_TRIES):
         scene = light_stage(STYLES[style](Palette(rng, side)))
         for _ in range(PATH_TRIES):
@@ -244,7 +245,7 @@ def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: floa
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
     linear = linear * gains.astype(np.float32) * (1 - 0.3 * away)[..., None].astype(np.float32)
-    image = cv2.GaussianBlur(develop(linear), (0, 0), noise.blur)
+    image = blur(develop(linear), noise.blur)
     image = np.clip(image + rng.normal(0, 0.004, image.shape), 0, 1).astype(np.float32)
     return np.round(image * 255) / np.float32(255)
 
@@ -255,14 +256,14 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> 
     angle = np.sqrt((turn * turn).sum())
     quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * turn)])
     out = pose.copy()
-    out[:3, :3] = compose(pose[:3, :3], quat_to_rotmat(quat))
+    out[:3, :3] = matmul(pose[:3, :3], quat_to_rotmat(quat))
     out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
     return out
 
 
 def _move_pose(pose: Array, world: Array, unit: float) -> Array:
     """Move a pose into the world of the exporter, in its units."""
-    out = compose(world, pose)
+    out = matmul(world, pose)
     out[:3, 3] *= unit
     return out
 

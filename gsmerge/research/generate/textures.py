@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.kernels import pictures
 from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.research.generate.shapes import Material
 
@@ -23,13 +24,7 @@ Grey: TypeAlias = NDArray[Any]  # float32: square, repeating without a seam, 0 t
 
 def enlarge(cells: NDArray[np.float64], size: int) -> Grey:
     """Enlarge a small periodic picture smoothly to ``[size,size]``."""
-    rows, columns = cells.shape
-    pad = 3
-    wide = np.pad(cells, pad, mode="wrap").astype(np.float32)
-    y = (np.arange(size, dtype=np.float32) + 0.5) * rows / size - 0.5 + pad
-    x = (np.arange(size, dtype=np.float32) + 0.5) * columns / size - 0.5 + pad
-    at_x, at_y = np.meshgrid(x, y)
-    return cv2.remap(wide, at_x, at_y, cv2.INTER_CUBIC)
+    return pictures.enlarge(cells, size, size, periodic=True)
 
 
 def noise(
@@ -312,7 +307,7 @@ def label(rng: np.random.Generator, size: int) -> Picture:
     page = mix(color(rng, strength=(0.3, 0.95)), color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
     for _ in range(rng.integers(2, 6)):
         cx, cy, r = rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.06, 0.3)
-        inside = np.hypot(x - cx, y - cy) < r if rng.random() < 0.5 else np.abs(y - cy) < r / 3
+        inside = np.square(x - cx) + np.square(y - cy) < r * r if rng.random() < 0.5 else np.abs(y - cy) < r / 3
         page = np.where(inside[..., None], color(rng, strength=(0.1, 0.95)), page)
     letters = glyphs(rng, 26)
     for _ in range(rng.integers(3, 9)):

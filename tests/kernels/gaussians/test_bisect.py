@@ -115,15 +115,6 @@ def test_children_match_exact_eigenvectors(seed: int) -> None:
             assert case.error(group, parts) <= 1.1 * case.error(group, expected) + 1e-12
 
 
-def test_two_clear_halves_are_told_apart_by_colour_and_by_place() -> None:
-    for column in ("sh", "means"):
-        case = Case(0, (20,))
-        case.means[:], case.sh[:] = 0, 0
-        getattr(case, column)[case.ids[::2]] = 1
-        (parts,) = case.children(2)
-        assert set(parts) == {frozenset(case.ids[::2].tolist()), frozenset(case.ids[1::2].tolist())}
-
-
 def test_identical_members_stay_one_child() -> None:
     case = Case(0, (12, 5))
     case.means[:], case.sh[:] = 0.5, 0.25

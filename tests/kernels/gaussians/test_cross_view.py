@@ -9,6 +9,7 @@ import pytest
 from scenes import arc, make_scene, room
 
 from gsmerge.geometry import project
+from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.cross_view import sum_cross_view
 from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
 from gsmerge.pooling import Members, scene_members
@@ -20,7 +21,7 @@ def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Membe
     """``[g,7]``: a loop over points and views."""
     places, depths = project(means, cameras)
     actual = np.zeros((len(means), 7))
-    actual[:, 6] = np.log(len(cameras)) / 4
+    actual[:, 6] = elementary.log(len(cameras)) / 4
     for i in range(len(means)):
         seen, kinds, color, ratios = 0, [0, 0, 0], 0.0, 0.0
         for v in range(len(cameras)):
@@ -31,13 +32,13 @@ def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Membe
             there = project(members.means[j : j + 1], cameras)[1][v, 0]
             if not (there > 0 and members.opacities[j] > MIN_OPACITY):
                 continue
-            ratio, seen = float(np.log(depths[v, i] / there)), seen + 1
+            ratio, seen = float(elementary.log(depths[v, i] / there)), seen + 1
             kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
             if abs(ratio) < NEAR:
                 color += float(np.abs(SH_C0 * (sh0[i, 0] - members.sh0[j, 0])).mean())
             ratios += float(np.clip(ratio, -FAR, FAR))
         shares = [kind / max(seen, 1) for kind in kinds]
-        actual[i, :6] = [np.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
+        actual[i, :6] = [elementary.log1p(seen) / 3, *shares, color / max(kinds[0], 1), ratios / max(seen, 1) / FAR]
     return actual
 
 
@@ -68,7 +69,7 @@ def test_pixels_show_the_gaussians_that_are_named(scene: Scene) -> None:
     """Rows in another order with the pixels that show them say what the grid says; pixels without any say nothing."""
     members, g, cameras = scene_members(scene), scene.gaussians, scene.cameras
     order = np.random.default_rng(1).permutation(len(g))
-    fronts = np.argsort(order).astype(np.int32).reshape(4, 18, 24)
+    fronts = np.argsort(order, kind="stable").astype(np.int32).reshape(4, 18, 24)
     columns = {name: getattr(members, name)[order] for name in ("means", "opacities", "sh0")}
     views = np.arange(len(g)) // scene.pixels_per_view
     shuffled = replace(members, **columns, pixels=order, fronts=fronts)

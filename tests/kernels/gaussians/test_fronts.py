@@ -9,6 +9,7 @@ import pytest
 from made_gaussians import random_gaussians
 
 from gsmerge.geometry import project
+from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.fronts import weigh_centres
 from gsmerge.stages.assign import find_pixels
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -37,7 +38,7 @@ def slowly(gaussians: Gaussians, view: int) -> tuple[np.ndarray, np.ndarray, np.
             continue
         row, column = int(np.clip(y, 0, HEIGHT - 1)), int(np.clip(x, 0, WIDTH - 1))
         weight = gaussians.opacities[i] * passing[row, column]
-        weights[i] = weight * (middle * long + 0.3) * np.exp(-away / radius2 / 2)
+        weights[i] = weight * (middle * long + 0.3) * elementary.exp(-away / radius2 / 2)
         pixels[i] = row * WIDTH + column
         if away > 0:
             continue

@@ -18,7 +18,7 @@ def test_neighbours_of_other_views(num: int, views: int) -> None:
     neighbors = nearest_of_other_views(means, owners, count)
     assert neighbors.shape == (num, count)
     for i, row in enumerate(neighbors):
-        near = np.argsort(np.linalg.norm(means - means[i], axis=1))
+        near = np.argsort(np.linalg.norm(means - means[i], axis=1), kind="stable")
         others = [j for j in near if j != i and (owners[i] < 0 or owners[j] != owners[i])][:count]
         assert row.tolist() == others + [-1] * (count - len(others))
 
@@ -32,7 +32,7 @@ def test_neighbours_are_the_same_on_any_number_of_threads() -> None:
         with use_threads(threads):
             results.append(nearest_of_other_views(means, owners, 16))
     np.testing.assert_array_equal(*results)
-    for i in generator.choice(40_000, 200):
+    for i in generator.choice(40_000, 30):
         near = np.sort(np.linalg.norm(means[owners != owners[i]] - means[i], axis=1))[:16]
         np.testing.assert_allclose(np.linalg.norm(means[results[0][i]] - means[i], axis=1), near)
 
@@ -41,7 +41,7 @@ def test_what_lies_behind_thousands_of_the_own_view_is_not_looked_for() -> None:
     crowd = np.random.default_rng(0).normal(size=(5000, 3))
     neighbors = nearest_of_other_views(np.concatenate([crowd, [[50, 0, 0]]]), np.array([0] * 5000 + [1]), 4)
     assert (neighbors[:5000] == -1).mean() > 0.9
-    nearest = np.argsort(np.linalg.norm(crowd - [50, 0, 0], axis=1))[:4]
+    nearest = np.argsort(np.linalg.norm(crowd - [50, 0, 0], axis=1), kind="stable")[:4]
     assert neighbors[5000].tolist() == nearest.tolist()
 
 

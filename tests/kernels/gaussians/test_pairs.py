@@ -70,11 +70,11 @@ def run(cloud: dict[str, np.ndarray], order: np.ndarray, starts: np.ndarray, lea
 
 
 def test_the_cheapest_pair_is_merged_again_and_again() -> None:
-    cloud, order = cloud_of(60), np.random.default_rng(1).permutation(60)
-    starts = np.array([0, 24, 25, 25, 60])
+    cloud, order = cloud_of(33), np.random.default_rng(1).permutation(33)
+    starts = np.array([0, 12, 13, 13, 33])
     pairs, costs = run(cloud, order, starts, 0.25)
-    assert [int(np.isfinite(costs[a:b]).sum()) for a, b in pairwise(starts)] == [18, 0, 0, 27]
-    for low, high, least in ((0, 24, 6), (25, 60, 8)):
+    assert [int(np.isfinite(costs[a:b]).sum()) for a, b in pairwise(starts)] == [9, 0, 0, 15]
+    for low, high, least in ((0, 12, 3), (13, 33, 5)):
         expected, expected_costs = agglomerate_slowly(cloud, order[low:high], least)
         made = slice(low, low + len(expected))
         np.testing.assert_allclose(costs[made], expected_costs, rtol=2e-3)

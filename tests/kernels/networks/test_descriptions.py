@@ -11,6 +11,7 @@ from messages import refuses
 from network_fixtures import Made, made
 
 from gsmerge.geometry import quat_to_rotmat
+from gsmerge.kernels.elementary import log
 from gsmerge.networks.corrections import move_features, move_gaussians
 from gsmerge.networks.options import FEATURE, MEMBER, PART, RESIDUAL
 from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
@@ -45,9 +46,13 @@ def slow_frame(mean: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(away, right), away], 1)
 
 
+def arcsinh(values: np.ndarray) -> np.ndarray:
+    return np.sign(values) * log(np.abs(values) + np.sqrt(values * values + 1))
+
+
 def logit(opacity: float) -> float:
     inside = min(max(float(opacity), 1e-4), 1 - 1e-4)
-    return np.log(inside / (1 - inside))
+    return log(inside / (1 - inside))
 
 
 def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[float]:
@@ -55,10 +60,14 @@ def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[f
     f, base = features.features, features.base
     mean, pixel, size = (np.float64(x[row]) for x in (base.means, f.footprints, features.sizes))
     frame, count = slow_frame(mean, viewmat), int(np.diff(f.starts)[row])
-    local = np.arcsinh(frame.T @ f.covars[row].astype(np.float64) @ frame / size**2)
+    local = arcsinh(frame.T @ f.covars[row].astype(np.float64) @ frame / size**2)
     place = viewmat[:3, :3] @ mean + viewmat[:3, 3]
-    numbers = [*np.clip(np.log(base.scales[row] / pixel), -12, 12) / 4, logit(base.opacities[row]) / 3]
-    numbers += [np.log(f.masses[row] / pixel**3) / 10, np.log(f.extinctions[row] / pixel**2) / 10, np.log(count) / 4]
+    numbers = [*np.clip(log(base.scales[row] / pixel), -12, 12) / 4, logit(base.opacities[row]) / 3]
+    numbers += [
+        log(f.masses[row] / pixel**3) / 10,
+        log(f.extinctions[row] / pixel**2) / 10,
+        log(count) / 4,
+    ]
     numbers += [f.weights[row] / count, *(SH_C0 * base.sh0[row, 0]), *local[np.triu_indices(3)]]
     return [*numbers, *np.clip(place[:2] / max(place[2], 1e-6), -3, 3)]
 
@@ -72,9 +81,9 @@ def slow_part(features: GroupFeatures, parts: Gaussians, part: int, owner: int) 
     normal = frame.T @ quat_to_rotmat(parts.quats[part].astype(np.float64))[:, np.argmin(parts.scales[part])]
     normal *= -(1 - scales[0] / scales[1]) * np.sign(normal[2])
     color = SH_C0 * (parts.sh0[part, 0].astype(np.float64) - base.sh0[owner, 0])
-    numbers = [*np.arcsinh(offset / size), *np.clip(np.log(scales / pixel), -12, 12) / 4]
+    numbers = [*arcsinh(offset / size), *np.clip(log(scales / pixel), -12, 12) / 4]
     numbers += [logit(parts.opacities[part]) / 3, *color, *normal]
-    return [*numbers, *np.arcsinh(offset / pixel), *(SH_C0 * parts.sh0[part, 0])]
+    return [*numbers, *arcsinh(offset / pixel), *(SH_C0 * parts.sh0[part, 0])]
 
 
 def test_groups(some: Made, each_target: Each) -> None:

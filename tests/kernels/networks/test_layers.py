@@ -12,6 +12,7 @@ import pytest
 from network_fixtures import noisy
 from sweeps import sweep
 
+from gsmerge.kernels import elementary
 from gsmerge.kernels.networks.layers import (
     GELU,
     PLAIN,
@@ -108,7 +109,7 @@ def slow_attention(query: np.ndarray, keys: np.ndarray, values: np.ndarray, mask
     for s, q, h in np.ndindex(*query.shape[:2], heads):
         part = slice(h * size, (h + 1) * size)
         scores = keys[s, :, part].astype(np.float64) @ query[s, q, part] / math.sqrt(size)
-        shares = np.where(mask[s], np.exp(scores - scores[mask[s]].max()), 0)
+        shares = np.where(mask[s], elementary.exp(scores - scores[mask[s]].max()), 0)
         out[s, q, part] = shares @ values[s, :, part] / shares.sum()
     return out
 

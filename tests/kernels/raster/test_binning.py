@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gsmerge.kernels import elementary
 from gsmerge.kernels.raster import binning
 
 RNG = np.random.default_rng(0)
@@ -56,7 +57,7 @@ def test_tile_lists(tile_height: int, tile_width: int) -> None:
 
 
 def test_tile_lists_end_where_nothing_behind_is_seen() -> None:
-    conics = np.tile(np.array([8, 8, 1e-6, 0, 1e-9, np.log(0.9), 0, 40], np.float32), (9, 1))
+    conics = np.tile(np.array([8, 8, 1e-6, 0, 1e-9, elementary.log(0.9), 0, 40], np.float32), (9, 1))
     conics[2] = [8, 8, 9, 0, 9, 0, 0, 40]  # covers no tile
     order, boxes = np.arange(9, dtype=np.int32), np.tile(np.array([0, 2, 0, 3], np.int16), (9, 1))
     boxes[:, 1] = [1, 2, 2, 2, 2, 2, 2, 2, 1]

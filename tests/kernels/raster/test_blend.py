@@ -10,6 +10,7 @@ from slow_renderer import Reference, render_arrays
 from sweeps import sweep
 
 from gsmerge import Cameras, Gaussians
+from gsmerge.kernels import elementary
 from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr
 
@@ -18,8 +19,8 @@ WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 
 def turned_camera() -> Cameras:
     viewmat = np.eye(4)
-    viewmat[0, 0] = viewmat[2, 2] = np.cos(0.2)
-    viewmat[0, 2], viewmat[2, 0] = np.sin(0.2), -np.sin(0.2)
+    viewmat[0, 0] = viewmat[2, 2] = elementary.cos(0.2)
+    viewmat[0, 2], viewmat[2, 0] = elementary.sin(0.2), -elementary.sin(0.2)
     viewmat[:3, 3] = [-0.4, 0.1, 0.2]
     K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])
     return Cameras(viewmat[None], K[None], WIDTH, HEIGHT)
@@ -62,7 +63,7 @@ def test_depth_range_matches() -> None:
 @sweep("scale", [1e-6, 0.3, 3.0], often=2)
 def test_tiny_and_large_gaussians_match(scale: float) -> None:
     gaussians, cameras = random_gaussians(200, 9), turned_camera()
-    scales = np.exp(0.5 * np.log(gaussians.scales / 0.05)) * scale
+    scales = elementary.exp(0.5 * elementary.log(gaussians.scales / 0.05)) * scale
     resized = replace(gaussians, scales=scales, opacities=gaussians.opacities * 0.3)
     assert_alike(render(resized, cameras).images[0], reference(resized, cameras).image)
 

@@ -80,7 +80,7 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
     assert view_owners(tiled, 1 - rows, 2)[1].tolist() == [0]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@sweep("seed", [0, 1])
 def test_the_best_of_all_views(seed: int) -> None:
     gaussians = random_gaussians(150, seed, size=-2.5)
     viewmats = np.stack([np.eye(4)] * 3)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
+from gsmerge.kernels.elementary import exp, sin
 from gsmerge.kernels.raster import image_loss, project, sh
 
 RNG = np.random.default_rng(0)
@@ -26,7 +27,7 @@ def normal(*shape: int) -> np.ndarray:
 def columns_of(n: int, num: int = 3, *, hostile: bool = False) -> Columns:
     """Gaussians in front of the camera; every third number is a hostile one if that is asked for."""
     columns = {
-        "means": normal(n, 3) + np.float32([0, 0, 3]), "quats": normal(n, 4), "scales": np.exp(normal(n, 3) - 3),
+        "means": normal(n, 3) + np.float32([0, 0, 3]), "quats": normal(n, 4), "scales": exp(normal(n, 3) - 3),
         "opacities": RNG.random(n, dtype=np.float32), "sh0": normal(n, 1, 3), "shN": normal(n, num, 3),
     }  # fmt: skip
     for column in columns.values() if hostile else ():
@@ -83,7 +84,7 @@ def project_back(c: Columns) -> list[np.ndarray]:
     ids = listed(len(c["means"]))
     m, block = len(ids), project.BLOCK
     results = [np.empty(shape, np.float32) for shape in ((m, 3), (m, 4), (m, 3), m, (-(-m // block), 12))]
-    sums = np.sin(np.arange(9 * m, dtype=np.float32)).reshape(m, 9)
+    sums = sin(np.arange(9 * m, dtype=np.float32)).reshape(m, 9)
     head = c["means"], c["quats"], c["scales"], c["opacities"], ids, sums, camera_of(True)
     project.project_backward(*head, 0, m, *results)
     parts = [np.empty_like(one) for one in results]
@@ -99,7 +100,7 @@ def colors_of(c: Columns) -> list[np.ndarray]:
     m, num = len(ids), c["shN"].shape[1]
     results = [np.empty(shape, np.float32) for shape in ((m, 3), (m, 1, 3), (m, num, 3), (m, 3))]
     sh.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, 0, m, results[0])
-    grad = np.sin(np.arange(3 * m, dtype=np.float32)).reshape(m, 3)
+    grad = sin(np.arange(3 * m, dtype=np.float32)).reshape(m, 3)
     head = c["means"], c["shN"], ids, eye
     sh.view_colors_backward(*head, 0, m, results[0], grad, *results[1:])
     parts = [np.empty_like(one) for one in results]

@@ -10,9 +10,10 @@ from scenes import intrinsics, look_at, make_scene, room
 
 from gsmerge.alignment import choose_depths
 from gsmerge.geometry import camera_centres, camera_depths
+from gsmerge.kernels.elementary import cos, sin
 from gsmerge.types import Cameras, Scene
 
-VIEWS, WIDTH, HEIGHT = 5, 96, 72
+VIEWS, WIDTH, HEIGHT = 5, 64, 48
 EYES = np.array([[-0.7, 0.2, 0], [-0.3, -0.3, 0.7], [0, 0.3, -0.6], [0.4, -0.2, 0.4], [0.8, 0.1, -0.2]])
 
 
@@ -77,10 +78,10 @@ def test_one_view_is_wrong() -> None:
 
 def test_many_views_with_little_parallax() -> None:
     """The nearest views of a film hardly contradict any depth: those farther away are asked, too."""
-    t = np.linspace(-1, 1, 60)
-    scene, maps, distances = scene_from(np.stack([0.9 * t, 0.2 * np.sin(3 * t), 0.4 * np.cos(4 * t)], 1))
+    t = np.linspace(-1, 1, 40)
+    scene, maps, distances = scene_from(np.stack([0.9 * t, 0.2 * sin(3 * t), 0.4 * cos(4 * t)], 1))
     wrong = moved_by(maps / distances, scene)
-    _, count = choose_depths(wrong, maps.reshape(60, HEIGHT, WIDTH), 1.0)
+    _, count = choose_depths(wrong, maps.reshape(40, HEIGHT, WIDTH), 1.0)
     assert count == len(wrong.gaussians)
 
 

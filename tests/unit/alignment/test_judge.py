@@ -51,7 +51,7 @@ SWAPPED = [[0, 1, 2], [1, 0, 2]]
 
 @pytest.mark.parametrize("true", SWAPPED)
 def test_colours_tell_views_from_one_place_apart(twins: Smooth, true: list[int]) -> None:
-    inverse = np.argsort(true)
+    inverse = np.argsort(true, kind="stable")
     actual = recover(clues_of(twins, twins.images[inverse], SWAPPED))
     assert isinstance(actual, Recovery)
     assert list(actual.best.layout.views) == true

@@ -19,22 +19,22 @@ from gsmerge.alignment.registration.register import register
 from gsmerge.alignment.registration.similarities import DIGITS, fit_similarities
 from gsmerge.errors import SceneError
 from gsmerge.facts.views import subset
-from gsmerge.geometry import Similarity, camera_centres, turn_harmonics
+from gsmerge.geometry import Similarity, camera_centres
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_scene
 from gsmerge.types import grid_ids
 
-VIEWS = 6
+VIEWS, WIDTH, HEIGHT = 6, 144, 96
 SCALES = (1.1, 0.8, 1.25, 0.93, 1.0, 0.87)
 PATHS = [Path(f"{name}.ply") for name in "abcdef"]
 
 
-def made_scene(seed: int) -> Scene:
+def made_scene(seed: int, views: int = VIEWS) -> Scene:
     """A photographed room with the depth errors of a network."""
     ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
-    options = GenerateOptions(views=(VIEWS, VIEWS), width=240, height=160, style="room", path="arc", ranges=ranges)
+    options = GenerateOptions(views=(views, views), width=WIDTH, height=HEIGHT, style="room", path="arc", ranges=ranges)
     made = make_scene(seed, 0, options)
-    ids = grid_ids(np.ones((VIEWS, 160, 240), bool))
-    return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"))
+    ids = grid_ids(np.ones((views, HEIGHT, WIDTH), bool))
+    return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"[:views]))
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +48,12 @@ def parts(place: Scene) -> list[Scene]:
 
 
 def test_views_are_found_up_to_a_similarity(place: Scene, parts: list[Scene]) -> None:
-    """Within half a degree and one per cent of the truth."""
-    joined = join_scenes(parts, PATHS)
-    assert joined.used == (0, 1, 2, 3, 4, 5)
-    true, found = place.cameras.viewmats, joined.scene.cameras.viewmats
+    """Within half a degree and one per cent of the truth, and the first file stays; three pairs take a second."""
+    joined = join_scenes(parts[:3], PATHS[:3])
+    assert joined.used == (0, 1, 2)
+    true, found = place.cameras.viewmats[:3], joined.scene.cameras.viewmats
     centres = [camera_centres(poses)[None] for poses in (found, true)]
-    _, scales, _ = fit_similarities(*centres, np.ones((1, VIEWS)))
+    _, scales, _ = fit_similarities(*centres, np.ones((1, 3)))
     # the rotation of all views at once, and what each is off by then
     turns = found[:, :3, :3].swapaxes(1, 2) @ true[:, :3, :3]
     u, _, v = np.linalg.svd(turns.sum(0))
@@ -63,20 +63,15 @@ def test_views_are_found_up_to_a_similarity(place: Scene, parts: list[Scene]) ->
     missed = np.linalg.norm(scales[0] * apart[0] @ (u @ v) - apart[1], axis=1)
     assert missed.max() < 0.01 * np.linalg.norm(apart[1], axis=1).max()
     own = np.array([fact["scale"] for fact in joined.facts])
-    assert np.abs(own * SCALES / SCALES[0] - 1).max() < 0.01
-
-
-def test_the_first_file_stays_where_it_is(parts: list[Scene]) -> None:
-    joined = join_scenes(parts[:2], PATHS[:2])
-    size = parts[0].pixels_per_view
-    assert np.array_equal(joined.scene.gaussians.means[:size], parts[0].gaussians.means)
-    assert np.array_equal(joined.scene.images, np.concatenate([parts[0].images, parts[1].images]))
-    assert joined.scene.names == ("a", "b")
-    assert names(joined.notes[0], "2 of 2", "a.ply")
+    assert np.abs(own * SCALES[:3] / SCALES[0] - 1).max() < 0.01
+    assert np.array_equal(joined.scene.gaussians.means[: WIDTH * HEIGHT], parts[0].gaussians.means)
+    assert np.array_equal(joined.scene.images, np.concatenate([part.images for part in parts[:3]]))
+    assert joined.scene.names == ("a", "b", "c")
+    assert names(joined.notes[0], "3 of 3", "a.ply")
 
 
 def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
-    stranger = split_views(made_scene(5), SCALES)[1]
+    stranger = split_views(made_scene(5, 2), SCALES[:2])[1]
     joined = join_scenes([stranger, *parts[:2]], PATHS[:3])
     assert joined.used == (1, 2)
     assert [fact["joined"] for fact in joined.facts] == [False, True, True]
@@ -98,8 +93,8 @@ def test_files_of_several_views(place: Scene) -> None:
 
 
 def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
-    bare = [replace(part, images=None) for part in parts[:3]]
-    assert join_scenes(bare, PATHS[:3]).used == (0, 1, 2)
+    bare = [replace(part, images=None) for part in parts[:2]]
+    assert join_scenes(bare, PATHS[:2]).used == (0, 1)
     joined = join_scenes([bare[0], parts[1]], PATHS[:2])
     assert joined.scene.images is None
     assert "photos" in joined.notes[-1]
@@ -131,9 +126,9 @@ def test_files_that_cannot_be_joined(parts: list[Scene]) -> None:
     unaligned = replace(parts[1], pixel_ids=None)
     with refuses(SceneError, "b.ply", "-o"):
         join_scenes([parts[0], unaligned], PATHS[:2])
-    small = replace(parts[1].cameras, width=160, height=240)
-    tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, 240, 160, 3))
-    with refuses(SceneError, "b.ply", "240 x 160", "a.ply", "160 x 240"):
+    small = replace(parts[1].cameras, width=HEIGHT, height=WIDTH)
+    tall = replace(parts[1], cameras=small, images=parts[1].images.reshape(1, WIDTH, HEIGHT, 3))
+    with refuses(SceneError, "b.ply", "144 x 96", "a.ply", "96 x 144"):
         join_scenes([parts[0], tall], PATHS[:2])
     g = parts[1].gaussians
     shiny = replace(parts[1], gaussians=replace(g, shN=np.zeros((len(g), 3, 3), np.float32)))
@@ -150,7 +145,7 @@ def test_similarities_of_exact_points() -> None:
     assert np.allclose(shifts, shift)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3, 4])
+@pytest.mark.parametrize("degree", [0, 4])
 def test_a_moved_scene_looks_the_same(degree: int) -> None:
     """Gaussians, harmonics and cameras move together."""
     rng, num = np.random.default_rng(1), (degree + 1) ** 2 - 1
@@ -179,8 +174,3 @@ def test_a_moved_scene_looks_the_same(degree: int) -> None:
 
 def pinholes(poses: np.ndarray, K: np.ndarray) -> Cameras:
     return Cameras(poses, np.tile(K, (2, 1, 1)), 32, 24)
-
-
-def test_a_turn_back_gives_the_same_harmonics() -> None:
-    shN, turn = np.random.default_rng(2).normal(size=(7, 15, 3)).astype(np.float32), rotation(1.0, 0.3, -2.0)
-    assert np.allclose(turn_harmonics(turn_harmonics(shN, turn), turn.T), shN, atol=1e-5)

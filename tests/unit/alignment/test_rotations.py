@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene, with_surface_rotations
+from sweeps import sweep
 from tiny_scene import Tiny
 
 from gsmerge.alignment.rotations import square_roots
 from gsmerge.geometry import covariances, normalize, quat_to_rotmat
+from gsmerge.kernels import elementary
 from gsmerge.scene.read import load_scene, read_scene
 
 
@@ -27,7 +29,7 @@ def discs(noise_degrees: float) -> Tiny:
     tiny, rng = with_surface_rotations(smooth_scene(48, 36)), np.random.default_rng(4)
     n = len(tiny.gaussians)
     spin = rng.uniform(0, 2 * np.pi, n)
-    within = np.stack([np.cos(spin / 2), 0 * spin, 0 * spin, np.sin(spin / 2)], 1)
+    within = np.stack([elementary.cos(spin / 2), 0 * spin, 0 * spin, elementary.sin(spin / 2)], 1)
     tilt = rng.normal(size=(n, 3)) * np.deg2rad(noise_degrees) / 2
     off = normalize(np.concatenate([np.ones((n, 1)), tilt], 1))
     quats = product(off, product(tiny.gaussians.quats, within)).astype(np.float32)
@@ -46,7 +48,7 @@ def applied_twice(tiny: Tiny) -> np.ndarray:
 def degrees_off(actual: np.ndarray, tiny: Tiny) -> np.ndarray:
     """``[n]`` angles between the thinnest axes."""
     axes = [quat_to_rotmat(quats)[:, :, 2] for quats in (actual, tiny.gaussians.quats)]
-    return np.rad2deg(np.arccos(np.abs((axes[0] * axes[1]).sum(1)).clip(max=1)))
+    return np.rad2deg(elementary.arccos(np.abs((axes[0] * axes[1]).sum(1)).clip(max=1)))
 
 
 def covariance_error(actual: np.ndarray, tiny: Tiny) -> np.ndarray:
@@ -89,7 +91,7 @@ def test_it_can_be_given(tmp_path: Path) -> None:
         assert np.median(covariance_error(read_scene(folder, **hints).gaussians.quats, tiny)) < 0.01
 
 
-@pytest.mark.parametrize("noise", [0.0, 20.0, 40.0])
+@sweep("noise", [40.0, 0.0, 20.0])
 @pytest.mark.parametrize("last", [False, True])
 def test_files_that_store_rotations_once(tmp_path: Path, noise: float, last: bool) -> None:
     tiny = discs(noise)
@@ -102,12 +104,11 @@ def test_files_that_store_rotations_once(tmp_path: Path, noise: float, last: boo
     assert last or not any("rotations are" in note for note in notes)
 
 
-@pytest.mark.parametrize("spread", [0.0, 0.3])
-@pytest.mark.parametrize("turns", ["random", "squared"])
+@pytest.mark.parametrize(("turns", "spread"), [("random", 0.0), ("squared", 0.3)])
 def test_round_gaussians_say_nothing(tmp_path: Path, spread: float, turns: str) -> None:
     tiny, rng = discs(0.0), np.random.default_rng(9)
     n = len(tiny.gaussians)
-    scales = 0.03 * np.exp(spread * rng.normal(size=(n, 3))).astype(np.float32)
+    scales = 0.03 * elementary.exp(spread * rng.normal(size=(n, 3))).astype(np.float32)
     quats = normalize(rng.normal(size=(n, 4)).astype(np.float32))
     quats = product(quats, quats) if turns == "squared" else quats
     tiny = replace(tiny, gaussians=replace(tiny.gaussians, scales=scales, quats=quats))

@@ -17,17 +17,18 @@ from tiny_scene import make_tiny, write_images
 from gsmerge.alignment import readings, unaligned
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
+from gsmerge.kernels import elementary
 from gsmerge.scene.read import load_scene
 from gsmerge.types import SH_C0, Cameras
 
-WIDTH, HEIGHT = 64, 48
+WIDTH, HEIGHT = 56, 40
 SMOOTH = smooth_scene(WIDTH, HEIGHT)
 
 
-def voxels(share: float = 0.6) -> np.ndarray:
-    """Rows of a share of the Gaussians, in an order of space."""
+def voxels() -> np.ndarray:
+    """Rows of three fifths of the Gaussians, a prime number, in an order of space."""
     means = SMOOTH.gaussians.means
-    chosen = np.random.default_rng(0).permutation(len(means))[: round(share * len(means))]
+    chosen = np.random.default_rng(0).permutation(len(means))[:4027]
     return export_rows(SMOOTH, chosen[np.lexsort(means[chosen].round(1).T)])
 
 
@@ -45,10 +46,20 @@ def padded(rows: np.ndarray) -> np.ndarray:
     return full[grid.transpose(1, 2, 0).reshape(-1)]
 
 
-def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
+def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of its rows allows many grids; none of them is worth a search for a frame, as no camera shows them."""
+    efforts = []
+    usual = readings.candidate_similarities
+
+    def count(*args: object, effort: int = 2, **options: object) -> object:
+        efforts.append(effort)
+        return usual(*args, effort=effort, **options)
+
+    monkeypatch.setattr(readings, "candidate_similarities", count)
     rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.aligned
+    assert set(efforts) == {0}
     assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
     assert any("Gaussians that only fill the file up are left out" in note for note in loaded.notes)
     viewmats = loaded.scene.cameras.viewmats
@@ -60,7 +71,7 @@ def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path) -> None:
 def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -> None:
     first = SMOOTH.w2c[0]
     rows = turned(voxels(), first[:3, :3], scale=scale, shift=scale * first[:3, 3])
-    rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+    rows["opacity"] = 1 / (1 + elementary.exp(-rows["opacity"]))
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.aligned
     assert any("moved into the first camera" in note for note in loaded.notes)
@@ -74,22 +85,8 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
     folder = save_export(tmp_path, SMOOTH, rows)
     for photo in (folder / "images").rglob("*.png"):
         photo.unlink()
-    with refuses(SceneError, "scene.ply", 9216, "cameras"):
+    with refuses(SceneError, "scene.ply", 6720, "cameras"):
         load_scene(folder)
-
-
-def test_no_frame_is_solved_for_rows_that_no_camera_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of VolSplat's rows allows many grids; none of them is worth a search."""
-    efforts = []
-    usual = readings.candidate_similarities
-
-    def count(*args: object, effort: int = 2, **options: object) -> object:
-        efforts.append(effort)
-        return usual(*args, effort=effort, **options)
-
-    monkeypatch.setattr(readings, "candidate_similarities", count)
-    load_scene(save_export(tmp_path, SMOOTH, turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])))
-    assert set(efforts) == {0}
 
 
 def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,6 +120,7 @@ def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
 
 @pytest.mark.parametrize("fits", [True, False])
 def test_hundreds_of_cameras_take_seconds(tmp_path: Path, fits: bool) -> None:
+    """Rows of no pixels take one, as each of the many cameras is tried."""
     tiny, rng = make_tiny(24, 16), np.random.default_rng(0)
     means = tiny.gaussians.means if fits else rng.uniform(-1, 1, tiny.gaussians.means.shape).astype(np.float32)
     c2w = np.tile(np.eye(4), (400, 1, 1))

@@ -14,10 +14,11 @@ from sweeps import sweep
 
 from gsmerge.alignment.score import UPRIGHT
 from gsmerge.errors import SceneError
+from gsmerge.kernels import elementary
 from gsmerge.scene.read import Loaded, load_scene
 from gsmerge.types import SH_C0
 
-WIDTH, HEIGHT, VIEWS, TRIM = 128, 96, 3, 8
+WIDTH, HEIGHT, VIEWS, TRIM = 96, 72, 3, 8
 
 
 def with_texture(tiny: Smooth) -> Smooth:
@@ -51,7 +52,7 @@ def upright(tiny: Smooth, rows: np.ndarray, first: int = 0) -> tuple[np.ndarray,
     scale = 1 / np.quantile(np.abs(means - middle), 0.95, axis=0).max()
     turn = UPRIGHT @ tiny.w2c[first, :3, :3]
     moved = turned(rows, turn, scale=scale, shift=-scale * turn @ middle)
-    moved["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+    moved["opacity"] = 1 / (1 + elementary.exp(-rows["opacity"]))
     return moved, scale, scale * (tiny.c2w[:, :3, 3] - middle) @ turn.T
 
 
@@ -91,6 +92,7 @@ def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -
 
 @sweep("photos", ["none", "of another scene"])
 def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
+    """Takes a second: grids of all sizes are tried before it is given up."""
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)))
     strange = np.random.default_rng(5).integers(0, 256, textured.images.shape, np.uint8)
     folder = save_export(tmp_path, replace(textured, images=strange), rows)

@@ -89,13 +89,6 @@ def test_whatever_a_line_holds_the_records_can_be_read(tmp_path: Path) -> None:
         assert not any(known.holds(tmp_path, "k") for known in index.results.values())
 
 
-@pytest.mark.parametrize("line", [b'"output":[1]', b'"output":null', b'"report":5', b'"key":[]', b'"files":[7]'])
-def test_a_line_of_odd_types_is_passed_over(tmp_path: Path, line: bytes) -> None:
-    key = json.loads(b"{" + line + b"}")
-    (tmp_path / RECORDS).write_text(json.dumps(done("a.ply") | key) + "\n")
-    assert RecordIndex(tmp_path).read_on().results == {}
-
-
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
 def test_a_pipe_in_place_of_a_result_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.ply")

@@ -25,20 +25,20 @@ from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
 from gsmerge.types import Cameras, PicturedScene, Scene
 
-SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 40, "threads": 1}
+SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 10, "threads": 1}
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     """Eight views along a wall."""
-    return scenes.make_scene(scenes.wall(), scenes.arc(8, 40, 30, span=2.4, start=-1.2), noise=0.01)
+    return scenes.make_scene(scenes.wall(), scenes.arc(8, 24, 18, span=2.4, start=-1.2), noise=0.01)
 
 
-def along(places: np.ndarray) -> Scene:
+def along(places: np.ndarray, width: int = 40, height: int = 30) -> Scene:
     """Views along a wall of eight views' width, at places from 0 to 1."""
     viewmats = np.tile(np.eye(4), (len(places), 1, 1))
     viewmats[:, 0, 3] = -20 * places
-    cameras = Cameras(viewmats, scenes.intrinsics(len(places), 40, 30), 40, 30)
+    cameras = Cameras(viewmats, scenes.intrinsics(len(places), width, height), width, height)
     return scenes.make_scene(scenes.wall(), cameras, noise=0.01)
 
 
@@ -69,23 +69,18 @@ def test_blocks_are_as_good_as_one_piece() -> None:
 @sweep(("reach", "looks"), [(0.15, 4), (1.0, 2)])
 def test_rooms_that_all_views_see_take_more_steps_at_seams(reach: float, looks: int) -> None:
     """Where most Gaussians are seen from several blocks, each was fitted by a part of the photos alone."""
-    seams = compact(along(np.linspace(0, reach, 60)), blocks=2, **SETTINGS).report.choices["seams"]
+    seams = compact(along(np.linspace(0, reach, 28), 24, 18), blocks=2, **SETTINGS).report.choices["seams"]
     assert seams["steps"] == max(100, looks * seams["views"])
     assert seams["steps"] > 100 or looks == 2
 
 
-def test_a_budget_is_met_exactly(scene: Scene) -> None:
-    result = compact(scene, blocks=2, budget=700, **SETTINGS)
-    assert len(result.gaussians) == 700
-
-
 def test_a_device_limits_the_whole(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as it draws in all, not in each block; fewer where superpixels ask for fewer."""
-    monkeypatch.setitem(DEVICES, "quest3", 600)
-    assert len(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians) == 600
-    free = compact(scene, blocks=2, **SETTINGS)
+    monkeypatch.setitem(DEVICES, "quest3", 200)
+    assert len(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians) == 200
     monkeypatch.setitem(DEVICES, "quest3", 5000)
-    assert scenes.identical(compact(scene, blocks=2, budget="quest3", **SETTINGS).gaussians, free.gaussians)
+    free, limited = (compact(scene, blocks=2, fit="none", budget=budget, **SETTINGS) for budget in (None, "quest3"))
+    assert scenes.identical(limited.gaussians, free.gaussians)
 
 
 def test_threads_do_not_change_a_bit(scene: Scene) -> None:
@@ -106,7 +101,7 @@ def test_without_photos(scene: Scene) -> None:
 @pytest.mark.parametrize("checkpoint", ["none", "shipped"])
 def test_without_a_fit(scene: Scene, checkpoint: str) -> None:
     """Each Gaussian is in one block, and they show the photos as those of one piece do."""
-    settings = {**SETTINGS, "checkpoint": checkpoint, "fit": "none"}
+    settings = SETTINGS | {"checkpoint": checkpoint, "fit": "none"}
     whole, result = (compact(scene, blocks=blocks, **settings) for blocks in ("none", 2))
     scenes.assert_invariants(result.gaussians, scene)
     assert scenes.psnr_of(result.gaussians, scene) > scenes.psnr_of(whole.gaussians, scene) - 1
@@ -141,8 +136,8 @@ def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
 
 
 def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.facts.partition.WHOLE_GAUSSIANS", 5000)
-    monkeypatch.setattr("gsmerge.facts.partition.BLOCK_GAUSSIANS", 4000)
+    monkeypatch.setattr("gsmerge.facts.partition.WHOLE_GAUSSIANS", 1800)
+    monkeypatch.setattr("gsmerge.facts.partition.BLOCK_GAUSSIANS", 1440)
     assert count_blocks(scene) == 3
     assert count_blocks(scene, levels=2) == 1
 
@@ -152,7 +147,7 @@ def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> 
     [
         ({"quality": "30dB"}, "quality 30dB"), ({"budget": "auto"}, "budget auto"), ({"levels": 2}, "levels"),
         ({"method": "voxel"}, "method voxel"), ({"poses": "free"}, "poses free"), ({"drop": "sky"}, "drop sky"),
-        ({"crop": "sphere:0,0,3,2"}, "crop"), ({"drop": "floaters"}, "drop floaters"),
+        ({"crop": "sphere:0,0,3,2"}, "crop"),
     ],
 )  # fmt: skip
 def test_what_needs_one_piece(scene: Scene, settings: dict[str, Any], problem: str) -> None:
@@ -191,7 +186,7 @@ def test_what_is_fixed_stays(scene: Scene) -> None:
 
 def test_views_of_blocks_are_joined(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they are one after the other, with photos in a file or not."""
-    masks = np.random.default_rng(0).random((len(scene), 30, 40)) < 0.9
+    masks = np.random.default_rng(0).random((len(scene), 18, 24)) < 0.9
     chosen = [([6, 1], None), ([3], masks)]
     bare = [
         PicturedScene.of(replace(scene, gaussians=scene.gaussians[:0], pixel_ids=None), scene.images, mask)

@@ -24,9 +24,14 @@ from gsmerge.compaction.search import (
 )
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.kernels import elementary
 from gsmerge.pipeline import Build
 from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
+
+
+def log2(number: float) -> float:
+    return float(elementary.log(number) / elementary.log(2))
 
 
 def points(*values: tuple[int, float, float]) -> list[CurvePoint]:
@@ -148,7 +153,7 @@ def test_a_curve_needs_a_point(function: Callable[[list[CurvePoint]], int]) -> N
 
 def rises(count: int) -> float:
     """2 dB per doubling."""
-    return 20 + 2 * math.log2(count / 1000)
+    return 20 + 2 * log2(count / 1000)
 
 
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
@@ -189,7 +194,7 @@ def test_search_says_when_it_is_out_of_reach() -> None:
 
 
 def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
-    actual = search(lambda count: 20 - abs(math.log2(count / 1000)), 25.0, 1000, 10, 5000)
+    actual = search(lambda count: 20 - abs(log2(count / 1000)), 25.0, 1000, 10, 5000)
     assert actual.unmet is not None
     assert actual.best.count == 1000
 
@@ -224,7 +229,7 @@ def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
 @pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("needed", [1.1, 2.0, 7.0])
 def test_more_are_taken_until_the_input_is_kept(slope: float, needed: float) -> None:
-    actual = keep(lambda count: 32.5 + slope * math.log2(count / (1000 * needed)), 1000, 20_000)
+    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
     assert actual.best.psnr >= 32.5
     assert actual.best.count <= 1.4 * 1000 * needed
     assert len(actual.tried) <= 5
@@ -242,14 +247,14 @@ def test_what_is_compact_already_is_kept() -> None:
 @pytest.mark.parametrize("needed", [1.1, 3.0, 12.0])
 def test_more_are_taken_until_photos_are_shown_as_well(slope: float, needed: float) -> None:
     """Beyond the four times the usual count that a quality may take."""
-    actual = keep(lambda count: 32.5 + slope * math.log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
+    actual = keep(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False)
     assert actual.met
     assert actual.best.count <= 1000 * needed * 2 ** (KEPT_LOSS / slope) * CLOSE
     assert len(actual.tried) <= 5
     assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
 
 
-@pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - math.log2(count / 1000)])
+@pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - log2(count / 1000)])
 def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]) -> None:
     """As of another scene. The best is kept, even if it is the usual count."""
     actual = keep(curve, 1000, 20_000, rendered=False)
@@ -259,7 +264,7 @@ def test_photos_that_no_count_shows_end_the_search(curve: Callable[[int], float]
 
 
 def test_a_count_that_is_too_few_is_not_called_enough() -> None:
-    actual = keep(lambda count: 20 + math.log2(count / 1000), 1000, 3000, rendered=False)
+    actual = keep(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
     assert actual.best.count == 3000
     assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
 

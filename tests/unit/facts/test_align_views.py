@@ -31,6 +31,11 @@ def scene() -> Scene:
     return scenes.move(made, np.eye(3), 0.5, np.array([0, 0, 0.5 * back]))
 
 
+@pytest.fixture(scope="module")
+def small() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3))
+
+
 def worst_error(scene: Scene, truth: Scene) -> tuple[float, float]:
     """Degrees and distances between relative poses."""
     relative = [one.cameras.viewmats @ np.linalg.inv(one.cameras.viewmats[2]) for one in (scene, truth)]
@@ -77,10 +82,10 @@ def test_views_that_are_left_out_stay(scene: Scene) -> None:
     np.testing.assert_allclose(np.median(common[:4], 0), 0, atol=2e-3)
 
 
-def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: Scene) -> None:
-    viewmats = scene.cameras.viewmats.copy()
+def test_cameras_of_repeated_views_and_of_views_that_share_one(small: Scene) -> None:
+    viewmats = small.cameras.viewmats.copy()
     viewmats[1] = viewmats[0]  # of other Gaussians and another photo
-    shared = scenes.take_views(replace(scene, cameras=replace(scene.cameras, viewmats=viewmats)), [0, 1, 0, 2])
+    shared = scenes.take_views(replace(small, cameras=replace(small.cameras, viewmats=viewmats)), [0, 1, 0, 2])
     options = CompactOptions().with_settings({"fit": "none", "poses": "fixed"})
     prepared = prepare(shared, options.prepare)
     assert prepared.repeated == (0, 1, 0, 2)
@@ -93,27 +98,27 @@ def test_cameras_of_repeated_views_and_of_views_that_share_one(scene: Scene) -> 
 
 
 @pytest.mark.parametrize("cameras", [True, False])
-def test_nothing_is_moved_without_photos(cameras: bool, scene: Scene) -> None:
-    places, names = (scene.cameras, scene.names) if cameras else (scene.cameras[[]], ())
-    unaligned = Scene(scene.gaussians[::8], places, None, None, names)
+def test_nothing_is_moved_without_photos(cameras: bool, small: Scene) -> None:
+    places, names = (small.cameras, small.names) if cameras else (small.cameras[[]], ())
+    unaligned = Scene(small.gaussians[::2], places, None, None, names)
     result = compact(unaligned, poses="free", budget=200, fit_steps=4)
     assert "poses" not in result.report.choices
     np.testing.assert_array_equal(result.cameras.viewmats, places.viewmats)
 
 
-def test_all_levels_have_the_cameras_of_the_finest(scene: Scene) -> None:
-    result = compact(scene, poses="free", fit_steps=12, superpixels="2%", levels=2)
-    assert np.abs(result.cameras.viewmats - scene.cameras.viewmats).max() > 0
+def test_all_levels_have_the_cameras_of_the_finest(small: Scene) -> None:
+    result = compact(small, poses="free", fit_steps=12, superpixels="2%", levels=2)
+    assert np.abs(result.cameras.viewmats - small.cameras.viewmats).max() > 0
     np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
 
 
-def test_clean_up_keeps_the_poses_of_the_fit(scene: Scene) -> None:
-    moved = replace(scene.cameras, viewmats=scene.cameras.viewmats + 0.01)
+def test_clean_up_keeps_the_poses_of_the_fit(small: Scene) -> None:
+    moved = replace(small.cameras, viewmats=small.cameras.viewmats + 0.01)
 
     def method(*_: object) -> Fitted:
-        return Fitted(scene.gaussians, moved, None)
+        return Fitted(small.gaussians, moved, None)
 
-    options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(scene)
+    options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(small)
     assert build_cleaned(method, prepared, make_plan(prepared, options), None).cameras is moved
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from gsmerge.fit.fit_state import State, gaussians_of, start_state
 from gsmerge.fit.growth import FADED, error_masses, grow, grow_to
 from gsmerge.fit.photo_sizes import holdout_psnr, reduced, training_weights
 from gsmerge.geometry import covariances
+from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, QUAT, SIZE
 from gsmerge.raster.metrics import psnr
 from gsmerge.raster.photos import Photos, scene_photos
 
 
+@cache
 def make(degree: int) -> tuple[Scene, Gaussians]:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), degree=degree)
     actual = scenes.plain(scene, superpixels="8%")
@@ -54,7 +57,7 @@ def used(gaussians: Gaussians) -> State:
 
 def covars_of(x: np.ndarray) -> np.ndarray:
     made = x.astype(np.float64)
-    return covariances(made[:, QUAT:LOGIT], np.exp(made[:, SIZE:QUAT]))
+    return covariances(made[:, QUAT:LOGIT], elementary.exp(made[:, SIZE:QUAT]))
 
 
 # the state
@@ -248,7 +251,7 @@ def test_holdout_psnr_sets_exposure_aside(photos: Photos) -> None:
     """Views that are brighter or darker than the mean cost nothing; what they have in common still counts."""
     weights = training_weights(photos, 0.2, 0)
     factors = np.array([0.8, 1.25] * len(photos), np.float32)[: len(photos)]
-    factors /= np.exp(np.log(factors).mean())
+    factors /= elementary.exp(elementary.log(factors).mean())
     images = [0.5 * photo / factor for photo, factor in zip(photos.images, factors, strict=True)]
     halved = replace(photos, images=0.5 * photos.images)
     assert holdout_psnr(images, halved, weights, 1.15) > 60

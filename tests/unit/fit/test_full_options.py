@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from sweeps import sweep
 
-from gsmerge import Gaussians
+from gsmerge import Gaussians, Scene
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
@@ -22,10 +23,9 @@ from gsmerge.raster.photos import Photos
 from gsmerge.settings.fit import GROW_STEPS, LONG_STEPS, USUAL_SHARE, Tuning
 
 
-@pytest.mark.parametrize("coarse", [0.5, 1.0])
-def test_steps_do_not_look_where_the_mask_is_not(coarse: float) -> None:
+@sweep("coarse", [0.5, 1.0])
+def test_steps_do_not_look_where_the_mask_is_not(coarse: float, scene: Scene, truth: Gaussians) -> None:
     """Rubbish on the left third of every photo; at both sizes, and at half size alone."""
-    scene, truth = scenes.self_made(0)
     start = scenes.spoil(truth)
     options = FitOptions(fit_steps=40, holdout=0.2, half_res_share=coarse, dropout=0.0)
 

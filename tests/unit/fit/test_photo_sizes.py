@@ -201,7 +201,7 @@ def test_result_does_not_depend_on_threads(truth: Gaussians, scene: Scene) -> No
     for threads in (1, 3):
         with use_threads(threads):
             photos = fit_photos(with_large(scene, 2), replace(LONG, photo_scale=2))
-            results.append(fit(start, FitJob(photos, LONG, count=len(start) + 20))[0])
+            results.append(fit(start, FitJob(photos, replace(LONG, fit_steps=60), count=len(start) + 20))[0])
     assert scenes.identical(*results)
 
 

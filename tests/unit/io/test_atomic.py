@@ -4,7 +4,6 @@ import errno
 import itertools
 import os
 import re
-import signal
 import stat
 import subprocess
 import sys
@@ -227,51 +226,6 @@ def test_an_interrupt_between_renames_waits_for_the_last(
     with pytest.raises(KeyboardInterrupt):
         write_three(tmp_path)
     assert contents(tmp_path) == ["new"] * 3
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals as POSIX has them")
-@pytest.mark.parametrize("call", range(4))
-def test_a_kill_between_renames_leaves_each_file_old_or_new(tmp_path: Path, call: int) -> None:
-    """A kill before each of three renames, and after the last."""
-    for name in ("a.txt", "b.txt"):
-        (tmp_path / name).write_text("old")
-    program = f"""
-import itertools, os, signal
-from pathlib import Path
-from gsmerge.io import atomic_outputs
-calls, replace = itertools.count(), os.replace
-def kill_or_rename(*paths):
-    if next(calls) == {call}:
-        os.kill(os.getpid(), signal.SIGKILL)
-    replace(*paths)
-os.replace = kill_or_rename
-with atomic_outputs(overwrite=True) as add:
-    for name in ("a.txt", "b.txt", "c.txt"):
-        add(Path({str(tmp_path)!r}, name)).write_text("new")
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=False)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    remove_stale(tmp_path)
-    assert contents(tmp_path) == ["new"] * call + ["old", "old", None][call:]
-
-
-def test_a_folder_is_searched_for_the_rest_of_killed_processes_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "far").mkdir()
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    name = temporary_path(tmp_path / "a.txt").name.replace(f"-{os.getpid()}-", f"-{int(dead.stdout)}-")
-    for folder in (tmp_path, tmp_path / "far"):
-        (folder / name).touch()
-    searched, scan = [], os.scandir
-    monkeypatch.setattr(os, "scandir", lambda folder: searched.append(Path(folder)) or scan(folder))
-    monkeypatch.chdir(tmp_path)
-    for path in ("a.txt", tmp_path / "b.txt", "far/c.txt", "far/d.txt"):
-        with atomic_output(path):
-            pass
-    assert searched == [tmp_path, tmp_path / "far"]
-    assert not any((folder / name).exists() for folder in searched)
 
 
 def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, generate_scene
 from gsmerge.scene.read import load_scene
 
-WIDTH, HEIGHT, SCALE = 72, 48, 3
+WIDTH, HEIGHT, SCALE = 48, 32, 3
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
     return max(offsets, key=lambda offset: fits(*offset))
 
 
-@pytest.mark.parametrize("scale", [1.5, 2, 3])
+@pytest.mark.parametrize("scale", [1.5, 3])
 def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
     scene = gsmerge.read_scene(made)
     assert scene.aligned
@@ -84,7 +84,7 @@ def test_cameras_may_have_the_photos_size(folder: Path) -> None:
     np.testing.assert_allclose(scene.large_photos.Ks, scene.cameras.Ks * [[SCALE], [SCALE], [1]])
 
 
-@pytest.mark.parametrize("k1", [0.0, -0.05])
+@pytest.mark.parametrize("k1", [pytest.param(0.0, marks=pytest.mark.slow), -0.05])
 def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
     """The grid is the middle of wider photos, which a lens has bent."""
     side = 31
@@ -143,56 +143,56 @@ def test_a_photo_that_is_gone_when_it_is_needed(folder: Path) -> None:
         large_photos(scene, 2)
 
 
-SMOOTH = smooth_scene(48, 36)
+SMOOTH = smooth_scene(24, 18)
 LARGE = replace(
     SMOOTH,
     K=SMOOTH.K * np.array([[4.0], [4], [1]]),
-    width=192,
-    height=144,
-    images=np.stack([cv2.resize(image, (192, 144), interpolation=cv2.INTER_CUBIC) for image in SMOOTH.images]),
+    width=96,
+    height=72,
+    images=np.stack([cv2.resize(image, (96, 72), interpolation=cv2.INTER_CUBIC) for image in SMOOTH.images]),
 )
-NOTE = "views of 192 x 144 are worked on at 96 x 72: no side is longer than 96 pixels (max_side)"
+NOTE = "views of 96 x 72 are worked on at 48 x 36: no side is longer than 48 pixels (max_side)"
 
 
 def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
-    order = np.random.default_rng(0).permutation(3 * 36 * 48)[:3000] if shuffled else None
+    order = np.random.default_rng(0).permutation(3 * 18 * 24)[:750] if shuffled else None
     return save_export(folder, tiny, export_rows(SMOOTH, order))
 
 
 @pytest.mark.parametrize("order", ["auto", "none"])
 def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
-    loaded = load_scene(save(tmp_path), order=order, max_side=96)
+    loaded = load_scene(save(tmp_path), order=order, max_side=48)
     scene = loaded.scene
     assert not scene.aligned
     assert NOTE in loaded.notes
-    assert scene.images.shape == (3, 72, 96, 3)
-    assert (scene.cameras.width, scene.cameras.height) == (96, 72)
+    assert scene.images.shape == (3, 36, 48, 3)
+    assert (scene.cameras.width, scene.cameras.height) == (48, 36)
     assert np.allclose(scene.cameras.Ks, SMOOTH.K * np.array([[2.0], [2], [1]]))
-    small = np.stack([cv2.resize(image, (96, 72), interpolation=cv2.INTER_AREA) for image in LARGE.images])
+    small = np.stack([cv2.resize(image, (48, 36), interpolation=cv2.INTER_AREA) for image in LARGE.images])
     assert np.abs(scene.images * 255 - small).max() < 0.6
 
 
 def test_small_enough_views_stay(tmp_path: Path) -> None:
-    loaded = load_scene(save(tmp_path), max_side=192)
-    assert loaded.scene.cameras.width == 192
+    loaded = load_scene(save(tmp_path), max_side=96)
+    assert loaded.scene.cameras.width == 96
     assert not any("max_side" in note for note in loaded.notes)
-    assert load_scene(tmp_path).scene.cameras.width == 192
+    assert load_scene(tmp_path).scene.cameras.width == 96
 
 
 def test_cameras_without_photos_are_resized_too(tmp_path: Path) -> None:
     folder = save(tmp_path)
     for path in (folder / "images").rglob("*.png"):
         path.unlink()
-    loaded = load_scene(folder, max_side=96)
+    loaded = load_scene(folder, max_side=48)
     assert loaded.scene.images is None
-    assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (96, 72)
+    assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (48, 36)
     assert NOTE in loaded.notes
 
 
 def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
     loaded = load_scene(save(tmp_path, shuffled=False), max_side=16)
     assert loaded.scene.aligned
-    assert loaded.scene.cameras.width == 48
+    assert loaded.scene.cameras.width == 24
 
 
 @pytest.mark.parametrize("shuffled", [False, True])
@@ -200,11 +200,11 @@ def test_memory_is_bounded_before_pixels_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shuffled: bool
 ) -> None:
     """More photos than fit are resized first; a grid that they were resized to is found all the same."""
-    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 100 * 75 * 12)
-    loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=96)
+    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 52 * 39 * 12)
+    loaded = load_scene(save(tmp_path, shuffled=shuffled), max_side=48)
     assert NOTE in loaded.notes
     assert loaded.scene.aligned != shuffled
-    size = (96, 72) if shuffled else (48, 36)
+    size = (48, 36) if shuffled else (24, 18)
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == size
 
 

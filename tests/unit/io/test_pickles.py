@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 from messages import refuses
-from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.io import pickles
+from gsmerge.io import bounds, pickles
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.io.pickles import StandIn, read_pickle
 
@@ -110,7 +109,7 @@ def test_damage_ends_in_a_value_or_in_a_refusal() -> None:
         with refuses(ValueError, ""):
             read_pickle(content[:length], BUDGET, {})
     draw, refused = random.Random(0), count()
-    for _ in range(5000):
+    for _ in range(1500):
         spoilt = bytearray(content)
         for _ in range(draw.randint(1, 3)):
             spoilt[draw.randrange(len(spoilt))] = draw.randrange(256)
@@ -118,10 +117,17 @@ def test_damage_ends_in_a_value_or_in_a_refusal() -> None:
             read_pickle(bytes(spoilt), BUDGET, NAMES)
         except ValueError:
             next(refused)
-    assert 1000 < next(refused) < 5000
+    assert 300 < next(refused) < 1500
 
 
-@sweep("unit", [b"]", b"}K\1Ns", b"}", b"(", b"\x8c\3\xe2\x82\xac"], often=2)
+def test_steps_are_as_many_as_the_bytes_allow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounds, "_FREE_STEPS", 1000)
+    with refuses(SceneError, "a", "1,100", "steps"):
+        read_pickle(b"\x80\x02" + b"]" * 1200, BUDGET, {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [b"]", b"}K\1Ns", b"}", b"(", b"\x8c\3\xe2\x82\xac"])
 def test_structures_stay_within_the_budget(unit: bytes) -> None:
     num_bytes = 200_000
     tracemalloc.start()

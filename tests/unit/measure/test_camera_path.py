@@ -9,8 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from messages import refuses
+from sweeps import sweep
 
 from gsmerge.geometry import camera_centres, motion_matrices, project
+from gsmerge.kernels import elementary
 from gsmerge.measure.camera_path import (
     ACROSS,
     UPRIGHT,
@@ -50,14 +52,14 @@ def walk() -> Cameras:
 def angles_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles (radians) between rotations ``[n,4,4]``."""
     cosines = ((a[:, :3, :3] * b[:, :3, :3]).sum((1, 2)) - 1) / 2
-    return np.arccos(cosines.clip(-1, 1))
+    return elementary.arccos(cosines.clip(-1, 1))
 
 
 def pose_steps(path: Cameras, depth: float = DEPTH) -> np.ndarray:
     """How far each camera is from the one before, turns by what they move at the depth."""
     shifts = np.linalg.norm(np.diff(camera_centres(path.viewmats), axis=0), axis=1)
     turns = angles_between(path.viewmats[1:], path.viewmats[:-1])
-    return np.hypot(shifts, depth * turns)
+    return np.sqrt(shifts**2 + (depth * turns) ** 2)
 
 
 def ring(count: int, degrees: float, pitch: float = 0.3) -> Cameras:
@@ -160,7 +162,7 @@ def test_a_spline_far_from_the_origin_is_the_same(walk: Cameras) -> None:
     np.testing.assert_allclose(moved, camera_centres(spline(walk, DEPTH, 40).viewmats), atol=1e-6)
 
 
-@pytest.mark.parametrize("count", [2, 7, 60])
+@sweep("count", [60, 2, 7])
 def test_an_orbit_is_closed_even_upright_and_looks_at_its_middle(walk: Cameras, count: int) -> None:
     path = orbit(walk, DEPTH, count)
     centres = camera_centres(path.viewmats)
@@ -177,7 +179,7 @@ def test_an_orbit_is_closed_even_upright_and_looks_at_its_middle(walk: Cameras, 
         assert steps.max() / steps.min() < (1.01 if count > 50 else 1.2)
 
 
-@pytest.mark.parametrize(("apart", "radius"), [(0.0, ACROSS[0] * DEPTH), (0.5, 0.5), (9.0, ACROSS[1] * DEPTH)])
+@sweep(("apart", "radius"), [(0.0, ACROSS[0] * DEPTH), (0.5, 0.5), (9.0, ACROSS[1] * DEPTH)], often=2)
 def test_an_orbit_is_as_wide_as_the_cameras_stand_within_limits(apart: float, radius: float) -> None:
     places = [[-apart, 0, 0], [0, 0, 0], [apart, 0, 0]]
     cameras = make_cameras(places, np.zeros((3, 3)).tolist())
@@ -192,7 +194,7 @@ def test_the_middle_camera_is_none_that_looks_elsewhere() -> None:
     assert median_camera(make_cameras(places, turns)) == 3
 
 
-@pytest.mark.parametrize("turn", [20.0, 90.0])
+@sweep("turn", [90.0, 20.0])
 def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn: float) -> None:
     path = orbit(walk, DEPTH, 60, turn)
     home = walk.viewmats[median_camera(walk)]
@@ -207,7 +209,7 @@ def test_a_wide_orbit_turns_that_far_and_keeps_its_distance(walk: Cameras, turn:
     assert steps.max() / steps.min() < 1.01
 
 
-@pytest.mark.parametrize("kind", ["orbit", "orbit:30", "spline"])
+@sweep("kind", ["orbit:30", "spline", "orbit"], often=2)
 def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
     path, back = (sample_path(parse_path(text), walk, DEPTH, 20) for text in (kind, f"{kind},back:0.5"))
     if kind == "spline":  # even speed is another one farther away: the ends are the same cameras
@@ -215,11 +217,6 @@ def test_a_step_back_keeps_what_is_looked_at(kind: str, walk: Cameras) -> None:
     np.testing.assert_allclose(back.viewmats[:, :3, :3], path.viewmats[:, :3, :3], atol=1e-12)
     shifts = camera_centres(back.viewmats) - camera_centres(path.viewmats)
     np.testing.assert_allclose(shifts, -0.5 * DEPTH * path.viewmats[:, 2, :3], atol=1e-9)
-
-
-def test_a_spline_that_steps_back_has_even_speed(walk: Cameras) -> None:
-    steps = pose_steps(sample_path(CameraPath("spline", back=0.5), walk, DEPTH, 400), 1.5 * DEPTH)
-    assert steps.max() / steps.min() < 1.03
 
 
 @pytest.mark.parametrize(
@@ -261,7 +258,7 @@ def test_the_camera_outside_is_one_that_fog_is_measured_with(walk: Cameras) -> N
     assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one in outside_cameras(given, middle))
 
 
-@pytest.mark.parametrize("kind", ["orbit", "orbit:40", "spline,back:0.5"])
+@sweep("kind", ["orbit:40", "spline,back:0.5", "orbit"], often=2)
 def test_a_path_moves_with_its_scene(kind: str, walk: Cameras) -> None:
     means = np.random.default_rng(1).uniform(-4, 4, (500, 3))
     motion = motion_matrices(np.array([[0.3, -1.1, 0.7, 4, -2, 1]]))[0]

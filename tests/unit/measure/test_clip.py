@@ -35,12 +35,12 @@ def read(path: Path) -> list[np.ndarray]:
 
 
 FFMPEG = f"""#!{sys.executable}
-import os, sys
-import cv2, numpy as np
+import sys
 if "-encoders" in sys.argv:
     print(" V....D libx264              H.264")
     sys.exit()
 width, height = map(int, sys.argv[sys.argv.index("-s") + 1].split("x"))
+import cv2, numpy as np
 fps = int(sys.argv[sys.argv.index("-r") + 1])
 frames = np.frombuffer(sys.stdin.buffer.read(), np.uint8).reshape(-1, height, width, 3)
 writer = cv2.VideoWriter(sys.argv[-1], cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))

@@ -11,6 +11,7 @@ from messages import says
 from tiny_scene import rotation
 
 from gsmerge.geometry import camera_centres
+from gsmerge.kernels import elementary
 from gsmerge.measure.fog import ALL, CAMERAS, HAZE, Fog, describe_fog, fog_sums, mean_fog, measure_fog, outside_cameras
 from gsmerge.types import Cameras, Gaussians
 
@@ -111,7 +112,7 @@ def test_places_of_the_cameras() -> None:
     seen = cameras(views=7)
     seen.viewmats[:, 1, 3] = -np.arange(7) / 10  # the second, fourth and sixth are taken
     places = [(kind, *camera_centres(camera.viewmats)[0]) for kind, camera in outside_cameras(curtain(1), seen[[3]])]
-    y, side, back = 0.3, 3 * np.sin(np.radians(30)), 2 - 3 * np.cos(np.radians(30))
+    y, side, back = 0.3, 3 * elementary.sin(np.radians(30)), 2 - 3 * elementary.cos(np.radians(30))
     expected = [("back", 0, y, -1), ("back", 0, y, -3), ("turned", -side, y, back), ("turned", side, y, back)]
     for (kind, *place), (expected_kind, *expected_place) in zip(places, expected, strict=True):
         assert kind == expected_kind

@@ -96,5 +96,5 @@ def test_coverage() -> None:
     away = 3 + half
     boxes = [Leaf({"bound": {"min": [x - half, -half, -half], "max": [x + half, half, half]}}, []) for x in (0, away)]
     camera = replace(cameras(), Ks=np.array([[[10.0, 0, 5], [0, 10, 5], [0, 0, 1]]]), width=10, height=10)
-    slope = 0.5 / np.tan(np.pi / 8)
+    slope = 0.5 / (np.sqrt(2) - 1)
     assert coverage(boxes, camera) == pytest.approx([1, 1 / (1 + 3 * slope) ** 2])

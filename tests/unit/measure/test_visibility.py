@@ -50,11 +50,6 @@ def test_larger_pictures_have_no_gaps_between_samples(factor: int) -> None:
     assert np.array_equal(visible_pixels(points, small, 0.01, cameras), visible_pixels(points, small, 0.01))
 
 
-def test_input_views_see_themselves_whole() -> None:
-    scene = scenes.make_scene(scenes.room(), scenes.arc(2, 24, 18))
-    assert visible_pixels(context_points(scene, 0.01), scene.cameras, 0.01).all()
-
-
 def test_pixels_without_a_gaussian_give_no_sample() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(1, 24, 18))
     valid = scene.valid.copy()

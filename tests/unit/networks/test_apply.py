@@ -124,16 +124,6 @@ def test_order_within_a_cluster_does_not_matter(scene: Made) -> None:
     np.testing.assert_allclose(np.sort(a.latents, 0), np.sort(b.latents, 0), atol=1e-5, rtol=1e-5)
 
 
-def test_clusters_alone_and_together(scene: Made) -> None:
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
-    half, matches = len(encoded) // 2, pairs(encoded)
-    together = merge(encoded, matches, context)
-    two = np.array([5, half + 5])
-    alone = merge(take(encoded, two), Matches(np.zeros(2, np.int64), 1), context)
-    assert_close(alone, take(together, np.array([2 + 5 - 1])), 2e-6)
-
-
 def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     """Slots that are empty do not count, whoever shares the table."""
     context = scene.networks(noisy())

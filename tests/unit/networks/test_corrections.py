@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -10,6 +9,7 @@ from scenes import make_features
 
 from gsmerge import geometry
 from gsmerge.geometry import covariances, quat_to_rotmat
+from gsmerge.kernels import elementary
 from gsmerge.networks.corrections import (
     COLOR,
     LOGIT,
@@ -34,7 +34,7 @@ def some(count: int = 20) -> FeatureGaussians:
     half = rng.normal(size=(count, 3, 3)).astype(np.float32)
     covars = half @ half.swapaxes(1, 2)
     scales = np.sqrt(np.linalg.eigvalsh(covars).clip(1e-6))
-    return replace(features, covars=covars, extinctions=-math.log(0.4) * scales[:, 1] * scales[:, 2])
+    return replace(features, covars=covars, extinctions=-float(elementary.log(0.4)) * scales[:, 1] * scales[:, 2])
 
 
 def move(gaussians: Gaussians, residuals: np.ndarray, owners: np.ndarray, axes: np.ndarray) -> Gaussians:
@@ -96,7 +96,7 @@ def test_gaussians_move_as_told() -> None:
     sizes = np.sqrt(np.sort(base.scales, 1)[:, 1:].prod(1))
     np.testing.assert_allclose(moved.means, base.means + frames()[:, :, 0] * sizes[:, None], atol=1e-6)
     np.testing.assert_allclose(np.log(moved.scales) - np.log(base.scales), residuals[:, SIZE], atol=1e-5)
-    logits = [np.log(g.opacities / (1 - g.opacities)) for g in (base, moved)]
+    logits = [elementary.log(g.opacities / (1 - g.opacities)) for g in (base, moved)]
     np.testing.assert_allclose(logits[1] - logits[0], residuals[:, LOGIT], atol=1e-5)
     np.testing.assert_allclose(SH_C0 * (moved.sh0 - base.sh0)[:, 0], residuals[:, COLOR], atol=1e-6)
 
@@ -156,10 +156,10 @@ def test_feature_gaussians_move_like_gaussians() -> None:
     decoded = base_of(moved)
     np.testing.assert_allclose(decoded.opacities, base.opacities, atol=1e-4)
     residuals = zeros()
-    residuals[:, LOGIT] = np.log(2)
+    residuals[:, LOGIT] = elementary.log(2)
     doubled = base_of(move_features(features, base, residuals, frames()))
     np.testing.assert_allclose(doubled.opacities, 1 - (1 - base.opacities) ** 2, atol=1e-4)
-    residuals[:, MASS] = np.log(3)
+    residuals[:, MASS] = elementary.log(3)
     heavier = move_features(features, base, residuals, frames())
     np.testing.assert_allclose(heavier.masses, 6 * features.masses, rtol=1e-5)
 

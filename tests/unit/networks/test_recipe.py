@@ -57,7 +57,7 @@ def test_what_is_set_besides_goes_before() -> None:
     assert options.with_settings({"k": 2}).match.match == "none"
 
 
-@pytest.mark.parametrize("k", [1, 2, 3, 4])
+@pytest.mark.parametrize("k", [1, 3])
 def test_every_group_has_k_children(scene: Scene, absolute: Path, k: int) -> None:
     """Also groups of fewer members, and nothing is left out but by opacity."""
     result = scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=k, superpixels="20%", min_opacity=0.0)
@@ -104,11 +104,9 @@ def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path)
 
 
 @pytest.mark.parametrize("rule", ["saliency", "distortion"])
-@pytest.mark.parametrize("settings", [{"fit": "none"}, {"fit_steps": 12}], ids=str)
-def test_mixed_k_lies_between_one_and_two(scene: Scene, settings: dict, rule: str) -> None:
-    one, mixed, two = (
-        len(scenes.compacted(scene, k=k, k_rule=rule, checkpoint="none", **settings).gaussians) for k in (1, "mixed", 2)
-    )
+def test_mixed_k_lies_between_one_and_two(scene: Scene, rule: str) -> None:
+    settings = {"k_rule": rule, "checkpoint": "none", "fit": "none"}
+    one, mixed, two = (len(scenes.compacted(scene, k=k, **settings).gaussians) for k in (1, "mixed", 2))
     assert one < mixed < two
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -34,9 +35,17 @@ from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import PicturedScene, Views
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _small_outlines() -> Iterator[None]:
+    """A quarter as wide as on a page: they take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(data, "OUTLINE_SIDE", 320)
+        yield
+
+
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 160, 120), noise=0.05)
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 80, 60), noise=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +60,7 @@ def small() -> Scene:
 
 @pytest.fixture(scope="module")
 def held_out() -> Views:
-    other = scenes.make_scene(scenes.room(), scenes.arc(2, 180, 108))
+    other = scenes.make_scene(scenes.room(), scenes.arc(2, 90, 54))
     return Views(other.cameras, other.images, ("x/a.png", "x/b.png"))
 
 
@@ -129,7 +138,7 @@ def test_stills_are_our_renders(actual: ViewData, scene: Scene, half: Gaussians,
             for some in (scene.gaussians, half)
         ]
         for still, picture in zip((view.photo, *view.stills), (split.images[i], *renders), strict=False):
-            assert psnr(decoded(still), picture) > 34  # 41 where pictures are not as small and colourful
+            assert psnr(decoded(still), picture) > 31  # 41 where pictures are not as small and colourful
 
 
 def test_the_view_from_outside(actual: ViewData, scene: Scene, half: Gaussians) -> None:
@@ -255,13 +264,13 @@ def test_what_is_not_finite_or_faint_is_left_out(half: Gaussians) -> None:
 
 
 def test_outlines_are_the_borders_of_superpixels(actual: ViewData, scene: Scene) -> None:
-    assert actual.num_superpixels == (int(0.044 * 160 * 120),) * 2
+    assert actual.num_superpixels == (int(0.044 * 80 * 60),) * 2
     assert [view.outlines is None for view in actual.views] == [view.held_out for view in actual.views]
     view = next(view for view in actual.views if view.place == 1)
     labels = segment(scene.images, SegmentOptions()).labels[1]
     picture = cv2.imdecode(np.frombuffer(view.outlines or b"", np.uint8), cv2.IMREAD_UNCHANGED)
-    factor = 1280 // 160
-    assert picture.shape == (120 * factor, 160 * factor, 4)
+    factor = 320 // 80
+    assert picture.shape == (60 * factor, 80 * factor, 4)
     lines = picture[..., 3] > 0
     enlarged = labels.repeat(factor, 0).repeat(factor, 1)[lines]
     counts = np.bincount(labels.reshape(-1))[:, None]

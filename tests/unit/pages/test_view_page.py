@@ -246,7 +246,7 @@ def test_views_may_differ_in_superpixels(data: ViewData, counts: tuple[int, int]
 
 @pytest.fixture(scope="module")
 def alone() -> ViewData:
-    scene = scenes.make_scene(scenes.room(), scenes.arc(3))
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
     return collect("room", scene, {}, (2_000_000,))
 
 

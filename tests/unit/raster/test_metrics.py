@@ -8,6 +8,7 @@ import pytest
 from messages import refuse_all, refuses
 from skimage.metrics import structural_similarity
 
+from gsmerge.kernels import elementary
 from gsmerge.raster.metrics import psnr, ssim
 
 RNG = np.random.default_rng(0)
@@ -55,7 +56,7 @@ def test_ssim_is_scikit_images(channels: int) -> None:
 def test_ssim_is_scikit_images_where_images_are_smooth(noise: float) -> None:
     """Small variances, which float32 loses first."""
     y, x = np.mgrid[:60, :70] / 60
-    smooth = np.stack([0.9 + 0.05 * x, 0.5 + 0.4 * np.sin(2 * x + y), x * 0 + 0.02], -1).astype(np.float32)
+    smooth = np.stack([0.9 + 0.05 * x, 0.5 + 0.4 * elementary.sin(2 * x + y), x * 0 + 0.02], -1).astype(np.float32)
     noisy = np.clip(smooth + np.random.default_rng(1).normal(0, noise, smooth.shape), 0, 1).astype(np.float32)
     assert ssim(smooth, noisy) == pytest.approx(reference_ssim(smooth, noisy), abs=1e-5)
 

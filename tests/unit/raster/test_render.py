@@ -41,18 +41,6 @@ def test_one_gaussian_by_hand() -> None:
     assert value(images, 10, 3) == pytest.approx(0.8 * math.exp(-0.5 * 4 / 4.3), abs=1e-6)
 
 
-def test_opacity_is_clamped() -> None:
-    rendering = render(balls((0, 0, 1, 0.5, 1.0, 1.0)), camera())
-    assert float(rendering.alphas[0, 5, 10, 0]) == pytest.approx(0.99)
-
-
-def test_a_pixel_stops_before_it_is_too_dark() -> None:
-    # 0.1^3 = 1e-3 stays; the fourth would reach 1e-4 and is left out
-    rows = [(0, 0, 1 + i, 5.0 * (1 + i), 0.9001, 0.0) for i in range(4)]
-    rendering = render(balls(*rows), camera(), 1.0)
-    assert value(rendering.images, 10, 5) == pytest.approx(0.0999**3, rel=1e-4)
-
-
 def test_there_is_no_farthest_depth() -> None:
     near, huge = (render(balls((0, 0, s, 0.02 * s, 0.8, 1.0)), camera(), near=0.01 * s) for s in (1, 4e13))
     np.testing.assert_allclose(huge.images, near.images, atol=1e-6)

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
-import subprocess
 import sys
 import threading
 import time
 import weakref
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -52,21 +52,16 @@ def test_other_libraries_are_held_to_one_thread(torch: Any) -> None:
         assert (torch.get_num_threads(), cv2.getNumThreads()) == (1, 1)
 
 
-def test_torch_that_is_imported_later_is_held_too() -> None:
-    pytest.importorskip("torch")
-    code = """
-from gsmerge.runtime.threads import parallel_map, use_threads
-import sys
-with use_threads(2):
-    assert "torch" not in sys.modules
-    import torch
-    torch.set_num_threads(2)
-    parallel_map(abs, [1, 2])
-    held = torch.get_num_threads()
-print(held, torch.get_num_threads())
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["1", "2"]
+def test_torch_that_is_imported_later_is_held_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in of two threads that is there only after the pool."""
+    counts = [2]
+    late = SimpleNamespace(get_num_threads=lambda: counts[-1], set_num_threads=counts.append)
+    monkeypatch.delitem(sys.modules, "torch", raising=False)
+    with use_threads(2):
+        monkeypatch.setitem(sys.modules, "torch", late)
+        parallel_map(abs, [1, 2])
+        assert counts == [2, 1]
+    assert counts == [2, 1, 2]
 
 
 def test_outer_block_wins() -> None:

@@ -19,10 +19,9 @@ from exports import (
     with_surface_rotations,
 )
 from messages import noted, refuses
-from plyfile import PlyData, PlyElement
 from scripts import load_script
 from sweeps import sweep
-from tiny_scene import Tiny, make_tiny, rotation, write_npz
+from tiny_scene import Tiny, rotation, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
@@ -35,7 +34,8 @@ def smooth() -> Tiny:
     return smooth_scene(48, 36)
 
 
-def test_depthsplat(tmp_path: Path, smooth: Tiny) -> None:
+def test_depthsplat(tmp_path: Path) -> None:
+    smooth = smooth_scene(64, 48)
     h, w = smooth.height, smooth.width
     inner = np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].reshape(3, -1)
     rows = export_rows(smooth, inner.T.reshape(-1))
@@ -57,13 +57,12 @@ def test_depthsplat(tmp_path: Path, smooth: Tiny) -> None:
     assert np.isfinite(scene.gaussians.means).all()
 
 
-@pytest.mark.parametrize("nested", [1.0, 1.7])
-@pytest.mark.parametrize("ties", [False, True])
+@pytest.mark.parametrize(("nested", "ties"), [(1.7, False), (1.0, True)])
 def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
-    tiny = smooth_scene(96, 72)
+    tiny = smooth_scene(48, 36)
     depths = tiny.depths.copy()
     if ties:
-        depths[:, :14] = depths.max()  # a sky of one depth, more than a tenth of the view: kept
+        depths[:, :7] = depths.max()  # a sky of one depth, more than a tenth of the view: kept
     kept = da3_rows(tiny, depths)
     rows = export_rows(tiny, kept)
     save_export(tmp_path / "gs_ply", tiny, rows, cameras=False, name="0000.ply")
@@ -78,7 +77,7 @@ def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
     scene = loaded.pixel_scene()
     assert home(scene, tiny, kept) == 1
     assert scene.num_gaussians == len(kept)
-    sky = np.isin(np.arange(4 * 96 + 3, 5 * 96 - 3), kept)
+    sky = np.isin(np.arange(2 * 48 + 1, 3 * 48 - 1), kept)
     assert ties == bool(sky.all())
     if not ties:  # what was dropped is put back where the depth maps have it
         assert scene.valid.all()
@@ -88,7 +87,7 @@ def test_depth_anything(tmp_path: Path, nested: float, ties: bool) -> None:
 
 
 def test_depth_anything_every_other_view(tmp_path: Path) -> None:
-    tiny = smooth_scene(96, 72)
+    tiny = smooth_scene(48, 36)
     kept = [np.flatnonzero(depth_map_mask(d)) + i * d.size for i, d in enumerate(tiny.depths)]
     save_export(tmp_path / "gs_ply", tiny, export_rows(tiny, np.concatenate(kept[::2])), cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths, image=tiny.images)
@@ -110,48 +109,12 @@ def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, 
     assert home(load_scene(path, order=order).pixel_scene(), smooth) == 1
 
 
-def test_views_in_reverse(tmp_path: Path, smooth: Tiny) -> None:
-    index = np.arange(3 * smooth.height * smooth.width).reshape(3, -1)[::-1].reshape(-1)
-    scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).pixel_scene()
-    assert scene.names == tuple(f"images/{n}" for n in smooth.names[::-1])
-    assert np.allclose(scene.cameras.viewmats, smooth.w2c[::-1])
-    assert np.array_equal((scene.images * 255).round(), smooth.images[::-1])
-
-
 @sweep("views", [(0, 2), (0, 1), (1, 2), (2,)])
 def test_some_of_the_views(tmp_path: Path, smooth: Tiny, views: tuple[int, ...]) -> None:
     size = smooth.height * smooth.width
     index = np.concatenate([np.arange(size) + view * size for view in views])
     scene = load_scene(save_export(tmp_path, smooth, export_rows(smooth, index))).pixel_scene()
     assert scene.names == tuple(f"images/{smooth.names[view]}" for view in views)
-
-
-@pytest.mark.parametrize("layers_first", [False, True])
-def test_three_gaussians_per_pixel(tmp_path: Path, smooth: Tiny, layers_first: bool) -> None:
-    size = smooth.height * smooth.width
-    pixel = np.arange(3 * size).reshape(3, size)
-    index = np.stack([pixel] * 3, 0 if layers_first else 2).reshape(-1)
-    rows = export_rows(smooth, index)
-    layer = np.stack([np.full((3, size), i) for i in range(3)], 0 if layers_first else 2).reshape(-1)
-    rows["opacity"] = layer - 1.0
-    loaded = load_scene(save_export(tmp_path, smooth, rows))
-    scene = loaded.pixel_scene()
-    assert len(scene) == 9
-    assert scene.names[:3] == (f"images/{smooth.names[0]}",) * 3
-    opacities = scene.gaussians.opacities.reshape(9, -1)
-    assert (opacities == opacities[:, :1]).all()
-    assert np.allclose(opacities[:3, 0], 1 / (1 + np.exp([1, 0, -1])))
-
-
-def test_any_similarity(tmp_path: Path, smooth: Tiny) -> None:
-    rows = export_rows(smooth)
-    turn = make_tiny().c2w[2, :3, :3] @ make_tiny().c2w[1, :3, :3]
-    moved = turned(rows, turn, scale=0.3, shift=np.array([3.0, -1, 2]))
-    loaded = load_scene(save_export(tmp_path, smooth, moved))
-    assert home(loaded.pixel_scene(), smooth) == 1
-    assert loaded.recovery.best.frame.kind == "other"
-    assert loaded.recovery.best.frame.scale == pytest.approx(0.3, rel=1e-2)
-    assert loaded.alignment.worst_px < 0.3
 
 
 def test_the_pixelsplat_world(tmp_path: Path, smooth: Tiny) -> None:
@@ -207,7 +170,8 @@ def test_logits_under_the_name_of_an_exporter_of_raw_opacities(tmp_path: Path, s
     assert np.allclose(read, smooth.gaussians.opacities, atol=1e-5)
 
 
-def test_infinite_opacities_and_nan_scales(tmp_path: Path, smooth: Tiny) -> None:
+def test_infinite_opacities_and_nan_scales(tmp_path: Path) -> None:
+    smooth = smooth_scene(64, 48)
     h, w = smooth.height, smooth.width
     rows = export_rows(smooth, np.arange(3 * h * w).reshape(3, h, w)[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1))
     rows["opacity"][0], rows["opacity"][1] = np.inf, -np.inf
@@ -226,27 +190,6 @@ def test_byte_normals_are_long_lrm(tmp_path: Path, smooth: Tiny) -> None:
     loaded = load_scene(save_export(tmp_path, smooth, rows))
     assert [d.name for d in loaded.exporters] == ["longlrm"]
     assert home(loaded.pixel_scene(), smooth) == 1
-
-
-def test_extra_elements_are_ignored(tmp_path: Path, smooth: Tiny) -> None:
-    rows = export_rows(smooth)
-    path = save_export(tmp_path, smooth, rows)
-    extra = [PlyElement.describe(np.zeros(n, [("value", t)]), name)
-             for name, n, t in (("extrinsic", 16, "f4"), ("intrinsic", 9, "f4"), ("image_size", 2, "u4"))]  # fmt: skip
-    PlyData([PlyElement.describe(rows, "vertex"), *extra], byte_order="<").write(str(path / "scene.ply"))
-    assert home(read_scene(path), smooth) == 1
-
-
-def test_voxels_are_unaligned(tmp_path: Path, smooth: Tiny) -> None:
-    rows = export_rows(smooth, np.lexsort(smooth.gaussians.means.round(1).T)[::2])
-    rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
-    loaded = load_scene(save_export(tmp_path, smooth, rows))
-    assert not loaded.scene.aligned
-    assert len(loaded.scene.gaussians) == len(rows)
-    assert loaded.scene.images is not None
-    assert {d.name for d in loaded.exporters} == {"anysplat", "worldmirror"}
-    assert loaded.alignment is None
-    assert loaded.problem is not None
 
 
 def test_a_scene_can_be_given_as_unaligned(tmp_path: Path, smooth: Tiny) -> None:

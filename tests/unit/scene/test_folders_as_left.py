@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from exports import export_rows, home, save_export, smooth_scene, turned
 from messages import noted, refuses
+from model_files import MODELS
+from model_rows import check_cameras, check_pixels
 from sweeps import sweep
 from tiny_scene import frames_of, save_json, write_images, write_npz
 
@@ -27,13 +29,15 @@ ROWS = np.arange(3 * 36 * 48).reshape(3, 36, 48)
 
 def test_depthsplat_s_folders(tmp_path: Path) -> None:
     """Rows trimmed, view fastest, in the first camera's frame; the photos of another scene are there as well."""
-    rows = ROWS[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1)
-    kept = np.isin(ROWS.reshape(-1), rows)
-    moved = turned(export_rows(SMOOTH, rows), SMOOTH.c2w[0, :3, :3].T)
-    save_export(tmp_path / "gaussians", SMOOTH, moved, cameras=False, name="room.ply")
-    write_images(tmp_path / "images/room/color", SMOOTH)
-    write_images(tmp_path / "images/hall/color", replace(SMOOTH, images=SMOOTH.images[::-1]))
-    save_json(tmp_path / "poses_of_room.json", frames_of(SMOOTH))
+    smooth = replace(smooth_scene(64, 48), names=SMOOTH.names)
+    grid = np.arange(3 * 48 * 64).reshape(3, 48, 64)
+    rows = grid[:, 8:-8, 8:-8].transpose(1, 2, 0).reshape(-1)
+    kept = np.isin(grid.reshape(-1), rows)
+    moved = turned(export_rows(smooth, rows), smooth.c2w[0, :3, :3].T)
+    save_export(tmp_path / "gaussians", smooth, moved, cameras=False, name="room.ply")
+    write_images(tmp_path / "images/room/color", smooth)
+    write_images(tmp_path / "images/hall/color", replace(smooth, images=smooth.images[::-1]))
+    save_json(tmp_path / "poses_of_room.json", frames_of(smooth))
     save_json(tmp_path / "scores.json", {"psnr": 27.1})
     for path in (tmp_path, tmp_path / "gaussians", tmp_path / "gaussians/room.ply"):
         files = find_scene_files(path)
@@ -42,8 +46,8 @@ def test_depthsplat_s_folders(tmp_path: Path) -> None:
         assert files.images == tmp_path / "images/room"
     loaded = load_scene(tmp_path)
     assert loaded.scene.aligned
-    assert home(loaded.scene, SMOOTH, kept) == 1
-    assert np.array_equal((loaded.scene.images * 255).round(), SMOOTH.images)
+    assert home(loaded.scene, smooth, kept) == 1
+    assert np.array_equal((loaded.scene.images * 255).round(), smooth.images)
     assert "depthsplat" in [exporter.name for exporter in loaded.exporters]
     shutil.copy(tmp_path / "gaussians/room.ply", tmp_path / "gaussians/hall.ply")
     assert find_scene_files(tmp_path / "gaussians/hall.ply").images == tmp_path / "images/hall"
@@ -138,7 +142,7 @@ def test_lyra_2_s_cameras(tmp_path: Path, ends: str) -> None:
 def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: Path, written: str) -> None:
     """AnySplat's script writes among the photos; poses have no names then: photos are taken in order."""
     tiny = replace(SMOOTH, names=("2.png", "10.png", "11.png"))
-    some = np.random.default_rng(0).permutation(ROWS.size)[:3000]
+    some = np.random.default_rng(0).permutation(ROWS.size)[:2999]
     save_export(tmp_path, tiny, export_rows(tiny, some), cameras=False, name="gaussians.ply")
     write_images(tmp_path, tiny)
     K = np.tile(tiny.K / np.array([[48], [36], [1]]), (3, 1, 1))
@@ -157,48 +161,31 @@ def test_gaussians_among_the_photos_and_poses_as_a_model_returns_them(tmp_path: 
         assert {tmp_path / name for name in tiny.names} <= set(read_files(loaded.files))
 
 
-@pytest.mark.parametrize("beside", [True, False])
-@pytest.mark.parametrize("written", ["frames and normalisation", "frames", "nothing"])
-def test_long_lrm_s_folders(tmp_path: Path, beside: bool, written: str) -> None:
-    """The Gaussians' world has its origin in the mean pose of the inputs, which lie within +-1.
+@pytest.mark.parametrize("frames", [True, False])
+def test_long_lrm_s_folders(tmp_path: Path, frames: bool) -> None:
+    """Without the files that say where the origin is: in the mean pose of the inputs, which lie within +-1.
 
-    tttLRM writes no files that say so; of its rows the faint ones are missing.
+    tttLRM does not say either which frames they are; of its rows the faint ones are missing.
     """
-    tiny, out, data = SMOOTH, tmp_path / "out/scene", tmp_path / "data"
-    ids = [2, 0, 1] if written != "nothing" else [0, 1, 2]
-    kept = np.random.default_rng(0).random(ROWS.size) < (1 if written != "nothing" else 0.7)
-    mean = np.eye(4)
-    mean[:3, 2] = tiny.c2w[:, :3, 2].mean(0) / np.linalg.norm(tiny.c2w[:, :3, 2].mean(0))
-    down = tiny.c2w[:, :3, 1].mean(0)
-    down -= (down @ mean[:3, 2]) * mean[:3, 2]
-    mean[:3, 1] = down / np.linalg.norm(down)
-    mean[:3, 0], mean[:3, 3] = np.cross(mean[:3, 1], mean[:3, 2]), tiny.c2w[:, :3, 3].mean(0)
-    move = np.linalg.inv(mean)
-    scale = 1 / np.abs((move @ tiny.c2w)[:, :3, 3]).max()
-    rows = export_rows(tiny, ROWS[ids].reshape(-1)[kept], rest=45, normals="u1")
-    rows = turned(rows, move[:3, :3], scale=scale, shift=scale * move[:3, 3])
-    save_export(out, tiny, rows, cameras=False, name="gaussians_001.ply")
-    if written != "nothing":
-        (out / "input_frame_idx.txt").write_text("".join(f"{i}\n" for i in ids))
-    if "normalisation" in written:
-        np.savetxt(out / "pos_avg_inv.txt", move)
-        np.savetxt(out / "scene_scale.txt", [scale])
-    common = {"fx": tiny.K[0, 0], "fy": tiny.K[1, 1], "cx": tiny.K[0, 2], "cy": tiny.K[1, 2], "w": 48, "h": 36}
-    frames = [
-        {"file_path": f"images/{n}", "w2c": m.tolist(), **common} for n, m in zip(tiny.names, tiny.w2c, strict=True)
-    ]
-    place = out if beside else data
-    place.mkdir(exist_ok=True)
-    write_images(place / "images", tiny)
-    save_json(place / "opencv_cameras.json", {"scene_name": "scene", "frames": frames})
-    loaded = load_scene(out, cameras=None if beside else data / "opencv_cameras.json")
-    assert loaded.scene.names == tuple(f"images/{tiny.names[i]}" for i in ids)
-    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images[ids])
+    export, options = MODELS["Long-LRM"](tmp_path / "out"), {}
+    for name in ("pos_avg_inv.txt", "scene_scale.txt", *(["input_frame_idx.txt"] * (not frames))):
+        (export.path / name).unlink()
+    if frames:  # and the data set beside the Gaussians
+        shutil.copytree(tmp_path / "data", export.path, dirs_exist_ok=True)
+    else:
+        options, kept = export.options, np.random.default_rng(0).random(len(export.rows)) < 0.7
+        arrays = {name: getattr(export, name)[kept] for name in ("rows", "pixels", "opacities", "quats")}
+        export = replace(export, **arrays)
+        save_export(export.path, export.scene, export.rows, cameras=False, name="gaussians_001.ply")
+    loaded = load_scene(export.path, **options)
+    if frames:
+        check_pixels(loaded.pixel_scene(), export)
+    check_cameras(loaded.scene, export)
     assert loaded.alignment is not None
     assert loaded.alignment.worst_px < 0.5
-    assert noted(loaded.notes, "moved into their mean pose") == (written == "nothing")
+    assert noted(loaded.notes, "moved into their mean pose") is not frames
     assert not noted(loaded.notes, "positions scaled")
-    assert {*out.glob("input_frame_idx.txt")} <= set(read_files(loaded.files))
+    assert {*export.path.glob("input_frame_idx.txt")} <= set(read_files(loaded.files))
 
 
 def test_cameras_of_any_name_only_where_one_file_has_them(tmp_path: Path) -> None:

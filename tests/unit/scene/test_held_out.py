@@ -91,7 +91,7 @@ def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> 
 def test_poses_in_the_convention_that_the_scene_s_own_are_in(all_views: bool, tiny: Tiny, tmp_path: Path) -> None:
     folder = tiny.save(tmp_path / "scene")
     flip_poses(folder / "transforms.json")
-    load = load_scene(folder)
+    load = load_scene(folder, order="view-major")
     assert any("OpenCV axes" in note for note in load.notes)
     views = dict(zip(stems(tiny), tiny.c2w, strict=True)) if all_views else {}
     path = write_views(tmp_path / "all", views | {"held": between(tiny)}, tiny)

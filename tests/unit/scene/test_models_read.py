@@ -23,27 +23,36 @@ def load(name: str, folder: Path) -> tuple[Loaded, Export]:
     return load_scene(export.path, **export.options), export
 
 
-# Frames
-
-
-@pytest.mark.parametrize("name", ["ZPressor", "MVSplat's script with its far cut"])
-def test_trims_and_far_cuts(tmp_path: Path, name: str) -> None:
-    """A border of 4 pixels is no resize; dropped rows do not move the frame."""
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ZPressor",  # a border of 4 pixels is no resize
+        "MVSplat's script with its far cut",  # dropped rows do not move the frame
+        # photos of twice the model's size, and where it takes squares cropped to one
+        *(f"{model} with the user's own photos" for model in ("NoPoSplat", "Splatt3R", "YoNoSplat")),
+        "SPFSplat",  # inputs under names of the scene, and drawings of its own that are no photos of these views
+        "Lyra 2",
+    ],
+)
+def test_every_row_is_at_its_pixel(tmp_path: Path, name: str) -> None:
     loaded, export = load(name, tmp_path)
     check_cameras(loaded.scene, export)
-    check_pixels(loaded.pixel_scene(), export)
+    check_pixels(loaded.pixel_scene(), export, quats="YoNoSplat" not in name)
 
 
-def test_fused_views_in_an_upright_frame(tmp_path: Path) -> None:
-    """Rows of no pixels: stretches of them show the frame, which colours alone would choose wrongly."""
-    loaded, export = load("FreeSplat", tmp_path)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "FreeSplat",  # stretches of rows show the upright frame, which colours alone would choose wrongly
+        "WorldMirror 1",  # squeezed photos beside the right ones
+        "gsplat's trainer",
+    ],
+)
+def test_cameras_and_photos_of_rows_of_no_pixels(tmp_path: Path, name: str) -> None:
+    loaded, export = load(name, tmp_path)
     assert not loaded.scene.aligned
     check_cameras(loaded.scene, export)
-
-
-def test_squeezed_photos_beside_the_right_ones(tmp_path: Path) -> None:
-    loaded, export = load("WorldMirror 1", tmp_path)
-    check_cameras(loaded.scene, export)
+    assert ("gsplat" in name) == ("gsplat" in {exporter.name for exporter in loaded.exporters})
 
 
 # Cameras from the rows
@@ -59,21 +68,6 @@ def test_cameras_of_a_grid_without_photos(tmp_path: Path, name: str) -> None:
     assert loaded.alignment.worst_px < 0.5
 
 
-@pytest.mark.parametrize("model", ["NoPoSplat", "Splatt3R", "YoNoSplat"])
-def test_photos_of_another_size_than_the_grid(tmp_path: Path, model: str) -> None:
-    """Twice the model's size, and where it takes squares cropped to one."""
-    loaded, export = load(f"{model} with the user's own photos", tmp_path)
-    check_pixels(loaded.pixel_scene(), export, quats=model != "YoNoSplat")
-    check_cameras(loaded.scene, export)
-
-
-def test_photos_beside_the_gaussians_under_names_of_the_scene(tmp_path: Path) -> None:
-    """SPFSplat's folder as it is left: the inputs, and drawings of its own that are no photos of these views."""
-    loaded, export = load("SPFSplat", tmp_path)
-    check_pixels(loaded.pixel_scene(), export)
-    check_cameras(loaded.scene, export)
-
-
 def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
     """Voxels and no cameras: the scene is that of the rows alone, and a note names the photos."""
     loaded, _ = load("VolSplat without cameras", tmp_path)
@@ -83,18 +77,6 @@ def test_photos_whose_cameras_cannot_be_found(tmp_path: Path) -> None:
 
 
 # Folders
-
-
-def test_cameras_of_lyra(tmp_path: Path) -> None:
-    loaded, export = load("Lyra 2", tmp_path)
-    check_pixels(loaded.pixel_scene(), export)
-    check_cameras(loaded.scene, export)
-
-
-def test_the_folder_of_gsplat_s_trainer(tmp_path: Path) -> None:
-    loaded, export = load("gsplat's trainer", tmp_path)
-    check_cameras(loaded.scene, export)
-    assert "gsplat" in {exporter.name for exporter in loaded.exporters}
 
 
 @pytest.mark.parametrize(

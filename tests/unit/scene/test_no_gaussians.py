@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 from messages import names, refuses
+from model_files import write_points_glb
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_colmap_binary, write_images, write_npz
 
@@ -23,31 +22,22 @@ from gsmerge.scene.no_gaussians import POINTS_ONLY
 def write_points(path: Path) -> None:
     """Write a coloured point cloud, as VGGT and MapAnything do into ``sparse/``."""
     columns = [*((name, "f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
-    path.parent.mkdir(parents=True, exist_ok=True)
     PlyData([PlyElement.describe(np.zeros(5, columns), "vertex")]).write(str(path))
-
-
-def write_mesh(path: Path) -> None:
-    """Write a ``.glb`` with a node and nothing else."""
-    text = json.dumps({"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{}]}).encode()
-    text += b" " * (-len(text) % 4)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text), len(text), b"JSON") + text)
 
 
 def leave(folder: Path, tiny: Tiny, name: str) -> None:
     """Leave a file of the kind that its name says."""
     path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".npz":
         write_npz(path, tiny, depth=None)
     elif path.suffix == ".glb":
-        write_mesh(path)
+        write_points_glb(path)
     elif path.suffix == ".ply":
         write_points(path)
     elif path.suffix == ".bin":
         write_colmap_binary(path.parent, tiny)
     else:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
 
 
@@ -105,7 +95,7 @@ def test_a_folder_without_gaussians(
 def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, said: tuple[str, ...]) -> None:
     leave(tmp_path, tiny, name)
     if name.endswith("GLB"):
-        write_mesh(tmp_path / name)
+        write_points_glb(tmp_path / name)
     with refuses(SceneError, name, "Gaussians", *said):
         find_scene_files(tmp_path / name)
 

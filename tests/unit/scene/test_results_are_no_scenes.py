@@ -95,7 +95,6 @@ def test_a_folder_of_results_alone(folder: Path, tiny: Tiny, tmp_path: Path) -> 
     assert noted(read_input(files).notes, "gsmerge", f"{len(tiny.gaussians[::5])} Gaussians")
     with refuses(SceneError, folder, "none", str(path)):
         list(find_scenes([str(folder)], tmp_path / "out"))
-    assert main(["inspect", str(folder), "-q"]) == 0
     save_result(folder / "y.ply", tiny)
     with refuses(SceneError, folder, "2 (x.ply, y.ply)"):
         find_scene_files(folder)

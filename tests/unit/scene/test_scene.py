@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports import export_rows, save_export, smooth_scene
-from messages import names, noted, refuses
+from messages import names, refuses
 from tiny_scene import (
     Tiny,
     edited_json,
@@ -50,9 +49,6 @@ def test_a_plain_scene(tiny_folder: Path, tiny: Tiny) -> None:
     assert scene.valid.all()
     assert scene.names == tuple(f"images/{n}" for n in tiny.names)
     assert np.allclose(scene.gaussians.means, tiny.gaussians.means)
-
-
-def test_loading_reports_files_layout_and_alignment(tiny_folder: Path) -> None:
     loaded = load_scene(tiny_folder / "scene.ply")
     assert loaded.alignment.ok
     assert loaded.info.layout == "17-column export"
@@ -71,10 +67,6 @@ def test_an_npz_with_its_own_images(tmp_path: Path, tiny: Tiny) -> None:
     other = tiny.save(tmp_path / "other", images=False)
     named = read_scene(other, images=tmp_path / "exports/npz/results.npz")
     assert np.array_equal(named.images, scene.images)
-
-
-def test_a_scene_without_images(tmp_path: Path, tiny: Tiny) -> None:
-    assert read_scene(tiny.save(tmp_path, images=False)).images is None
 
 
 def test_images_where_the_camera_file_says(tmp_path: Path, tiny: Tiny) -> None:
@@ -176,17 +168,17 @@ def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with refuses(SceneError, "transforms.json", "20 x 14", "30 x 14", "crop"):
-        read_scene(tiny_folder)
+        read_scene(tiny_folder, order="view-major")
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "14 x 20", "swapped"):
-        read_scene(tiny_folder)
+        read_scene(tiny_folder, order="view-major")
 
 
 def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path, images=False)
     rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "median", "swapped"):
-        read_scene(folder)
+        read_scene(folder, order="view-major")
 
 
 def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
@@ -201,20 +193,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
     with refuses(SceneError, "transforms.json", "median", "1.5 px", "100 %", "convention"):
-        read_scene(tiny_folder)
-
-
-def test_rows_that_only_fill_a_file_up_are_left_out(tmp_path: Path) -> None:
-    """As VolSplat writes them: at the origin, all alike."""
-    smooth = smooth_scene(24, 16)
-    rows = export_rows(smooth)
-    rows[-40:] = rows[0]
-    for name, value in (("x", 0), ("y", 0), ("z", 0), ("f_dc_0", 0.1), ("opacity", -4.6)):
-        rows[name][-40:] = value
-    rows["f_dc_1"][-1] = 0.7  # another one at the origin
-    loaded = load_scene(save_export(tmp_path, smooth, rows), order="none")
-    assert len(loaded.scene.gaussians) == len(rows) - 39
-    assert noted(loaded.notes, "39 Gaussians")
+        read_scene(tiny_folder, order="view-major")
 
 
 def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,12 +17,12 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.clean import NEIGHBORS, clean, faintest_dropped, floater_share, floaters, inside_crop
 
-QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60}
+QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60, "poses": "fixed"}
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 64, 48), noise=0.01)
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.01)
 
 
 def sphere_in(scene: Scene, share: float) -> str:

@@ -116,11 +116,6 @@ def test_as_many_to_a_cluster_as_there_are_views() -> None:
     assert sorted(map(len, sets(features))) == [1, 4, 4]
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_cluster_size_is_kept(size: int) -> None:
-    assert {len(c) for c in sets(make_features(np.zeros((6, 3))), cluster_size=size)} == {size}
-
-
 def test_heaviest_leads() -> None:
     """A chain of three: the middle one takes both when it is the heaviest, else it goes to the heavier end."""
     means = [[0, 0, 0], [0.012, 0, 0], [0.024, 0, 0]]

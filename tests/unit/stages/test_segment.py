@@ -73,7 +73,7 @@ def test_an_exact_number_is_met(scene: Scene) -> None:
         40,
     )
     assert len(segment_scene(*scene_and_choices(scene, **ADAPTIVE), 100).groups) == 100
-    assert len(scenes.compacted(scene, **ADAPTIVE, budget=90).gaussians) == 90
+    assert len(scenes.plain(scene, **ADAPTIVE, budget=90)) == 90
 
 
 def test_largest_count(scene: Scene) -> None:

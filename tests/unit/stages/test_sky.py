@@ -16,7 +16,7 @@ from gsmerge import CompactOptions, compact, render
 from gsmerge.errors import UsageError
 from gsmerge.stages.sky import sky, sky_region, sky_regions
 
-QUICK: dict[str, Any] = {"effort": "draft", "superpixels": 120}
+QUICK: dict[str, Any] = {"effort": "draft", "superpixels": 120, "fit_steps": 10, "poses": "fixed"}
 
 
 @pytest.mark.parametrize(
@@ -67,8 +67,6 @@ def test_compact_leaves_it_out_and_counts_it() -> None:
     shown = render(without.gaussians, scene.cameras).alphas[..., 0]
     assert shown[:, : HORIZON - 4].mean() < 0.3
     assert shown[:, HORIZON + 4 :].mean() > 0.9
-    exact = compact(scene, **QUICK, drop="sky", budget=200)
-    assert len(exact.gaussians) == 200
 
 
 def test_indoors_nothing_changes() -> None:

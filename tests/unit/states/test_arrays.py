@@ -14,6 +14,7 @@ from view_batches import decoded, fed, parts_of, room, state_of
 
 from gsmerge import Scene
 from gsmerge.geometry import covariances
+from gsmerge.kernels import elementary
 from gsmerge.states.arrays import convert_state, feature_arrays
 from gsmerge.states.state import State
 from gsmerge.states.state_file import save_state
@@ -47,7 +48,7 @@ def test_they_are_what_is_decoded(plain: State) -> None:
     expected = covariances(one.quats.astype(np.float64), one.scales.astype(np.float64))
     np.testing.assert_allclose(arrays["covars"], expected, rtol=1e-4, atol=1e-5 * expected.max())
     discs = one.scales[:, 1].astype(np.float64) * one.scales[:, 2]
-    depths = np.minimum(1 - np.exp(-arrays["gains"] * arrays["extinctions"] / discs), arrays["opacities"].max())
+    depths = np.minimum(1 - elementary.exp(-arrays["gains"] * arrays["extinctions"] / discs), arrays["opacities"].max())
     np.testing.assert_allclose(depths, arrays["opacities"], rtol=1e-4)
 
 

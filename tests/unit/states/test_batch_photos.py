@@ -22,8 +22,6 @@ from gsmerge.raster.weights import apply
 from gsmerge.states.groups import moments_of, share
 from gsmerge.states.state import GroupSet, Replay
 from gsmerge.states.view_batch import (
-    MARGIN,
-    REACH,
     BatchPhotos,
     fit_batch_colors,
     group_errors,
@@ -40,49 +38,13 @@ def features_of(gaussians: Gaussians) -> FeatureGaussians:
     return replace(scenes.make_features(gaussians.means), **moments_of(gaussians))
 
 
-def corner_distances(cameras: Cameras, view: int, point: np.ndarray) -> list[float]:
-    """How far inside the planes between rays through the picture's corners, and before the eye, a point is."""
-    viewmat, K = cameras.viewmats[view], cameras.Ks[view]
-    place = viewmat[:3, :3] @ point + viewmat[:3, 3]
-    w, h, m = cameras.width, cameras.height, MARGIN
-    corners = [
-        np.linalg.inv(K) @ np.array([x, y, 1.0]) for x, y in ((-m, -m), (w + m, -m), (w + m, h + m), (-m, h + m))
-    ]
-    middle = np.linalg.inv(K) @ np.array([w / 2, h / 2, 1.0])
-    actual = []
-    for one, other in zip(corners, [*corners[1:], corners[0]], strict=True):
-        normal = np.cross(one, other)
-        normal /= np.linalg.norm(normal)
-        actual.append(float(place @ normal) * (1 if middle @ normal > 0 else -1))
-    return [*actual, float(place[2])]
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_in_view_of_a_ball_about_each(seed: int) -> None:
-    """Balls against the pyramid of what a picture with some pixels about it shows, a plane after the other."""
-    gaussians, cameras = random_gaussians(300, seed), scenes.arc(3, 32, 20)
-    features = features_of(gaussians)
-    actual = groups_in_view(features, cameras)
-    assert actual.shape == (3, 300)
-    assert 0.1 < actual.mean() < 0.9
-    radii = REACH * np.sqrt(np.trace(features.covars.astype(np.float64), axis1=1, axis2=2))
-    for view in range(3):
-        for g in range(300):
-            distances = np.array(corner_distances(cameras, view, features.means[g].astype(np.float64)))
-            assert actual[view, g] == (distances > -radii[g]).all()
-
-
-def test_nothing_is_in_view_of_nothing() -> None:
-    assert groups_in_view(scenes.make_features(np.zeros((0, 3))), scenes.arc(2)).shape == (2, 0)
-
-
 @given(
     seed=st.integers(0, 10_000),
     size=st.sampled_from([(0.0005, 0.01), (0.005, 0.1), (0.05, 0.5), (0.001, 0.5)]),
     shape=st.sampled_from([(24, 18), (40, 16), (17, 33)]),
     level=st.sampled_from([1, 2]),
 )
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: tuple[int, int], level: int) -> None:
     """Every Gaussian that adds anything to any pixel, with the low-pass of the rasterizer, at either size."""
     gaussians, cameras = random_gaussians(200, seed, size=size), scenes.arc(2, *shape)
@@ -99,6 +61,14 @@ def test_what_is_drawn_is_in_view(seed: int, size: tuple[float, float], shape: t
         assert len(missed) == 0, (gaussians.means[missed], gaussians.scales[missed], peaks[missed])
 
 
+def test_what_is_behind_or_beside_is_not_in_view() -> None:
+    cameras = scenes.arc(2)
+    places = cameras.centres[0] + np.array([[0, 0, 3], [0, 0, -3], [9, 0, 3], [0, 9, 3]])
+    gaussians = replace(random_gaussians(4, 0), means=places.astype(np.float32))
+    assert groups_in_view(features_of(gaussians), cameras)[0].tolist() == [True, False, False, False]
+    assert groups_in_view(scenes.make_features(np.zeros((0, 3))), cameras).shape == (2, 0)
+
+
 def test_pixel_errors_by_hand() -> None:
     """Squared differences, and light that comes through."""
     scene = room(2)
@@ -111,13 +81,6 @@ def test_pixel_errors_by_hand() -> None:
     assert actual.dtype == np.float32
     assert (actual[0, -4:] >= 1 - 1e-4).all()  # nothing is there
     assert actual[0, 4:8, 4:20].mean() < 0.2
-
-
-def test_pixel_errors_of_another_size_repeat() -> None:
-    scene = room(2)
-    pictures = photos_of(scene.images, scene.cameras, 2)
-    small, large = (pixel_errors(scene.gaussians, pictures, h, w) for h, w in ((12, 18), (24, 36)))
-    np.testing.assert_array_equal(small.repeat(2, 1).repeat(2, 2), large)
 
 
 def grouped(sizes: list[int], rows: np.ndarray) -> FeatureGaussians:
@@ -156,7 +119,7 @@ FEW = FitOptions(holdout=0.05)
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return room(6, 48, 36)
+    return room(6)
 
 
 @pytest.fixture(scope="module")
@@ -192,15 +155,6 @@ def drawn(groups: GroupSet, scene: Scene) -> tuple[Gaussians, Photos, Drawn]:
     return gaussians, photos, draw(gaussians, photos)
 
 
-def test_nothing_held_is_the_usual_fit(drawn: tuple[Gaussians, Photos, Drawn]) -> None:
-    gaussians, photos, views = drawn
-    plain, report = fit_colors(gaussians, views, photos, FEW)
-    none, other = fit_colors(gaussians, views, photos, FEW, 0, np.zeros(len(gaussians)))
-    assert report.accepted
-    assert scenes.identical(plain, none)
-    assert report == other
-
-
 def test_what_is_held_fast_stays(drawn: tuple[Gaussians, Photos, Drawn]) -> None:
     gaussians, photos, views = drawn
     precision = np.full(len(gaussians), 1e9)
@@ -210,22 +164,6 @@ def test_what_is_held_fast_stays(drawn: tuple[Gaussians, Photos, Drawn]) -> None
     assert report.accepted
     assert rms(actual.sh0[1::2], gaussians.sh0[1::2]) < 1e-6
     assert rms(actual.sh0[::2], gaussians.sh0[::2]) > 0.02
-
-
-def test_the_solution_is_where_the_gradient_vanishes(drawn: tuple[Gaussians, Photos, Drawn]) -> None:
-    """The equations by hand: a dense least-squares problem with what is held on its diagonal."""
-    gaussians, photos, views = drawn
-    precision = np.random.default_rng(1).uniform(1, 50, len(gaussians))
-    options = scenes.tuned(FEW, prior_weight=1e-9, iterations=400, huber=1e6, min_gain=1.0, max_gain=1.0)
-    actual, report = fit_colors(gaussians, views, photos, options, 0, precision)
-    assert report.accepted
-    n = len(gaussians)
-    rows = [np.stack([dense(view, j, n) for j in range(n)], 1) for view in views.views]
-    residuals = [(p - i).reshape(-1, 3) for p, i in zip(photos.images, views.images, strict=True)]
-    weights, right = np.concatenate(rows), np.concatenate(residuals)
-    offsets = np.linalg.solve(weights.T @ weights + np.diag(precision), weights.T @ right)
-    inside = np.abs(0.5 + SH_C0 * gaussians.sh0[:, 0] + offsets - 0.5) < 0.5  # colours are kept in range
-    np.testing.assert_allclose(SH_C0 * (actual.sh0 - gaussians.sh0)[:, 0][inside], offsets[inside], atol=2e-3)
 
 
 def dense(view: object, column: int, count: int) -> np.ndarray:
@@ -262,14 +200,11 @@ def test_what_is_held_is_the_diagonal_of_the_equations(groups: GroupSet, batch_p
     np.testing.assert_allclose(twice.colors.precision, 2 * actual.colors.precision, rtol=1e-5)
 
 
-@pytest.mark.parametrize("tint", [(0.1, 0.0, -0.1), (-0.06, 0.1, 0.04)])
-def test_one_batch_after_the_other_is_near_all_at_once(
-    groups: GroupSet, batch_photos: BatchPhotos, tint: tuple[float, float, float]
-) -> None:
+def test_one_batch_after_the_other_is_near_all_at_once(groups: GroupSet, batch_photos: BatchPhotos) -> None:
     """Batches of other tints, which say different things: nearer than where earlier ones are forgotten."""
     steady = scenes.tuned(FEW, min_gain=1.0, max_gain=1.0)
     sides = np.array([1, -1, 1, -1, 1, -1], np.float32)[:, None, None, None]
-    images = 0.6 * batch_photos.images + 0.2 + sides * np.array(tint, np.float32)
+    images = 0.6 * batch_photos.images + 0.2 + sides * np.array((0.1, 0.0, -0.1), np.float32)
     tinted = BatchPhotos(images, batch_photos.cameras)
     joint, _ = fit_batch_colors(groups, tinted, steady)
     after = forgetful = groups
@@ -312,8 +247,7 @@ def kept(sizes: list[int], most: int, start: int = 0) -> Replay:
     return actual
 
 
-@pytest.mark.parametrize("most", [1, 2, 3, 4, 7, 16])
-@pytest.mark.parametrize("num_views", [1, 2, 5, 6, 8, 9, 23])
+@pytest.mark.parametrize(("most", "num_views"), [(1, 5), (2, 9), (3, 1), (4, 8), (7, 23), (16, 6)])
 def test_kept_photos_do_not_depend_on_the_batches(most: int, num_views: int) -> None:
     """At most so many, every so many-th of all, whatever the sizes of the batches were."""
     rng = np.random.default_rng(most)
@@ -332,8 +266,7 @@ def test_kept_photos_do_not_depend_on_the_batches(most: int, num_views: int) -> 
         np.testing.assert_array_equal(actual.images, whole.images)
 
 
-@pytest.mark.parametrize("start", [1, 3, 7])
-@pytest.mark.parametrize("most", [1, 2, 5])
+@pytest.mark.parametrize(("start", "most"), [(1, 1), (3, 2), (7, 5)])
 def test_views_without_photos_before(start: int, most: int) -> None:
     """Where the first photo is no even one, one is kept all the same."""
     actual = kept([1, 1, 1], most, start)
@@ -342,17 +275,13 @@ def test_views_without_photos_before(start: int, most: int) -> None:
     assert actual.images[:, 0, 0, 0].tolist() == actual.views.tolist()
 
 
-def test_views_that_come_again_are_kept_once() -> None:
-    many = kept([4], 4)
-    again = update_replay(many, numbered_photos(10, 3), np.array([1, 4, 1]), 5, 8)
+def test_views_that_come_again_or_came_without_photos_are_kept_once() -> None:
+    again = update_replay(kept([4], 4), numbered_photos(10, 3), np.array([1, 4, 1]), 5, 8)
     assert again.views.tolist() == [0, 1, 2, 3, 4]
     assert again.images[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 11]
-
-
-def test_photos_of_views_that_came_without() -> None:
-    actual = update_replay(kept([1, 1], 8, 4), numbered_photos(0, 3), np.array([0, 2, 1]), 6, 8)
-    assert actual.views.tolist() == [0, 1, 2, 4, 5]
-    assert actual.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
+    before = update_replay(kept([1, 1], 8, 4), numbered_photos(0, 3), np.array([0, 2, 1]), 6, 8)
+    assert before.views.tolist() == [0, 1, 2, 4, 5]
+    assert before.images[:, 0, 0, 0].tolist() == [0, 2, 1, 4, 5]
 
 
 def test_known_cameras_are_found() -> None:
@@ -369,7 +298,7 @@ def test_fewer_may_be_wanted_later() -> None:
     assert few.views.tolist() == [0, 4, 8]
 
 
-@pytest.mark.parametrize("size", [(18, 12), (12, 8), (18, 24)])
+@pytest.mark.parametrize("size", [(12, 8), (18, 24)])
 def test_pictures_of_another_size_are_averages(size: tuple[int, int]) -> None:
     scene = room(2)
     actual = resize_photos(scene.images, scene.cameras, *size)

@@ -9,6 +9,7 @@ import pytest
 import scenes
 from view_batches import fed, group, parts_of, room, same_group, state_of
 
+from gsmerge.kernels import elementary
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.states.extend_decoded import find_partners, merge_into
 from gsmerge.states.groups import limit_children, select_groups, share
@@ -108,8 +109,8 @@ def test_children_of_both_are_kept_up_to_the_most(sides: tuple[GroupSet, GroupSe
     _, children = group(roomy, row)
     few = limit_children(select_groups(roomy, np.array([row])), 4)
     assert len(few.children) == 4
-    depth = -np.log1p(-children.opacities) * np.sort(children.scales, 1)[:, 1:].prod(1)
-    pooled = -np.log1p(-few.children.opacities) * np.sort(few.children.scales, 1)[:, 1:].prod(1)
+    depth = -elementary.log1p(-children.opacities) * np.sort(children.scales, 1)[:, 1:].prod(1)
+    pooled = -elementary.log1p(-few.children.opacities) * np.sort(few.children.scales, 1)[:, 1:].prod(1)
     assert float(pooled.sum()) == pytest.approx(float(depth.sum()), rel=0.1)
 
 

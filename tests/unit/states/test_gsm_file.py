@@ -32,7 +32,7 @@ from gsmerge.states.state_file import load_state, save_state
 @pytest.fixture(scope="module")
 def state(tmp_path_factory: pytest.TempPathFactory) -> State:
     checkpoint = written(tmp_path_factory.mktemp("networks") / "a.safetensors", noisy())
-    scene = scenes.make_scene(scenes.room(), scenes.arc(3), degree=1)
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 24, 18), degree=1)
     state = one_batch(scene, superpixels=60, checkpoint=str(checkpoint))
     assert isinstance(state.groups, DividedGroups)
     assert state.networks is not None
@@ -45,11 +45,7 @@ def path(state: State, tmp_path: Path) -> Path:
     return tmp_path / "scene.gsm"
 
 
-ARRAYS = (
-    *(f"division.{name}" for name in ("splits", "slots", "uniform", "growth_order", "means", "quats", "shN")),
-    *("heads.views", "heads.group", "heads.num_members", "networks.heads.1.out.weight", "features.latents"),
-    *("refined.means", "samples.means"),
-)
+ARRAYS = ("division.splits", "division.means", "heads.views", "heads.group", "networks.heads.1.out.weight")
 DAMAGED: dict[str, Spoil] = {
     "no networks": with_header(networks={"width": -1}),
     "networks of another size": with_header(networks={"width": 32, "heads": 2, "latent": 4}),
@@ -70,18 +66,12 @@ DAMAGED: dict[str, Spoil] = {
 }
 
 
-def test_everything_comes_back(path: Path, state: State) -> None:
+def test_everything_comes_back(path: Path, state: State, tmp_path: Path) -> None:
     actual = load_state(path)
     same_state(actual, state)
     assert actual.about == json.loads(json.dumps(state.about))
-    for k in (1, 2, 4):
-        assert scenes.identical(decoded(actual, k=k), decoded(state, k=k))
-
-
-def test_the_same_scene_gives_the_same_bytes(path: Path, state: State, tmp_path: Path) -> None:
-    save_state(tmp_path / "again.gsm", state)
-    assert (tmp_path / "again.gsm").read_bytes() == path.read_bytes()
-    save_state(tmp_path / "loaded.gsm", load_state(path))
+    assert scenes.identical(decoded(actual, k=2), decoded(state, k=2))
+    save_state(tmp_path / "loaded.gsm", actual)
     assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from hostile.gsm_files import (
     with_header,
     with_settings,
     with_text,
-    without,
 )
 from unaligned_scenes import far_behind, shuffled
 from view_batches import fed, parts_of, room, same_state, state_of
@@ -44,46 +42,29 @@ def path(state: State, tmp_path: Path) -> Path:
 
 
 ARRAYS = (
-    *(f"features.{name}" for name in ("means", "covars", "weights", "masses", "extinctions", "latents", "footprints")),
-    *("features.sh0", "features.shN", "features.views", "features.fitted_sh0", "features.color_precision"),
-    *(f"children.{name}" for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "counts")),
-    *("kept.means", "cameras.viewmats", "cameras.Ks", "frame.origin", "replay.images", "replay.views"),
+    *("features.means", "features.latents", "features.views", "features.fitted_sh0", "features.color_precision"),
+    *("children.quats", "children.shN", "children.counts", "kept.means", "cameras.viewmats", "cameras.Ks"),
+    *("frame.origin", "replay.images", "replay.views"),
 )
-FLOATS = [name for name in ARRAYS if name.split(".")[1] not in ("views", "counts", "images")]
-FLOATS = [name for name in FLOATS if name not in ("features.latents", "kept.means")]  # nothing is in those
+FLOATS = ("features.fitted_sh0", "features.color_precision", "children.quats", "cameras.viewmats", "cameras.Ks")
 DAMAGED: dict[str, Spoil] = {
     **UNREADABLE,
     **GSM_HEADERS,
     "of 0.1's encode by its name": with_text("{}", "gsmerge-encoded"),
     "views of another size": with_header(width=35),
-    "no about": without("about"),
     "about without options": with_header(about={"batches": []}),
-    "about without batches": with_header(about={"options": {}}),
-    "options in a list": with_header(about={"options": [], "batches": []}),
     "batches by number": with_header(about={"options": {}, "batches": {"0": 1}}),
-    "options of words": with_about(options={"k": "many"}),
-    "a crop by number": with_about(options={"crop": 5}),
     "a checkpoint in a list": with_about(options={"checkpoint": ["x"]}),
     "neighbours without end": with_about(options={"neighbors": 10**9}),
-    "sweeps without end": with_about(options={"early_sweeps": 10**20}),
-    "clusters without end": with_about(options={"cluster_size": 10**30}),
-    "a margin without end": with_about(options={"margin": 1e308}),
-    "a seed of words": with_about(options={"seed": "5"}),
-    "a budget in an object": with_about(options={"budget": {}}),
-    "an effort in a list": with_about(options={"effort": ["best"]}),
     "latents without networks": with_array("features.latents", lambda a: np.zeros((len(a), 4), np.float32)),
     "most of fewer than there are": with_settings(max_k=1),
     "a negative number": with_settings(num_input=-1),
     "a group without children": with_array("children.counts", filled(0)),
     "a group with too many": with_array("children.counts", filled(9)),
     "children of nobody": with_array("children.counts", lambda a: a.clip(max=1)),
-    "fewer children": with_array("children.means", lambda a: a[1:]),
     "harmonics of another degree": with_array("children.shN", lambda a: a[:, :0]),
     "views beyond": with_array("replay.views", lambda a: a + 3),
-    "views before": with_array("replay.views", lambda a: a - 1),
-    "views twice": with_array("replay.views", np.zeros_like),
     "views in no order": with_array("replay.views", lambda a: a[::-1]),
-    "fewer photos": with_array("replay.images", lambda a: a[1:]),
     "photos of another size": with_array("replay.images", lambda a: a[:, 1:]),
     **of_arrays(ARRAYS, FLOATS),
     **WILD_NUMBERS,
@@ -101,10 +82,9 @@ def test_the_same_state_gives_the_same_bytes(path: Path, state: State, tmp_path:
     assert (tmp_path / "loaded.gsm").read_bytes() == path.read_bytes()
 
 
-@pytest.mark.parametrize("settings", [{}, {"fit": "none", "replay": 2}, {"max_k": 1, "k": 1, "tolerance": 0}], ids=str)
-def test_saved_between_batches_is_kept_in_memory(settings: dict[str, Any], tmp_path: Path) -> None:
+def test_saved_between_batches_is_kept_in_memory(tmp_path: Path) -> None:
     """Bit for bit, in everything."""
-    batches = parts_of(room(6), 2)
+    batches, settings = parts_of(room(6), 2), {"max_k": 2, "replay": 2}
     kept = fed(batches, **settings)
     stored = fed(batches[:1], **settings)
     for number, batch in enumerate(batches[1:]):
@@ -129,11 +109,10 @@ def test_damage_is_told_in_one_line(damage: str, path: Path) -> None:
     assert_refused_in_one_line(load_state, path)
 
 
-@pytest.mark.parametrize("name", ["children.sh0", "features.means"])
-def test_what_is_not_what_was_written_is_refused(name: str, path: Path) -> None:
+def test_what_is_not_what_was_written_is_refused(path: Path) -> None:
     """As finite as the numbers are: only the checksum tells."""
-    damaged(name)(path)
-    assert "checksums" in assert_refused_in_one_line(load_state, path).partition(name)[2]
+    damaged("children.sh0")(path)
+    assert "checksums" in assert_refused_in_one_line(load_state, path).partition("children.sh0")[2]
 
 
 def test_a_file_decides_nothing_of_the_machine(path: Path, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
+from gsmerge.kernels import elementary
 from gsmerge.scene.read import load_scene
 
 
@@ -68,9 +69,9 @@ K = np.array([[180.0, 0, 96], [0, 170, 77], [0, 0, 1]])
 
 def bent(x: np.ndarray, y: np.ndarray, model: str, c: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Where a lens shows a point of the plane z = 1; the formulas of COLMAP's and OpenCV's documents."""
-    r = np.hypot(x, y)
+    r = np.sqrt(x * x + y * y)
     if model == "fisheye":
-        angle = np.arctan(r)
+        angle = elementary.arctan2(r, 1)
         scale = angle * (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(c))) / np.maximum(r, 1e-12)
         return x * scale, y * scale
     k1, k2, p1, p2, k3, k4, k5, k6 = [*c, *[0.0] * (8 - len(c))]

@@ -160,6 +160,7 @@ def test_impossible_depth_maps(tmp_path: Path, tiny: Tiny, changes: dict[str, An
         read_gaussians(path)
 
 
+@pytest.mark.slow
 def test_small_files_of_many_pixels(tmp_path: Path, tiny: Tiny) -> None:
     """Depths of 16 bits with images take 3.8 bytes a pixel; frames that pack to nothing may not take more together."""
     path, (views, height, width) = tmp_path / "results.npz", (4, 700, 800)

@@ -20,6 +20,7 @@ from gsmerge import Scene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
 from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
+from gsmerge.kernels import elementary
 from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Gaussians
 
@@ -43,12 +44,12 @@ needs_program = pytest.mark.skipif(program() is None, reason="needs splat-transf
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return scenes.make_scene(scenes.room(), scenes.arc(3, 96, 72))
+    return scenes.make_scene(scenes.room(), scenes.arc(2, 96, 72))
 
 
 def psnr(scene: Scene, one: Gaussians, other: Gaussians) -> float:
     a, b = (scenes.images_of(g, scene.cameras)[0].clip(0, 1) for g in (one, other))
-    return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
+    return float(-10 * elementary.log10(max(((a - b) ** 2).mean(), 1e-12)))
 
 
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
@@ -60,13 +61,12 @@ def test_what_is_read_back_shows_the_same(ending: str, degree: int, scene: Scene
     assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
 
 
-@pytest.mark.parametrize(("degree", "floor"), [(0, 40), (3, 34)])
-def test_a_compressed_ply_is_read_and_no_longer_written(degree: int, floor: int, scene: Scene, tmp_path: Path) -> None:
-    gaussians, path = drawn(scene, degree), tmp_path / "a.compressed.ply"
+def test_a_compressed_ply_is_read_and_no_longer_written(scene: Scene, tmp_path: Path) -> None:
+    gaussians, path = drawn(scene, 3), tmp_path / "a.compressed.ply"
     path.write_bytes(compressed_bytes(gaussians, ["SplatRenderMode: mip"]))
     actual = read_ply(path)
-    assert (actual.info.layout, actual.info.comments) == (f"compressed, SH degree {degree}", ("SplatRenderMode: mip",))
-    assert psnr(scene, gaussians, actual.gaussians) > floor
+    assert (actual.info.layout, actual.info.comments) == ("compressed, SH degree 3", ("SplatRenderMode: mip",))
+    assert psnr(scene, gaussians, actual.gaussians) > 34
     for name in ("b.compressed.ply", "B.USDA"):
         with refuses(UsageError, name, "no longer written", ".usdz"):
             write_gaussians(tmp_path / name, gaussians)
@@ -83,14 +83,6 @@ def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, 
     assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
     assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]
     assert psnr(scene, read_back(path), actual) > 50  # of .splat, it takes 127.5 for the middle
-
-
-@pytest.mark.parametrize("ending", QUANTISED)
-def test_they_are_smaller(ending: str, scene: Scene, tmp_path: Path) -> None:
-    gaussians = drawn(scene, 0)
-    write_gaussians(tmp_path / "a.ply", gaussians)
-    write_gaussians(tmp_path / f"b{ending}", gaussians)
-    assert (tmp_path / f"b{ending}").stat().st_size < (tmp_path / "a.ply").stat().st_size / 2
 
 
 @sweep("ending", OUTPUT_FORMATS, often=4)
@@ -142,18 +134,12 @@ def test_a_higher_degree_loses_its_top(scene: Scene, tmp_path: Path) -> None:
         assert read_back(tmp_path / f"a{ending}").sh_degree == degree
 
 
-@pytest.mark.parametrize(
-    ("name", "ending"),
-    [("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")],
-)
-def test_names_ask_for_formats(name: str, ending: str) -> None:
-    assert output_format(name).ending == ending
-
-
-@pytest.mark.parametrize("name", ["a", "a.ksplat", "ply", "a.ply.gz", "spz/a"])
-def test_other_names_are_refused(name: str) -> None:
-    with refuses(UsageError, name, ".ply, .spz, .sog, .splat, .glb, .usdc or .usdz"):
-        output_format(name)
+def test_names_ask_for_formats() -> None:
+    for name, ending in (("a.ply", ".ply"), ("A.SPZ", ".spz"), ("x/b.splat", ".splat")):
+        assert output_format(name).ending == ending
+    for name in ("a", "a.ksplat", "ply", "a.ply.gz", "spz/a"):
+        with refuses(UsageError, name, ".ply, .spz, .sog, .splat, .glb, .usdc or .usdz"):
+            output_format(name)
 
 
 @pytest.mark.parametrize("name", ["colmap", "colmap/sparse/0/points3D.bin"])
@@ -168,6 +154,8 @@ def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: P
     bad, path = replace(corners(), opacities=np.array([0.0, float("nan"), 0.5], np.float32)), tmp_path / f"a{ending}"
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad)
+    with refuses(ValueError, "gaussians", "none"):
+        write_gaussians(path, corners()[:0])
     assert list(tmp_path.iterdir()) == []
     path.write_text("precious")
     with refuses(SceneError, path, "exists"):
@@ -175,13 +163,6 @@ def test_failures_leave_existing_files_and_nothing_else(ending: str, tmp_path: P
     with refuses(ValueError, "", "finite", 1):
         write_gaussians(path, bad, overwrite=True)
     assert [one.read_text() for one in tmp_path.iterdir()] == ["precious"]
-
-
-@pytest.mark.parametrize("ending", OUTPUT_FORMATS)
-def test_no_gaussians(ending: str, tmp_path: Path) -> None:
-    with refuses(ValueError, "gaussians", "none"):
-        write_gaussians(tmp_path / f"a{ending}", corners()[:0])
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_comments_reach_the_headers(tmp_path: Path) -> None:

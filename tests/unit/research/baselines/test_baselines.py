@@ -26,6 +26,8 @@ PRUNERS = ("opacity", "contribution", "random")
 EXACT = (*PRUNERS, "moment-matching", "blocks", "greedy")
 BASELINES = {name: load_plugin(METHODS, name) for name in find_plugins(METHODS)}
 OWN = sorted(set(BASELINES) - {"splat-transform"})  # which need no program
+KINDS = ["greedy", "moment-matching", "unmerged-fit", "voxel"]  # each makes Gaussians in a way of its own
+EACH = [*KINDS, *(pytest.param(name, marks=pytest.mark.slow) for name in OWN if name not in KINDS)]
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def test_used_settings_exist() -> None:
 
 
 @pytest.mark.parametrize("method", EXACT)
-@pytest.mark.parametrize("count", [3, 100, 2000, 3 * 32 * 24])
+@pytest.mark.parametrize("count", [3, 2000])
 def test_budgets_are_met(scene: Scene, method: str, count: int) -> None:
     result = made(scene, method, budget=count)
     assert len(result.gaussians) == count
@@ -73,13 +75,13 @@ def test_the_usual_count_without_a_budget(scene: Scene, method: str) -> None:
     assert len(made(scene, method, budget=None, superpixels="10%", k=2).gaussians) == 2 * 3 * 76
 
 
-@pytest.mark.parametrize("method", OWN)
+@pytest.mark.parametrize("method", EACH)
 def test_a_run_repeats_on_any_number_of_threads(scene: Scene, method: str) -> None:
     one, other = (made(scene, method, threads=threads).gaussians for threads in (1, 3))
     assert scenes.identical(one, other)
 
 
-@pytest.mark.parametrize("method", OWN)
+@pytest.mark.parametrize("method", EACH)
 def test_scenes_without_an_order(scene: Scene, method: str) -> None:
     if method == "blocks":
         with refuses(UsageError, "method blocks", "unaligned"):
@@ -90,13 +92,13 @@ def test_scenes_without_an_order(scene: Scene, method: str) -> None:
     assert len(result.gaussians) > COUNT / 2
 
 
-@pytest.mark.parametrize("method", ["unmerged", "opacity", "contribution", "voxel", "greedy"])
+@pytest.mark.parametrize("method", ["opacity", "contribution", "voxel", "greedy"])
 def test_the_order_of_the_rows_does_not_matter(scene: Scene, method: str) -> None:
     actual = [compact(unaligned_scenes.shuffled(scene, seed), method=method, budget=COUNT).gaussians for seed in (1, 2)]
     scenes.assert_same_set(*actual, atol=1e-4)
 
 
-@pytest.mark.parametrize("method", OWN)
+@pytest.mark.parametrize("method", EACH)
 def test_rows_that_are_not_there_stay_out(scene: Scene, method: str) -> None:
     valid = scene.valid.copy()
     valid[:, :4] = False
@@ -116,7 +118,7 @@ def test_photos_are_asked_for(scene: Scene) -> None:
         made(replace(scene, images=None, pixel_ids=None), "unmerged-fit")
 
 
-@pytest.mark.parametrize("method", sorted(set(OWN) - {"unmerged-fit"}))
+@pytest.mark.parametrize("method", ["blocks", "contribution", "greedy", "voxel"])
 def test_the_others_do_without_photos(scene: Scene, method: str) -> None:
     result = made(replace(scene, images=None), method)
     assert result.report.psnr_reference == ROW_COLORS
@@ -187,8 +189,7 @@ def test_the_seed_chooses(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("height", "width", "count"),
-    [(24, 32, 66), (24, 32, 1), (24, 32, 768), (24, 32, 767), (1, 40, 7), (40, 1, 7), (5, 7, 11)],
+    ("height", "width", "count"), [(24, 32, 66), (24, 32, 1), (24, 32, 768), (24, 32, 767), (40, 1, 7)]
 )
 def test_blocks_are_as_many_as_asked_for(height: int, width: int, count: int) -> None:
     labels = grid_labels(height, width, count)
@@ -210,10 +211,9 @@ def test_one_gaussian_for_each_superpixel_has_their_mean_opacity() -> None:
     np.testing.assert_allclose(actual.opacities, np.full(COUNT, 0.7), atol=1e-4)
 
 
-@pytest.mark.parametrize("degree", [0, 2])
-@pytest.mark.parametrize("method", OWN)
-def test_harmonics_are_kept(method: str, degree: int) -> None:
-    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 24, 16), degree=degree)
+@pytest.mark.parametrize("method", EACH)
+def test_harmonics_are_kept(method: str) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2, 24, 16), degree=2)
     actual = made(scene, method, budget=50).gaussians
-    assert actual.sh_degree == degree
-    assert degree == 0 or np.abs(actual.shN).max() > 0.01
+    assert actual.sh_degree == 2
+    assert np.abs(actual.shN).max() > 0.01

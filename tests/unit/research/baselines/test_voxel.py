@@ -8,6 +8,7 @@ from clouds import some
 
 from gsmerge import Gaussians
 from gsmerge.geometry import normalize, quat_to_rotmat
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.research.baselines.voxel import fuse, voxel_keys, voxel_size
 
 
@@ -19,14 +20,14 @@ def slow_voxels(gaussians: Gaussians, size: float) -> dict[tuple[int, ...], dict
     result = {}
     for voxel, rows in actual.items():
         opacities = gaussians.opacities[rows].astype(np.float64)
-        shares = np.exp(opacities) / np.exp(opacities).sum()
-        logit = sum(w * np.log(a / (1 - a)) for w, a in zip(shares, opacities, strict=True))
+        shares = exp(opacities) / exp(opacities).sum()
+        logit = sum(w * log(a / (1 - a)) for w, a in zip(shares, opacities, strict=True))
         result[voxel] = {
             "means": sum(w * gaussians.means[r].astype(np.float64) for w, r in zip(shares, rows, strict=True)),
-            "scales": np.exp(
-                sum(w * np.log(gaussians.scales[r].astype(np.float64)) for w, r in zip(shares, rows, strict=True))
+            "scales": exp(
+                sum(w * log(gaussians.scales[r].astype(np.float64)) for w, r in zip(shares, rows, strict=True))
             ),
-            "opacities": 1 / (1 + np.exp(-logit)),
+            "opacities": 1 / (1 + exp(-logit)),
             "sh0": sum(w * gaussians.sh0[r].astype(np.float64) for w, r in zip(shares, rows, strict=True)),
             "shN": sum(w * gaussians.shN[r].astype(np.float64) for w, r in zip(shares, rows, strict=True)),
         }

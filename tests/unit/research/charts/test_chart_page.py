@@ -59,13 +59,14 @@ def outline(page: str) -> Outline:
 
 
 def page_of(records: list[RunRecord], folder: Path, most_figures: int = 1) -> str:
-    figures = make_figures(Results(records))[-most_figures:]
+    figures = make_figures(Results(records))[::-1][:most_figures]
     return make_page(records, figures, draw_figures(figures, folder / "charts"), folder, "gsmerge lab chart")
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    return page_of(make_grid(), tmp_path_factory.mktemp("results"), most_figures=20)
+    """With two figures, since their ids share the page; Matplotlib takes a second for both."""
+    return page_of(make_grid(budgets=("1%", "4.4%")), tmp_path_factory.mktemp("results"), most_figures=2)
 
 
 def test_the_page_is_well_formed(page: str) -> None:
@@ -89,23 +90,23 @@ def test_the_page_fetches_nothing(page: str) -> None:
 def test_every_reference_inside_the_page_is_there(page: str) -> None:
     actual = outline(page)
     inside = {value[1:] for value in actual.fetched if value.startswith("#")}
-    assert len(inside) == 3
+    assert len(inside) == 2
     assert inside - set(actual.ids) == set()
 
 
 def test_the_page_says_what_was_found(page: str) -> None:
-    assert "54 runs on 3 scene(s): apples, fern, fox" in page
+    assert "42 runs on 3 scene(s): apples, fern, fox" in page
     assert "gsmerge lab chart scenes --grid budget=1%,4.4%" in page
     assert "<td>processor</td><td>one</td>" in page
     assert "Failed runs" not in page
-    for title in ("Results", "Quality against time", "Quality against views"):
+    for title in ("Results", "Quality against size", "Quality against views"):
         assert f">{title}</h2>" in page
 
 
 def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     records = [
         replace(r, scene=EVIL if r.scene == "fern" else r.scene, command=EVIL, environment={EVIL: EVIL})
-        for r in make_grid()
+        for r in make_grid(budgets=("4.4%",), views=(None,))
     ]
     records += [replace(records[1], label=EVIL, error=EVIL), replace(records[0], settings={EVIL: EVIL})]
     made = page_of(records, tmp_path)
@@ -126,7 +127,7 @@ def test_pictures_are_in_the_page(tmp_path: Path) -> None:
             path = picture_path(tmp_path, owner, 0, kind)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data[path.suffix])
-    made = page_of(records, tmp_path)
+    made = page_of(records, tmp_path, most_figures=0)
     assert made.count('<input type="range"') == 3
     assert "fern, a/1.png" in made
     assert outline(made).open == []

@@ -10,6 +10,7 @@ from messages import refuses
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import project, quat_to_rotmat
+from gsmerge.kernels.elementary import log
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.research.generate import GenerateOptions, NoiseOptions
 from gsmerge.research.generate.noise import (
@@ -77,15 +78,15 @@ def test_thin_axes_are_the_normals() -> None:
 
 @pytest.mark.parametrize("bias", [0.01, 0.05])
 def test_a_view_s_bias_is_one_factor(bias: float) -> None:
-    ratios = [np.log(seen_again(made(replace(CLEAN, view_bias=bias), seed=s))[1] / seen().depth) for s in range(60)]
+    ratios = [log(seen_again(made(replace(CLEAN, view_bias=bias), seed=s))[1] / seen().depth) for s in range(60)]
     assert max(r.std() for r in ratios) < 1e-5
     assert np.std([r.mean() for r in ratios]) == pytest.approx(bias, rel=0.35)
 
 
 def test_grain_and_drift_have_their_strengths() -> None:
-    grain = np.log(seen_again(made(replace(CLEAN, grain=0.01)))[1] / seen().depth)
+    grain = log(seen_again(made(replace(CLEAN, grain=0.01)))[1] / seen().depth)
     assert grain.std() == pytest.approx(0.01, rel=0.05)
-    drift = np.log(seen_again(made(replace(CLEAN, drift=0.01)))[1] / seen().depth)
+    drift = log(seen_again(made(replace(CLEAN, drift=0.01)))[1] / seen().depth)
     assert drift.std() == pytest.approx(0.01, rel=0.4)
     assert np.abs(np.diff(drift, axis=1)).mean() < 0.15 * drift.std()
 
@@ -93,7 +94,7 @@ def test_grain_and_drift_have_their_strengths() -> None:
 def test_edges_bleed_and_are_not_trusted() -> None:
     given = seen(step=0.4)
     depth, confidence = predict_depth(given, replace(CLEAN, bleed=1.0, bleed_width=1.5), np.random.default_rng(0))
-    off = np.abs(np.log(depth / given.depth))
+    off = np.abs(log(depth / given.depth))
     assert off[:, W // 2 - 2 : W // 2 + 2].min() > 0.02
     assert off[:, : W // 2 - 8].max() < 1e-3
     assert confidence[:, W // 2].mean() < confidence[:, : W // 2 - 8].mean() - 0.4
@@ -107,7 +108,7 @@ def test_errors_are_larger_without_texture() -> None:
     given = replace(seen(), image=image)
     assert texture_mask(image)[: H // 2 - 4].max() == 0
     actual = seen_again(made(replace(CLEAN, grain=0.01, blank=2.0), given))[1]
-    off = np.log(actual / given.depth)
+    off = log(actual / given.depth)
     assert off[: H // 2 - 4].std() == pytest.approx(3 * off[H // 2 + 4 :].std(), rel=0.2)
 
 
@@ -126,7 +127,7 @@ def test_shares_are_met() -> None:
     assert (ratio < 0.96).mean() == pytest.approx(0.1, abs=0.025)
     sizes = gaussians.scales[:, 0].reshape(H, W) / (seen_again(gaussians)[1] / LENS.focal)
     assert (sizes > 1.5).mean() == pytest.approx(0.1, abs=0.025)
-    patches = np.log(seen_again(made(replace(CLEAN, patches=0.2, patch_error=0.3)))[1] / seen().depth)
+    patches = log(seen_again(made(replace(CLEAN, patches=0.2, patch_error=0.3)))[1] / seen().depth)
     assert (np.abs(patches) > 1e-4).mean() == pytest.approx(0.2, abs=0.02)
 
 

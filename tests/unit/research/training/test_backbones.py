@@ -27,7 +27,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 VIEWS = 8
-RUN = replace(PAPER, steps=4, save_every=2, buffer=1, refresh=1, workers=2)
+RUN = replace(PAPER, steps=2, save_every=1, buffer=1, refresh=1, workers=2)
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +49,11 @@ def data(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Guess:
     """A backbone that knows the scene, and remembers which views it was given.
 
-    Its depths are too large, the more so the fewer views it gets, or always as with ``views``.
+    Its depths are too large, the more so the fewer views it gets.
     """
 
-    def __init__(self, scene: Scene, views: int | None = None) -> None:
-        self.scene, self.views, self.calls = scene, views, list[tuple[int, ...]]()
-        self.busy = Lock()
-
-    def error(self, views: int) -> float:
-        return 0.2 / (self.views or views)
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.calls, self.busy = scene, list[tuple[int, ...]](), Lock()
 
     def __call__(self, images: np.ndarray, cameras: Cameras) -> Gaussians:
         assert not torch.is_grad_enabled()
@@ -75,7 +71,7 @@ class Guess:
         self.calls.append(tuple(ids))
         gaussians, centres = subset(self.scene, ids).gaussians, cameras.centres.repeat(32 * 24, 0)
         rays = gaussians.means - centres
-        return replace(gaussians, means=centres + (1 + self.error(len(ids))) * rays).to("cpu")
+        return replace(gaussians, means=centres + (1 + 0.2 / len(ids)) * rays).to("cpu")
 
 
 def files(out: Path) -> dict[str, bytes]:
@@ -85,7 +81,7 @@ def files(out: Path) -> dict[str, bytes]:
 def test_every_draw_is_predicted_from_its_own_views(scene: Scene, data: Path) -> None:
     guess, rng = Guess(scene), np.random.default_rng(0)
     (capture,) = bind_backbone(list_captures(data), guess)
-    for draw in range(12):
+    for draw in range(8):
         example = capture.draw(PAPER, rng)
         ids = guess.calls[draw]
         count = len(ids)
@@ -98,8 +94,8 @@ def test_every_draw_is_predicted_from_its_own_views(scene: Scene, data: Path) ->
         scale = np.linalg.norm(np.ptp(ours.centres, 0)) / np.linalg.norm(np.ptp(theirs.centres, 0))
         depths = np.linalg.norm(example.members.means[: 32 * 24] - ours.centres[0], axis=1) / scale
         expected = np.linalg.norm(subset(scene, ids[:1]).gaussians.means - theirs.centres[0], axis=1)
-        np.testing.assert_allclose(depths / expected, 1 + guess.error(count), rtol=1e-3)
-    assert len(set(guess.calls)) > 9
+        np.testing.assert_allclose(depths / expected, 1 + 0.2 / count, rtol=1e-3)
+    assert len(set(guess.calls)) > 5
     assert {len(ids) for ids in guess.calls} > {1, 8}
 
 
@@ -138,10 +134,11 @@ def run(scene: Scene, data: Path, tmp_path_factory: pytest.TempPathFactory) -> t
     """A run, and what it asked of the backbone. Read only."""
     out, guess = tmp_path_factory.mktemp("run"), Guess(scene)
     done = train(list_captures(data), [], out, RUN, backbone=guess, threads=1)
-    assert done.step == 4
+    assert done.step == 2
     return guess, out
 
 
+@pytest.mark.slow
 def test_training_asks_for_many_subsets(run: tuple[Guess, Path]) -> None:
     guess, out = run
     assert len(set(guess.calls)) >= RUN.steps * RUN.crops
@@ -149,6 +146,7 @@ def test_training_asks_for_many_subsets(run: tuple[Guess, Path]) -> None:
     assert len((out / "losses.csv").read_text().splitlines()) == 3
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_and_resumed_to_the_bit(
     scene: Scene, data: Path, run: tuple[Guess, Path], tmp_path: Path
 ) -> None:
@@ -156,12 +154,12 @@ def test_a_run_is_repeated_and_resumed_to_the_bit(
     expected, captures, guess = files(run[1]), list_captures(data), Guess(scene)
 
     def stop(step: int, *_: float) -> None:
-        if step == 3:
+        if step == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         train(captures, [], tmp_path / "run", RUN, backbone=guess, threads=2, progress=stop)
-    assert train(captures, [], tmp_path / "run", RUN, backbone=guess, threads=2).resumed == 2
+    assert train(captures, [], tmp_path / "run", RUN, backbone=guess, threads=2).resumed == 1
     assert files(tmp_path / "run") == expected
     other = replace(captures[0], name="hall")
     with refuses(SceneError, "state.safetensors", "data"):
@@ -169,16 +167,6 @@ def test_a_run_is_repeated_and_resumed_to_the_bit(
 
 
 @pytest.mark.slow
-def test_depths_that_depend_on_the_subset_train_other_networks(
-    scene: Scene, data: Path, run: tuple[Guess, Path], tmp_path: Path
-) -> None:
-    fixed = Guess(scene, VIEWS)
-    train(list_captures(data), [], tmp_path / "run", RUN, backbone=fixed, threads=1)
-    assert sorted(fixed.calls) == sorted(run[0].calls)
-    ours, theirs = ((out / "losses.csv").read_text() for out in (run[1], tmp_path / "run"))
-    assert ours != theirs
-
-
 def test_captures_and_shards_together(scene: Scene, data: Path, tmp_path: Path) -> None:
     example = make_example(make_training_scene(scene, range(3)), PAPER, 0.1, "shard")
     guess = Guess(scene)
@@ -205,6 +193,7 @@ def test_what_cannot_be_trained_on_is_refused(scene: Scene, data: Path, tmp_path
         train([missing], [], tmp_path, RUN, backbone=Guess(scene))
 
 
+@pytest.mark.slow
 def test_the_guide_s_example_runs(scene: Scene, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[4] / "docs" / "internals" / "training.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

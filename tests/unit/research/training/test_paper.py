@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scenes import arc, make_scene, room
-from training_runs import PAPER, TINY, noisy_networks, torch, written
+from training_runs import PAPER, TINY, noisy_networks, torch
 
 from gsmerge.geometry import rotmat_to_quat
-from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.kernels import elementary
 from gsmerge.networks.tensors import quat_to_rotmat
 from gsmerge.pooling import MAX_OPACITY, pool_members
-from gsmerge.research.training import Example, make_example, make_training_scene, preset_options, train
+from gsmerge.research.training import Example, make_example, make_training_scene, preset_options
 from gsmerge.research.training.examples import draw_views, select_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
-from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, predict
 from gsmerge.research.training.windows import Window, sample_window
 from gsmerge.stages.match import match
@@ -30,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    return make_example(make_training_scene(make_scene(room(), arc(4, 48, 36)), range(4)), PAPER, 0.1, "room")
+    return make_example(make_training_scene(make_scene(room(), arc(4, 32, 24)), range(4)), PAPER, 0.1, "room")
 
 
 def windows(example: Example, count: int) -> list[Window]:
@@ -50,17 +48,17 @@ def test_photos_have_the_longer_side_that_is_asked_for() -> None:
 
 def test_every_window_has_views_of_its_own(example: Example) -> None:
     rng = np.random.default_rng(0)
-    drawn = [draw_views(example, PAPER, rng) for _ in range(200)]
+    drawn = [draw_views(example, PAPER, rng) for _ in range(80)]
     counts = Counter(len(part.cameras) for part in drawn)
     assert set(counts) == {1, 2, 3, 4}
-    assert min(counts.values()) > 25
+    assert min(counts.values()) > 9
     assert {len(draw_views(example, replace(PAPER, random_views=(2, 3)), rng).cameras) for _ in range(20)} == {2, 3}
 
 
 def test_some_views_of_an_example_are_an_example_of_some_views(example: Example) -> None:
     """As if it had been made of them, apart from the frame."""
     part = select_views(example, [1, 3])
-    pixels = 48 * 36
+    pixels = 32 * 24
     assert (len(part.cameras), len(part.photos), part.covers.shape[:2]) == (2, 4, (2, 4))
     np.testing.assert_array_equal(part.cameras.viewmats, example.cameras.viewmats[[1, 3]])
     np.testing.assert_array_equal(part.members.means[:pixels], example.members.means[pixels : 2 * pixels])
@@ -86,7 +84,7 @@ def test_the_preset_s_examples_have_clusters(example: Example) -> None:
     assert float(sizes[sizes > 1].sum()) > 0.1 * len(example.features)
     strict = np.bincount(match(example.features, replace(paper, iou=0.7).match_options()).clusters)
     assert int(strict[strict > 1].sum()) < 0.5 * int(sizes[sizes > 1].sum())
-    shares = [predict(window.crop, noisy_networks(TINY), PAPER, 0).matched for window in windows(example, 12)]
+    shares = [predict(window.crop, noisy_networks(TINY), PAPER, 0).matched for window in windows(example, 6)]
     assert max(shares) > 0.1
 
 
@@ -100,21 +98,6 @@ def test_every_network_gets_a_gradient(example: Example) -> None:
             if part is not None:
                 sums[name.partition(".")[0] + name.partition("heads.")[2][:1]] += float(part.abs().sum())
     assert {name for name, value in sums.items() if value > 0} == {"encoder", "merger", "refiner", "heads1", "heads2"}
-
-
-def test_training_moves_every_layer_of_the_merger(example: Example, tmp_path: Path) -> None:
-    """Beyond what weight decay does: the last layer begins at zero, which decay leaves there."""
-    options = replace(PAPER, steps=6, save_every=6, decay=0.0, average=0.0)
-    done = train([written(example, tmp_path)], [], tmp_path / "run", options)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(options.seed)
-        before = Networks(options.network)
-    after = load_checkpoint(done.last).networks
-    assert after.options.outputs == "absolute"
-    for name, start in before.weights().arrays.items():
-        if name.startswith("merger"):
-            assert not np.array_equal(start, after.arrays[name]), name
-    assert np.abs(after.arrays["merger.out.weight"]).max() > 1e-4
 
 
 def teacher_of(example: Example) -> Prediction:
@@ -138,7 +121,7 @@ def teacher_of(example: Example) -> Prediction:
     )
     gaussians = Gaussians(
         *(torch.from_numpy(column).float() for column in columns),
-        torch.from_numpy(1 - np.exp(-depths)).float().clamp(0, MAX_OPACITY),
+        torch.from_numpy(1 - elementary.exp(-depths)).float().clamp(0, MAX_OPACITY),
         torch.from_numpy(np.stack(colors)).float()[:, None], torch.zeros(count, 0, 3),
     )  # fmt: skip
     return Prediction(gaussians, torch.arange(count), merged, torch.ones(count), 0.0)
@@ -166,7 +149,7 @@ def test_the_teacher_is_the_paper_s_two_equations(example: Example) -> None:
 def turn(quats: torch.Tensor, angle: float) -> torch.Tensor:
     """Rotated about the first axis of the world."""
     w, x, y, z = quats.unbind(1)
-    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    c, s = elementary.cos(angle / 2), elementary.sin(angle / 2)
     return torch.stack([c * w - s * x, c * x + s * w, c * y - s * z, c * z + s * y], 1)
 
 

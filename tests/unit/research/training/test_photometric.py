@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter
 from training_runs import OPTIONS, PAPER, TINY, noisy_networks, torch, written
 
 from gsmerge.errors import GsmergeError
+from gsmerge.kernels.elementary import exp
 from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.networks.apply import NetworkContext, refine_features
 from gsmerge.networks.options import NetworkOptions
@@ -204,6 +205,7 @@ def test_a_run_that_needs_lpips_says_what_is_missing(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_gradients_of_the_last_layers_are_those_of_finite_differences(example: Example) -> None:
     """Through corrections, Gaussians, rasterizer and loss; heads alone, whose gradient is exact.
 
@@ -274,7 +276,7 @@ def test_diversification_is_the_formula_of_the_paper() -> None:
     first = torch.zeros(4, dtype=torch.int64)
     profile = overlap_profile(gaussians, first, torch.arange(1, 5)).tolist()
     shifted, contact = 4 / 12, 2 * 3**0.5
-    expected = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - np.exp(-3 * (20 - contact) / contact))]
+    expected = [1.0, 0.5 * ((0.5 - shifted) / 0.5) ** 3, 0.5, 0.5 + 0.5 * (1 - exp(-3 * (20 - contact) / contact))]
     assert profile == pytest.approx(expected, rel=1e-5)
     pair = boxes([[0.0, 0, 0], [0, 0, 0]], [1.0, 0.5], [0.2, 0.6])
     together = torch.zeros(2, dtype=torch.int64)
