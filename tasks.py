@@ -15,6 +15,7 @@ TASKS = {
     "native": (("python", "gsmerge/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
+    "processors": (("python", "tools/processors.py"),),
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),
     "types": (("mypy", "-p", "gsmerge"),),
     "imports": (("lint-imports",),),

@@ -40,7 +40,8 @@ _STEPS = 48  # so that the last is four sides
 _FEW_SAMPLES = 3000  # Gaussians that are compared with the photos at each of these
 _SAMPLES = 20_000  # and near the best
 _SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # shares of it around the best that are searched next
-_ROUNDS = 8  # of each of them, at most
+_STRIDES = 0, 1, 2, 4  # of a round's change that are gone once more: along a valley (Hooke and Jeeves 1961)
+_ROUNDS = 16  # of each of them, at most
 _FINE, _FEWER = 0.01, 8  # above this span every eighth of the Gaussians is compared
 _MOST = 0.1  # distance of a Gaussian's colour from the photo's that counts, of 1: what is larger is another surface
 _HALF = 4  # places on either side in each
@@ -202,6 +203,7 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
                 K = min((K + focal * span * step / _HALF * change for step in steps), key=color_error)
             if np.array_equal(K, before):
                 break
+            K = min((K + stride * (K - before) for stride in _STRIDES), key=color_error)
         return K
 
     return reduce(search, _SPANS, pictures.pinhole(focal))

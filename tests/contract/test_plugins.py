@@ -57,6 +57,7 @@ def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> Non
     assert "count" in printed
 
 
+@pytest.mark.slow
 def test_a_broken_package_stops_no_other(site: Path, small_scene: Path) -> None:
     (site / "gsmerge_nth.py").write_text("import no_such_module\n")
     dry = ["compact", str(small_scene), "--set", "method=nth", "--dry-run"]

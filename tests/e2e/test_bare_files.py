@@ -87,6 +87,7 @@ def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Pa
     assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
 
 
+@pytest.mark.slow
 def test_photos_without_cameras_change_nothing(bare: Path, smallest_scene: Path, tmp_path: Path, run: Any) -> None:
     """Neither those that are named nor those that lie beside the scene."""
     named, beside = smallest_scene / "images", Path(shutil.copytree(smallest_scene / "images", tmp_path / "images"))

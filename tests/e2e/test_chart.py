@@ -65,6 +65,7 @@ def again(run: Run, folder: Path, *options: object) -> Outcome:
     return run("lab", "chart", folder / "room", *where, *CHART_TARGETS, *fast, *options)
 
 
+@pytest.mark.slow
 def test_what_a_grid_leaves_behind(charted_scene: Path) -> None:
     records = runs(charted_scene / "out")
     expected = ["input", "gsmerge, budget 1%, fit none", "gsmerge, budget 2%, fit none"]

@@ -176,6 +176,7 @@ def test_a_panel_of_a_size_cuts_photos_as_it_cuts_views(small_copy: Path, run: R
     assert [np.abs(photo - whole[80:240]).mean() < 4, np.abs(view - alone).mean() < 4] == [True, True]
 
 
+@pytest.mark.slow
 def test_a_view_of_one_scene(smallest_copy: Path, run: Run) -> None:
     """Of a folder, and of a compact scene beside its cameras: two pages, each with what it takes to show it."""
     outcome = run("view", smallest_copy, "--no-open", code=0)

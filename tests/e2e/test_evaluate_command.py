@@ -70,6 +70,7 @@ def test_table_and_files(
         assert len(list(csv.DictReader(file))) == 2 * 9
 
 
+@pytest.mark.slow
 @sweep("setting", ["context=false", "views=3", "photo_side=16"], often=2)
 def test_a_page_shows_what_was_measured(setting: str, scene: Path, small: Path, run: Run) -> None:
     page = scene / "page.html"
@@ -123,6 +124,7 @@ def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, mon
     assert [view["lpips_vgg"] for view in every["results"][0]["views"]].count(0.25) == 5
 
 
+@pytest.mark.slow
 def test_costs_and_files_of_every_kind(scene: Path, small: Path, run: Run) -> None:
     outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv", "md", "html")}
     flags = [part for path in outputs.values() for part in ("-o", path)]

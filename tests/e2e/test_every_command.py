@@ -143,6 +143,7 @@ def test_the_way_to_render_is_passed_on(small_copy: Path, run: Run) -> None:
     assert "of no use" not in comments
 
 
+@pytest.mark.slow
 @sweep("command", COMMANDS, often=len(COMMANDS) - MODES)
 def test_every_command_notes_odd_rows(command: str, small_copy: Path, run: Run) -> None:
     spoil_rows(small_copy / "scene.ply")

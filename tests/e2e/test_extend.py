@@ -141,6 +141,7 @@ def test_a_dry_run_knows_the_most(states: list[Path], tmp_path: Path, run: Run) 
     assert len(gsmerge.read_ply(tmp_path / "a.ply").gaussians) <= most["output"]["num_gaussians_at_most"]
 
 
+@pytest.mark.slow
 def test_the_papers_online_experiment(
     walks: list[Path], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

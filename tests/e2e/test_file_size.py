@@ -51,6 +51,7 @@ def test_harmonics_count(tmp_path: Path, small_scene: Path, run: Run) -> None:
         assert 0.97 * 40_000 <= file_bytes(folder / "out") <= 40_000
 
 
+@pytest.mark.slow
 @sweep(("name", "size"), [("a.spz", 24_000), ("a.ply", 40_000), ("a.sog", 20_000)])
 def test_states_and_batch_meet_it(
     name: str, size: int, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch

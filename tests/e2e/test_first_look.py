@@ -43,6 +43,7 @@ def test_a_scene_alone_is_compacted_and_shown(smallest_copy: Path, run: Run, ope
     assert listing(smallest_copy) == before
 
 
+@pytest.mark.slow
 def test_json_and_quiet(smallest_copy: Path, run: Run, opened: list[str]) -> None:
     said = run(smallest_copy, *FAST, "--json", code=0)
     assert json.loads(said.out)["output"]["num_gaussians"] > 0

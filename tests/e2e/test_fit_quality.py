@@ -60,6 +60,7 @@ def test_short_fits_reach_the_floor(
     floor(actual)
 
 
+@pytest.mark.slow
 @sweep("seed", [0, 1, 2])
 def test_full_fit_beats_the_merge_alone(
     seed: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]

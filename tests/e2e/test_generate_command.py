@@ -45,6 +45,7 @@ def test_other_commands_read_the_scenes(made: Path, run: Run) -> None:
     run("evaluate", made / "scene_0000", "--targets", targets, "--lpips", "none", "--json", code=0)
 
 
+@pytest.mark.slow
 def test_a_second_call_keeps_and_adds(made: Path, run: Run) -> None:
     before = listing(made)
     assert names(run("lab", "generate", "-o", made, *SMALL).out, "0 scenes", 1)

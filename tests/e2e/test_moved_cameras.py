@@ -20,14 +20,19 @@ from .conftest import Run
 SCALE = 1.8
 
 
-@pytest.fixture
-def moved_scene(scene_copy: Path) -> Path:
-    """The made scene with the camera centres in larger units, and none of the targets."""
-    with edited_json(scene_copy / "transforms.json") as data:
+def enlarge_cameras(folder: Path) -> Path:
+    """Move the cameras' centres of a scene into larger units."""
+    with edited_json(folder / "transforms.json") as data:
         for frame in data["frames"]:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= SCALE
-    return scene_copy
+    return folder
+
+
+@pytest.fixture
+def moved_scene(small_copy: Path) -> Path:
+    """The small scene with the camera centres in larger units."""
+    return enlarge_cameras(small_copy)
 
 
 def psnr(folder: Path, photos: Path) -> float:
@@ -48,6 +53,7 @@ def test_render_moves_the_cameras(moved_scene: Path, tmp_path: Path, run: Run) -
         assert psnr(tmp_path / name, photos) == pytest.approx(expected[key], abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) -> None:
     """A compact scene without photos tells no frame by itself, and has that of the scene beside it."""
     elsewhere, alone = tmp_path / "small.ply", tmp_path / "cameras" / "transforms.json"
@@ -62,9 +68,11 @@ def test_the_frame_of_another_file(moved_scene: Path, tmp_path: Path, run: Run) 
     assert actual["like"] > actual["own"] + 3
 
 
+@pytest.mark.slow
 def test_preview_and_render_agree_with_photos_that_are_broken(
-    moved_scene: Path, tmp_path: Path, run: Run, floor: Callable[..., None]
+    scene_copy: Path, tmp_path: Path, run: Run, floor: Callable[..., None]
 ) -> None:
+    moved_scene = enlarge_cameras(scene_copy)
     photos = tmp_path / "photos"
     (moved_scene / "images").rename(photos)
     (moved_scene / "images").mkdir()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from browser import CHROMIUM, browser, needs_browser
 
 import gsmerge
@@ -12,6 +13,7 @@ STAGE = "document.querySelector('iframe').contentDocument.getElementById('stage'
 SOLID = "document.querySelector('iframe').contentDocument.querySelectorAll('[data-set=solid]')[1]"
 
 
+@pytest.mark.slow
 @needs_browser()
 def test_a_frame_shows_the_page_in_3d(smallest_scene: Path, tmp_path: Path) -> None:
     page = gsmerge.compact(smallest_scene, effort="draft", budget=300).show()

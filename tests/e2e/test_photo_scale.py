@@ -47,6 +47,7 @@ def scores(folder: Path, ply: Path) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
+@pytest.mark.slow
 def test_larger_photos_make_the_result_sharper(
     folder: Path, tmp_path: Path, run: Callable[..., Any], floor: Floor
 ) -> None:

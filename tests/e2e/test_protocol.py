@@ -10,11 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from made_gaussians import random_gaussians
 from scripts import load_script
-from tiny_scene import Tiny
-
-from gsmerge.research.captures import list_captures
 
 ROOT = Path(__file__).parents[2]
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -45,6 +41,7 @@ def write_data(made: Path, data: Path) -> dict[str, list[int]]:
     return {role: [i for i, frame in enumerate(frames) if frame[0] == role] for role in ("context", "target")}
 
 
+@pytest.mark.slow
 def test_a_benchmark_is_repeated(
     protocol: ModuleType, made_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,31 +59,6 @@ def test_a_benchmark_is_repeated(
     assert float(rows["gsmerge"]) > float(rows["input"]) > 15
     with pytest.raises(SystemExit):
         protocol.main([*words, "--scenes", "cellar"])
-
-
-def test_chunks_of_re10k(
-    protocol: ModuleType, made_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from re10k_chunks import entry, save
-
-    listed = write_data(made_scene, tmp_path / "folders" / "room")
-    (capture,) = list_captures(tmp_path / "folders")
-    views = capture.read_views(capture.read_cameras())
-    cameras, photos = views.cameras, (views.images * 255).round().astype(np.uint8)
-    c2w = np.linalg.inv(cameras.viewmats)
-    tiny = Tiny(c2w, cameras.Ks[0], cameras.width, cameras.height, photos, random_gaussians(1, 0), views.names)
-    save(tmp_path / "chunks", entry(tiny, "hall"), entry(tiny, "room"))
-    (tmp_path / "chunks" / "index.json").write_text(json.dumps({"room": "000000.torch", "hall": "000000.torch"}))
-    shutil.copytree(made_scene, tmp_path / "exports" / "room")
-    (tmp_path / "views.json").write_text(json.dumps({"hall": None, "room": {**listed, "overlap": 0.4}}))
-    scores = []
-    for data in ("folders", "chunks"):
-        words = [str(tmp_path / name) for name in (data, "exports", "views.json")]
-        protocol.main([*words, "--set", "effort=draft", "superpixels=200"])
-        printed = capsys.readouterr().out
-        assert "1 of 1 scenes" in printed
-        scores.append(float(re.search(r"^\| input \| [^|]*\| ([\d.]+)", printed, re.MULTILINE)[1]))
-    assert scores[0] == pytest.approx(scores[1], abs=0.1)  # chunks hold JPEG
 
 
 def test_without_a_list_the_paper_s_rule_makes_one(

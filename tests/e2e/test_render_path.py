@@ -17,7 +17,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 
-from .conftest import Run, assert_refused, listing
+from .conftest import Run, listing
 
 WIDTH, HEIGHT = 48, 32
 SCALE = 1.8  # of the cameras' world to that of the Gaussians
@@ -35,7 +35,9 @@ def error(one: np.ndarray, other: np.ndarray) -> float:
 
 
 @sweep(("kind", "name"), [("orbit", "a.mp4"), ("turntable", "a.gif"), ("spline", "a.webm")])
-def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, small_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_a_video_shows_the_frames_of_its_path(
+    kind: str, name: str, small_scene: Path, tmp_path: Path, run: Run
+) -> None:
     call = ("render", small_scene, "--path", kind, "--frames", 8)
     outcome = run(*call, "-o", tmp_path / name, code=0)
     seconds = "0.6 s" if name.endswith(".gif") else "0.3 s"
@@ -49,15 +51,7 @@ def test_a_video_shows_the_frames_of_its_path(kind: str, name: str, small_scene:
     assert min(error(a, b) for a, b in zip(drawn[1:], drawn, strict=False)) > 0
 
 
-def test_a_spline_starts_and_ends_at_the_photos(made_scene: Path, tmp_path: Path, run: Run) -> None:
-    run("render", made_scene, "--path", "spline", "--frames", 2, "-o", tmp_path / "out", code=0)
-    photos = [cv2.imread(str(path)) for path in sorted((made_scene / "images").iterdir())]
-    for frame, photo in ((0, 0), (1, -1)):
-        drawn = cv2.imread(str(tmp_path / "out" / f"frame_{frame:05d}.png"))
-        errors = [error(drawn, one) for one in photos]
-        assert errors[photo] == min(errors) < 20
-
-
+@pytest.mark.slow
 def test_a_line_moves_between_two_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
     """Left of it is the first, right of it the second, each with its caption; it starts in the middle."""
     scene, dark = small_copy / "scene.ply", tmp_path / "dark.ply"
@@ -134,6 +128,7 @@ def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tm
         assert errors[i] == min(errors) < 20
 
 
+@pytest.mark.slow
 def test_a_scene_without_cameras_takes_those_of_the_path(small_copy: Path, tmp_path: Path, run: Run) -> None:
     bare = write_without_grid(small_copy / "scene.ply", tmp_path / "away" / "bare.ply")
     out = tmp_path / "out.mp4"
@@ -144,27 +139,14 @@ def test_a_scene_without_cameras_takes_those_of_the_path(small_copy: Path, tmp_p
     assert len(read(tmp_path / "x.mp4")) == 2
 
 
-@pytest.mark.parametrize(
-    ("name", "more", "parts"),
-    [
+def test_clips_too_large_for_the_memory_are_refused(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    for name, more, parts in (
         ("a.mp4", ("--size", "4096x4096"), ("8,388,608", "4096 x 4096", "folder")),
         ("a.gif", ("--size", "1920x1080", "--frames", 100), ("134,217,728", "100 x 1920 x 1080", ".mp4")),
-    ],
-)
-def test_clips_too_large_for_the_memory_are_refused(
-    name: str, more: tuple[object, ...], parts: tuple[str, ...], small_scene: Path, tmp_path: Path, run: Run
-) -> None:
-    outcome = run("render", small_scene, "-o", tmp_path / name, *more, code=3)
-    assert says(outcome.err.removeprefix(ERROR), tmp_path / name, *parts)
+    ):
+        outcome = run("render", small_scene, "-o", tmp_path / name, *more, code=3)
+        assert says(outcome.err.removeprefix(ERROR), tmp_path / name, *parts)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_camera_has_an_orbit_but_no_spline(small_scene: Path, tmp_path: Path, run: Run) -> None:
-    call = ("render", small_scene, "--views", 1, "--frames", 2, "-o", tmp_path / "a.mp4")
-    assert_refused(run(*call, "--path", "spline"), 2, "spline", 2, 1)
-    assert not (tmp_path / "a.mp4").exists()
-    run(*call, "--path", "orbit", code=0)
-    assert len(read(tmp_path / "a.mp4")) == 2
 
 
 def test_frames_grow_with_the_views_of_a_spline(

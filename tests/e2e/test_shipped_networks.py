@@ -31,6 +31,7 @@ def test_shipped_networks_gain(
     assert psnr[str(SHIPPED)] > psnr["none"] + LEAST_GAIN
 
 
+@pytest.mark.slow
 @sweep("k", [1, 2, 4])
 def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Path], tmp_path: Path, k: int) -> None:
     """Without one, what networks make more opaque is left out less often as too faint."""

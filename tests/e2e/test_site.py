@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -28,20 +29,26 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_compact_writes_a_site_whole_or_not_at_all(run: Run, small_copy: Path) -> None:
-    site = small_copy / "site"
+@pytest.fixture
+def copied(smallest_scene: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
+
+
+def test_compact_writes_a_site_whole_or_not_at_all(run: Run, copied: Path) -> None:
+    site = copied / "site"
     quick = ("--effort", "draft", "--fit", "none")
-    document = json.loads(run("compact", small_copy, "-o", f"{site}/", *quick, "--json", code=0).out)
+    document = json.loads(run("compact", copied, "-o", f"{site}/", *quick, "--json", code=0).out)
     assert names(site) == FILES
     assert document["output"]["path"] == str(site / "index.html")
     assert document["output"]["bytes"] == sum(path.stat().st_size for path in site.iterdir())
-    assert_refused(run("compact", small_copy, "-o", site, "--budget", "50"), 2, site / "index.html")
+    assert_refused(run("compact", copied, "-o", site, "--budget", "50"), 2, site / "index.html")
     (site / "scene.sog").write_bytes(b"")
     (site / "index.html").unlink()  # what is left is no site: the result goes into the folder
-    run("compact", small_copy, "-o", site, *quick, code=0)
+    run("compact", copied, "-o", site, *quick, code=0)
     assert "scene.compact.ply" in names(site)
 
 
+@pytest.mark.slow
 def test_a_budget_in_bytes_is_that_of_the_scene(run: Run, small_copy: Path) -> None:
     site = small_copy / "site"
     assert_refused(run("compact", small_copy, "-o", site, "--levels", "2"), 2, site / "index.html")
@@ -50,8 +57,8 @@ def test_a_budget_in_bytes_is_that_of_the_scene(run: Run, small_copy: Path) -> N
     assert 10_000 < (site / "scene.sog").stat().st_size <= 12_000
 
 
-def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, small_copy: Path) -> None:
-    small, site = small_copy / "scene.ply", small_copy / "site"
+def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, copied: Path) -> None:
+    small, site = copied / "scene.ply", copied / "site"
     run("convert", small, site, code=0)
     assert names(site) == FILES
     before = (site / "index.html").read_bytes()
@@ -155,6 +162,7 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
     assert tab.run("[site.lens / column(site.camera.matrix, 3).distanceTo(site.target)]")[0] > 1.5 * before
 
 
+@pytest.mark.slow
 @needs_browser()
 def test_from_disk_it_shows_a_picture_and_asks_for_its_folder(tab: Browser, site: Path) -> None:
     tab.open(site / "index.html")

@@ -49,6 +49,7 @@ def test_the_plan_says_how_many(
     assert not index.parent.exists()
 
 
+@pytest.mark.slow
 def test_what_takes_a_scene_takes_its_finest_level(small_scene: Path, index: Path, run: Run) -> None:
     run("compact", small_scene, "-o", index, *QUICK, code=0)
     said = json.loads(run("evaluate", small_scene, index, "--lpips", "none", "--json", code=0).out)
@@ -61,6 +62,7 @@ def test_what_takes_a_scene_takes_its_finest_level(small_scene: Path, index: Pat
     assert picture.stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_leaves_no_folder(
     small_scene: Path, index: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from messages import names
 
 from .conftest import Run
 
 
-def test_json_and_quiet(small_copy: Path, run: Run) -> None:
+@pytest.mark.slow
+def test_json_and_quiet(small_scene: Path, run: Run) -> None:
     quick = ("--set", "fit=none", "--cases", "unchanged,threads")
-    document = json.loads(run("lab", "stress", small_copy, *quick, "--json").out)
+    document = json.loads(run("lab", "stress", small_scene, *quick, "--json").out)
     assert [case["case"] for case in document["cases"]] == ["unchanged", "threads"]
     assert (document["held"], document["failed"]) == (2, 0)
     assert names(document["cases"][0]["wanted"], "0.1 dB")
-    outcome = run("lab", "stress", small_copy, *quick, "--quiet")
+    outcome = run("lab", "stress", small_scene, *quick, "--quiet")
     assert (outcome.out, outcome.err) == ("", "")
 
 

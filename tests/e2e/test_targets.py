@@ -73,8 +73,9 @@ def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, ru
     assert str(out) in said.out
 
 
+@pytest.mark.slow
 def test_a_loss_is_read_off_a_curve(scene: Scene) -> None:
-    result = compact(scene, fit_steps=12, quality="-2dB")
+    result = compact(scene, fit_steps=6, quality="-2dB")
     curve = result.report.choices["curve"]
     assert curve[0]["count"] < len(result.gaussians) < curve[-1]["count"]
     assert [point["count"] for point in curve] == sorted(point["count"] for point in curve)

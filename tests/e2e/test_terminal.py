@@ -159,6 +159,7 @@ def test_a_dry_run_replaces_nothing_and_refuses_nothing(small_scene: Path, tmp_p
     assert out.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_compact_scene_is_known_again(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out, words = tmp_path / "small.ply", ("--fit", "none", "--set", "superpixels=200")
     assert "already" not in run("compact", small_scene, "-o", out, *words).err

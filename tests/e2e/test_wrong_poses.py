@@ -81,13 +81,3 @@ def test_results_are_measured_from_where_they_were_made(exact: Path, tmp_path: P
     assert own == pytest.approx(document["psnr_input_views"]["after"], abs=0.6)  # of a quarter of each photo
     assert own > given + 2
     assert sum("its input views are seen from the cameras in auto.cameras.json" in n for n in found["notes"]) == 1
-
-
-@pytest.mark.slow
-def test_cameras_that_are_far_off(exact: Path, tmp_path: Path, run: Run) -> None:
-    folder = Path(shutil.copytree(exact, tmp_path / "far"))
-    turn_cameras(folder, 15, only=2)
-    outcome = run("compact", folder, *FAST, "-o", tmp_path / "a.ply", code=3)
-    assert outcome.err.count("\n") == 1
-    assert "median" in outcome.err
-    assert not (tmp_path / "a.ply").exists()

@@ -11,7 +11,7 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry import project, quat_to_rotmat
+from gsmerge.geometry import covariances, project, quat_to_rotmat
 from gsmerge.kernels import elementary
 from gsmerge.pooling import feature_to_gaussians, scene_members
 from gsmerge.stages.encode import encode
@@ -54,6 +54,21 @@ def test_all_gaussians_in_one_place(room: Scene, settings: dict) -> None:
 
 
 # 3: rank-deficient groups
+
+
+def test_coincident_members_stack(small: Scene) -> None:
+    count = small.pixels_per_view
+    same = {name: getattr(small.gaussians, name)[:1].repeat(count, 0) for name in scenes.FIELDS}
+    same["opacities"] = np.full(count, 0.02, np.float32)
+    merged = feature_to_gaussians(one_group_per_view(changed(small, **same)))
+    one = small.gaussians[:1]
+    footprint = scene_members(small).footprints[0]
+    floor = (0.1 * footprint) ** 2 * np.eye(3)
+    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64))[0] for g in (merged, one))
+    np.testing.assert_allclose(a, b + floor, rtol=1e-4, atol=1e-8)
+    discs = [float(np.sort(g.scales[0].astype(np.float64))[1:].prod()) for g in (merged, one)]
+    expected = 1 - (1 - 0.02) ** (count * discs[1] / discs[0])
+    assert float(merged.opacities[0]) == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("axes", [[0], [0, 1]], ids=["line", "sheet"])
@@ -128,6 +143,31 @@ def test_wholly_opaque_scene(room: Scene) -> None:
 
 
 # 10, 11: quaternions
+
+
+# 10, 11: quaternions
+
+
+def test_sign_and_length_of_quaternions_do_not_matter(room: Scene) -> None:
+    rng = np.random.default_rng(0)
+    factors = (rng.choice([-1, 1], (len(room.gaussians), 1)) * rng.uniform(0.01, 100)).astype(np.float32)
+    before, after = scenes.plain(room), scenes.plain(changed(room, quats=room.gaussians.quats * factors))
+    scenes.assert_same_set(before, after, atol=1e-5)
+
+
+def test_zero_quaternions_mean_no_rotation(room: Scene) -> None:
+    zero, one = room.gaussians.quats.copy(), room.gaussians.quats.copy()
+    zero[::3], one[::3] = 0, [1, 0, 0, 0]
+    a, b = (scenes.compacted(changed(room, quats=q), fit="none").gaussians for q in (zero, one))
+    scenes.assert_same_set(a, b, atol=1e-6)
+
+
+def test_tiny_changes_make_tiny_changes(room: Scene) -> None:
+    nudge = np.random.default_rng(0).normal(0, 1e-7, room.gaussians.means.shape)
+    moved = changed(room, means=room.gaussians.means + nudge)
+    actual = [feature_to_gaussians(one_group_per_view(scene)) for scene in (room, moved)]
+    a, b = (covariances(g.quats.astype(np.float64), g.scales.astype(np.float64)) for g in actual)
+    assert np.abs(a - b).max() < 1e-6
 
 
 # 14: something huge and near

@@ -34,6 +34,7 @@ def result(scene: gsmerge.Scene) -> gsmerge.CompactResult:
     return gsmerge.compact(scene, effort="draft", budget=100, levels=2)
 
 
+@pytest.mark.slow
 def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.CompactResult, tiny_scene: Path) -> None:
     views, size = len(scene), f"{scene.cameras.width} x {scene.cameras.height}"
     file = gsmerge.read_ply(tiny_scene / "scene.ply")
@@ -96,6 +97,7 @@ def test_a_light_page_lacks_the_scenes_own_gaussians(scene: gsmerge.Scene, resul
     assert re.findall('id="(splats-.)"', light) == ["splats-1"]
 
 
+@pytest.mark.slow
 def test_a_result_does_not_keep_its_scene(tiny_scene: Path, result: gsmerge.CompactResult) -> None:
     copy = pickle.loads(pickle.dumps(result))
     assert repr(copy.show()).startswith("Page(100 Gaussians")  # alone: the other process has no scene

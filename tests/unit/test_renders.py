@@ -58,6 +58,7 @@ def test_what_is_empty_stays_empty(scene: Scene) -> None:
     assert alphas[1][empty].mean() < 0.05
 
 
+@pytest.mark.slow
 def test_what_lies_around_does_not_refuse_a_fit(scene: Scene) -> None:
     """A fit that shows the given views better is kept, whatever it does to the others."""
     prepared = prepare(scene)
@@ -86,6 +87,7 @@ def test_all_of_the_input_is_left_as_it_is_by_superpixels_too(scene: Scene) -> N
     assert len(result.gaussians) == len(scene.gaussians)
 
 
+@pytest.mark.slow
 def test_a_fit_brings_them_nearer_where_few_are_left(scene: Scene) -> None:
     merged, fitted = (compact(scene, budget="2%", **more) for more in ({"fit": "none"}, {}))
     assert "fit" in fitted.report.choices

@@ -89,6 +89,7 @@ def test_rows_in_no_order_are_no_grid(index: str) -> None:
     assert find_dropped_grid(means, np.ones(len(means), bool)) is None
 
 
+@pytest.mark.slow
 def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
     """Gaussians anywhere in their pixels: of several scales that fit as well, none is taken."""
     tiny, rng = smooth_scene(64, 48), np.random.default_rng(2)

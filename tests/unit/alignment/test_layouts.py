@@ -73,6 +73,7 @@ def test_photos_and_cameras_larger_than_the_grid(tmp_path: Path, size: tuple, ma
     assert loaded.notes == (f"photos and cameras of {size[0]} x {size[1]} are {said}, the Gaussian grid's size",)
 
 
+@pytest.mark.slow
 def test_photos_larger_than_cameras_and_grid(tmp_path: Path) -> None:
     """An npz at the grid's size, photos as they were taken: stretched or cropped, as their colours say."""
     for name, mapping in (("stretch", resize_to((110, 72), (48, 36))), ("crop", resize_and_crop((110, 72), (48, 36)))):
@@ -166,6 +167,7 @@ def test_a_trimmed_grid_of_another_size(tmp_path: Path) -> None:
     assert int(scene.valid.sum()) == grid.size
 
 
+@pytest.mark.slow
 def test_dropped_pixels_of_a_patched_grid(tmp_path: Path) -> None:
     """Depth Anything 3 beside COLMAP cameras at the photos' own size: 504 pixels, border and far pixels dropped."""
     tiny = smooth_scene(504, 28)
@@ -255,6 +257,7 @@ def test_sizes_that_are_twice_a_principal_point(tmp_path: Path, tiny: Tiny) -> N
     assert not noted(loaded.notes, "scaled")
 
 
+@pytest.mark.slow
 def test_sizes_that_are_twice_a_principal_point_out_of_the_middle(tmp_path: Path) -> None:
     """Those of Lyra 2, whose Gaussians are of half the photos' size, show that intrinsics are those of the photos."""
     K = np.array([[55, 0, 24.5], [0, 55, 18], [0, 0, 1.0]])

@@ -70,6 +70,7 @@ def test_views_are_found_up_to_a_similarity(place: Scene, parts: list[Scene]) ->
     assert names(joined.notes[0], "3 of 3", "a.ply")
 
 
+@pytest.mark.slow
 def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
     stranger = split_views(made_scene(5, 2), SCALES[:2])[1]
     joined = join_scenes([stranger, *parts[:2]], PATHS[:3])
@@ -81,6 +82,7 @@ def test_a_view_of_another_place_is_left_out(parts: list[Scene]) -> None:
         join_scenes([stranger, parts[0]], PATHS[:2])
 
 
+@pytest.mark.slow
 def test_files_of_several_views(place: Scene) -> None:
     """Each with frame and unit of its own: two exports of one room."""
     turn, shift = rotation(0.5, -1.0, 2.2), np.array([4.0, -3, 2])
@@ -92,6 +94,7 @@ def test_files_of_several_views(place: Scene) -> None:
     assert np.linalg.norm(apart, axis=1).max() < 0.03
 
 
+@pytest.mark.slow
 def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
     bare = [replace(part, images=None) for part in parts[:2]]
     assert join_scenes(bare, PATHS[:2]).used == (0, 1)
@@ -100,6 +103,7 @@ def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
     assert "photos" in joined.notes[-1]
 
 
+@pytest.mark.slow
 def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     """Places are rounded, and what moves keypoints by a rounding error moves no place."""
     places = register(parts[:2]).places

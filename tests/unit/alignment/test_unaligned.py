@@ -118,6 +118,7 @@ def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
     assert foremost < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fits", [True, False])
 def test_hundreds_of_cameras_take_seconds(tmp_path: Path, fits: bool) -> None:
     """Rows of no pixels take one, as each of the many cameras is tried."""

@@ -65,6 +65,7 @@ while turns < 50:
 """
 
 
+@pytest.mark.slow
 def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> None:
     """Two processes that import the package: locks of one process say nothing about those of others."""
     processes = [subprocess.Popen([sys.executable, "-c", TAKE_TURNS, str(tmp_path)]) for _ in range(2)]

@@ -66,6 +66,7 @@ def test_blocks_are_as_good_as_one_piece() -> None:
     assert parts.report.num_output == len(parts.gaussians)
 
 
+@pytest.mark.slow
 @sweep(("reach", "looks"), [(0.15, 4), (1.0, 2)])
 def test_rooms_that_all_views_see_take_more_steps_at_seams(reach: float, looks: int) -> None:
     """Where most Gaussians are seen from several blocks, each was fitted by a part of the photos alone."""
@@ -83,6 +84,7 @@ def test_a_device_limits_the_whole(scene: Scene, monkeypatch: pytest.MonkeyPatch
     assert scenes.identical(limited.gaussians, free.gaussians)
 
 
+@pytest.mark.slow
 def test_threads_do_not_change_a_bit(scene: Scene) -> None:
     one, two = (compact(scene, blocks=2, **{**SETTINGS, "threads": threads}) for threads in (1, 2))
     assert scenes.identical(one.gaussians, two.gaussians)

@@ -69,6 +69,7 @@ def shift_between(scene: Scene, scale: float) -> tuple[float, float]:
     return max(offsets, key=lambda offset: fits(*offset))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.5, 3])
 def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> None:
     scene = gsmerge.read_scene(made)

@@ -122,6 +122,7 @@ def test_a_scene_in_no_order_skips_what_needs_pixels(noisy: Scene) -> None:
     assert [outcome.held for outcome in actual] == [None, None, True]
 
 
+@pytest.mark.slow
 def test_without_photos(noisy: Scene) -> None:
     bare = replace(noisy, images=None)
     actual = stress(bare, FAST, cases=["unchanged", "exposure", "utm"])
@@ -159,6 +160,7 @@ def test_what_does_not_hold_is_noticed(change: Any, words: str, noisy: Scene, mo
     assert words in outcome.found
 
 
+@pytest.mark.slow
 def test_threads_that_change_a_bit_are_noticed(noisy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     spoilt(monkeypatch, lambda g: replace(g, opacities=g.opacities * (1 - 1e-6)))
     assert stress(noisy, FAST, cases=["threads"])[0].held is False

@@ -165,6 +165,7 @@ def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
 # What does not fit
 
 
+@pytest.mark.slow
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with refuses(SceneError, "transforms.json", "20 x 14", "30 x 14", "crop"):

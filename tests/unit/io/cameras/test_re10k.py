@@ -48,6 +48,7 @@ def test_the_only_scene_needs_no_name(tmp_path: Path) -> None:
     assert len(read_cameras(path)) == 3
 
 
+@pytest.mark.slow
 def test_photos_that_were_cropped(tmp_path: Path) -> None:
     """DepthSplat's file beside its dataset: resized, cropped and trimmed, turned into the first camera."""
     tiny = smooth_scene(48, 48)

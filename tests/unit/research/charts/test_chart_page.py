@@ -103,6 +103,7 @@ def test_the_page_says_what_was_found(page: str) -> None:
         assert f">{title}</h2>" in page
 
 
+@pytest.mark.slow
 def test_what_comes_from_files_is_escaped(tmp_path: Path) -> None:
     records = [
         replace(r, scene=EVIL if r.scene == "fern" else r.scene, command=EVIL, environment={EVIL: EVIL})

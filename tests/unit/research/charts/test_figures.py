@@ -105,6 +105,7 @@ def axes_of(figure: Figure) -> Axes:
     return drawing.axes[0]
 
 
+@pytest.mark.slow
 def test_ticks_are_round_and_a_logarithmic_axis_says_so() -> None:
     """Over time, where each method has costs of its own, ours has the sizes at its points."""
     sizes = ("1%", "4%", "10%")

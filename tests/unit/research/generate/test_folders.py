@@ -41,6 +41,7 @@ def first(folder: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_folders_are_complete(folder: Path) -> None:
     views = {f"{sub}images/view_00{i}.png" for sub, n in (("", 3), ("targets/", 2)) for i in range(n)}
     files = {"scene.ply", "transforms.json", "targets/transforms.json", "generated.json"} | views

@@ -78,6 +78,7 @@ def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(out.iterdir())}
 
 
+@pytest.mark.slow
 def test_every_draw_is_predicted_from_its_own_views(scene: Scene, data: Path) -> None:
     guess, rng = Guess(scene), np.random.default_rng(0)
     (capture,) = bind_backbone(list_captures(data), guess)

@@ -88,6 +88,7 @@ def test_the_preset_s_examples_have_clusters(example: Example) -> None:
     assert max(shares) > 0.1
 
 
+@pytest.mark.slow
 def test_every_network_gets_a_gradient(example: Example) -> None:
     networks = noisy_networks(replace(TINY, outputs="absolute")).requires_grad_(True)
     sums: Counter[str] = Counter()

@@ -82,6 +82,7 @@ def test_a_damaged_shard_is_named_in_one_line(example: Example, tmp_path: Path) 
         read_shard(replace(shard, path=tmp_path / "none.safetensors"))
 
 
+@pytest.mark.slow
 def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
 

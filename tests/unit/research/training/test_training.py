@@ -54,6 +54,7 @@ def files(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(out.iterdir()) if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_run_has_a_table_and_the_best_checkpoint_and_is_gone_on_with_alone(shard: Shard, tmp_path: Path) -> None:
     """Three steps of training with a validation after each take a second."""
     options = replace(OPTIONS, steps=3, save_every=1)
