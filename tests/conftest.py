@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import atexit
 import gc
 import os
 import shutil
 import signal
 import sys
-import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,16 +21,16 @@ ROOT = Path(__file__).resolve().parent.parent
 MAX_PROCESSES = 8  # a process takes about 1 GB
 WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
 
-if sys.dont_write_bytecode:  # as many containers ask for: each process of the run would compile the package anew
-    sys.dont_write_bytecode, sys.pycache_prefix = False, tempfile.mkdtemp()
-    del os.environ["PYTHONDONTWRITEBYTECODE"]
-    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
-    atexit.register(shutil.rmtree, sys.pycache_prefix, ignore_errors=True)
+# Many containers ask for none, and each process of the run would compile the package and the tests anew
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A process for each processor; for named test files this one alone, which starts sooner."""
+    """A process for each processor, or as many as the variable says; for named test files this one alone."""
+    if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS"):
+        return int(os.environ["PYTEST_XDIST_AUTO_NUM_WORKERS"])
     if any(".py" in argument for argument in config.args):
         return 0
     return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_PROCESSES)

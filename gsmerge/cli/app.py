@@ -9,6 +9,7 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,6 +100,7 @@ def make_app(only: str | None = None) -> typer.Typer:
     return made
 
 
+@lru_cache
 def make_command(only: str | None = None) -> Any:
     """Make the command that parses and calls: of all commands, or of ``only`` one."""
     return typer.main.get_command(make_app(only))

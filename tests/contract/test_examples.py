@@ -53,6 +53,7 @@ def show(value: Any) -> str:
     return "png" if picture else getattr(value, "_repr_html_", value.__repr__)()
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its cells, one after the other in one namespace, as Jupyter runs them, on pictures of a sixteenth of the pixels.
 

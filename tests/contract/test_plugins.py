@@ -47,6 +47,7 @@ def run(site: Path, *commands: list[str]) -> tuple[list[int], str, str]:
     return json.loads(codes), "\n".join(lines), done.stderr
 
 
+@pytest.mark.slow
 def test_the_example_works(site: Path, small_scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.ply"
     compact = ["compact", str(small_scene), "--set", "method=nth", "--budget", "200", "-o", str(out), "-q"]

@@ -49,6 +49,7 @@ def test_a_killed_run_goes_on_where_it_was(rooms: Path, tmp_path: Path, undistur
     assert statuses(tmp_path) == {name: ["done"] for name in NAMES}
 
 
+@pytest.mark.slow
 def test_a_killed_process_costs_its_scene_alone(make_scene: Callable[..., Path], tmp_path: Path, run: Run) -> None:
     """Two processes are started, each of which imports the package."""
     rooms, out = tmp_path / "rooms", tmp_path / "out"

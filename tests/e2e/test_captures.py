@@ -61,6 +61,7 @@ def test_views_are_spread_and_held_out_ones_midway(script: Callable[[str], Modul
         script("make_capture").pick_views(6, 4)
 
 
+@pytest.mark.slow
 def test_a_capture_is_read_by_its_export(
     script: Callable[[str], ModuleType], made: Path, capture: Path, tmp_path: Path
 ) -> None:

@@ -128,6 +128,7 @@ def test_views(made_scene: Path, tmp_path: Path, run: Run) -> None:
     assert (both[22:, :half] == both[22:, half + 4 :]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("hint", "width"), [((), 1920), (("--hint", "max_side=1200"), 1200)])
 def test_pictures_of_views_are_as_large_as_asked(
     hint: tuple[str, ...], width: int, small_copy: Path, tmp_path: Path, run: Run

@@ -86,6 +86,7 @@ def test_a_page_shows_what_was_measured(setting: str, scene: Path, small: Path, 
     assert text.count('"held_out":') == shown + 1  # and the view from outside
 
 
+@pytest.mark.slow
 def test_a_trajectory_with_both_kinds_of_views(scene: Path, run: Run) -> None:
     context = json.loads((scene / "transforms.json").read_text())
     targets = json.loads((scene / "targets" / "transforms.json").read_text())

@@ -46,6 +46,7 @@ def set_apart(folder: Path, factor: float) -> None:
     gsmerge.write_ply(folder / "scene.ply", gaussians, overwrite=True)
 
 
+@pytest.mark.slow
 @sweep(
     ("name", "shift", "worse"),
     [("out.ply", 5e6, True), ("out.spz", 0, True), ("out.sog", 1e5, False), ("out.splat", 5e6, True)],

@@ -69,6 +69,7 @@ def test_full_fit_beats_the_merge_alone(
     floor(full - none)
 
 
+@pytest.mark.slow
 def test_hardly_any_time_costs_little(
     compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:

@@ -110,6 +110,7 @@ def test_a_clip_is_an_orbit_by_default(
     assert list(listing(tmp_path / "orbit")) == ["frame_00000.png", "frame_00001.png"]
 
 
+@pytest.mark.slow
 def test_the_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     """The cameras of the scene, and those of the path in their world, are in larger units than the Gaussians."""
     targets = tmp_path / "targets"
@@ -139,6 +140,7 @@ def test_a_scene_without_cameras_takes_those_of_the_path(small_copy: Path, tmp_p
     assert len(read(tmp_path / "x.mp4")) == 2
 
 
+@pytest.mark.slow
 def test_clips_too_large_for_the_memory_are_refused(small_scene: Path, tmp_path: Path, run: Run) -> None:
     for name, more, parts in (
         ("a.mp4", ("--size", "4096x4096"), ("8,388,608", "4096 x 4096", "folder")),

@@ -45,6 +45,7 @@ def test_a_budget_is_met_with_networks_and_without(make_scene: Callable[..., Pat
     assert counts["none"] < counts[str(SHIPPED)]
 
 
+@pytest.mark.slow
 def test_the_benchmark_compares_at_equal_count(
     make_scene: Callable[..., Path], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -67,6 +68,7 @@ def test_the_benchmark_compares_at_equal_count(
     assert "| no fit |" in benchmark.table([made, made], (condition,), args)
 
 
+@pytest.mark.slow
 def test_the_papers_method_beats_its_moment_matching(
     make_scene: Callable[..., Path], target_psnr: Callable[[Path, Path], float], tmp_path: Path
 ) -> None:

@@ -135,6 +135,7 @@ def test_the_camera_stays_where_photos_stood(tab: Browser, served: str) -> None:
     assert tab.run("site.lens") == 1
 
 
+@pytest.mark.slow
 @needs_browser()
 def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: str) -> None:
     tab.open(served)

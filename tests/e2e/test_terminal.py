@@ -109,6 +109,7 @@ def test_ctrl_c_leaves_no_bar(small_copy: Path, tmp_path: Path) -> None:
     assert list(tmp_path.glob("small*")) == []
 
 
+@pytest.mark.slow
 def test_no_command_breaks_a_word_or_a_row_of_figures(
     smallest_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:

@@ -30,6 +30,7 @@ def test_a_page_is_replaced_and_nothing_else(smallest_scene: Path, tmp_path: Pat
     assert_refused(run(*call[:-1], tmp_path / "page.txt"), 2, tmp_path / "page.txt", ".html")
 
 
+@pytest.mark.slow
 def test_sizes_are_compacted_and_light_leaves_the_scene_out(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     page = tmp_path / "page.html"
     call = ("view", smallest_scene, "--no-open", "-o", page, "--sizes")

@@ -46,6 +46,7 @@ def test_without_photos_and_a_fit_networks_keep_what_the_views_show(made_scene: 
     assert after > alone
 
 
+@pytest.mark.slow
 def test_one_photo_is_fitted_though_no_other_shows_what_is_held_out(one_photo: Scene) -> None:
     report = gsmerge.compact(one_photo, effort="draft", k=4, threads=1).report
     assert report.choices["fit"]["method"] == "full"

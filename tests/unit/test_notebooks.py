@@ -91,6 +91,7 @@ def test_a_result_shows_its_scene_beside_it(
         page.save(path)
 
 
+@pytest.mark.slow
 def test_a_light_page_lacks_the_scenes_own_gaussians(scene: gsmerge.Scene, result: gsmerge.CompactResult) -> None:
     whole, light = (gsmerge.view(scene, result, light=light).text for light in (False, True))
     assert len(re.findall('id="splats-', whole)) == 2
@@ -111,6 +112,7 @@ def test_a_result_does_not_keep_its_scene(tiny_scene: Path, result: gsmerge.Comp
     assert held.scene() is None
 
 
+@pytest.mark.slow
 def test_views_are_of_paths_gaussians_and_results(tiny_scene: Path, scene: gsmerge.Scene, tmp_path: Path) -> None:
     few = scene.gaussians[::5]
     gsmerge.write_ply(tmp_path / "few.ply", few)

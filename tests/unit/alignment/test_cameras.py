@@ -116,6 +116,7 @@ def save_with(tiny: Tiny, folder: Path, viewmats: np.ndarray) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_file_whose_cameras_are_off_is_read_with_a_note(large: Tiny, tmp_path: Path) -> None:
     load = load_scene(save_with(large, tmp_path / "scene", off(large, 0.7, 0.02)))
     assert load.scene.aligned

@@ -76,6 +76,7 @@ def test_one_view_is_wrong() -> None:
     assert np.allclose(chosen.gaussians.means, RIGHT.gaussians.means, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_many_views_with_little_parallax() -> None:
     """The nearest views of a film hardly contradict any depth: those farther away are asked, too."""
     t = np.linspace(-1, 1, 40)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from exports import Smooth, da3_rows, depth_map_mask, export_rows, save_export, smooth_scene, with_intrinsics
 from sweeps import sweep
 from tiny_scene import write_images
@@ -62,6 +63,7 @@ def test_cameras_and_pixels_from_photos(tmp_path: Path, fy: float) -> None:
     assert loaded.scene.num_missing == tiny.depths.size - len(kept)
 
 
+@pytest.mark.slow
 def test_every_other_view(tmp_path: Path) -> None:
     tiny = textured()
     masks = [depth_map_mask(depth) for depth in tiny.depths]

@@ -61,6 +61,7 @@ def check_centres(loaded: Loaded, centres: np.ndarray, scale: float) -> None:
     assert any("rotated" in note for note in loaded.notes)
 
 
+@pytest.mark.slow
 @sweep("first", [0, 2])
 def test_far_pixels_dropped_before_the_world_was_turned(tmp_path: Path, textured: Smooth, first: int) -> None:
     kept = far_cut(textured)
@@ -90,6 +91,7 @@ def test_larger_photos_are_cropped_to_the_square_of_the_family(tmp_path: Path) -
     check_centres(loaded, centres, scale)
 
 
+@pytest.mark.slow
 @sweep("photos", ["none", "of another scene"])
 def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured: Smooth, photos: str) -> None:
     """Takes a second: grids of all sizes are tried before it is given up."""

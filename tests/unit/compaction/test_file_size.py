@@ -22,6 +22,7 @@ def cloud(count: int) -> Gaussians:
     return Gaussians(*(column.astype(np.float32) for column in (*columns, *more)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "rebuilt"), [(0.99, False), (0.9, True)])
 def test_the_finest_level_is_built_again_with_what_the_others_leave(
     share: float, rebuilt: bool, monkeypatch: pytest.MonkeyPatch

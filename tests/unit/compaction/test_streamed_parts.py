@@ -35,6 +35,7 @@ def test_sky_is_in_no_level() -> None:
     assert noted == {"count": 1, "streamed": {"errors": True, "environment": len(parts.environment)}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reason", ["dropped", "size", "photos"])
 def test_it_stays_where_it_may(reason: str) -> None:
     """Where it has been dropped already, where the files would not have the bytes asked for, and without photos."""

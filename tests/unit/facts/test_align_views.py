@@ -147,6 +147,7 @@ def test_no_motion_in_common() -> None:
     np.testing.assert_allclose(without_common(start, together, np.mean), start, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_compacting_says_how_far_views_were_moved(scene: Scene) -> None:
     wrong, settings = motions.disagreeing(scene), {"effort": "draft", "superpixels": "2%", "match": "overlap"}
     fixed, auto = (compact(wrong, **settings, poses=poses) for poses in ("fixed", "auto"))

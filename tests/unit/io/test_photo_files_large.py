@@ -78,6 +78,7 @@ def test_larger_photos_show_what_the_grid_shows(made: Path, scale: float) -> Non
     assert shift_between(scene, scale) == (0, 0)
 
 
+@pytest.mark.slow
 def test_cameras_may_have_the_photos_size(folder: Path) -> None:
     change_cameras(folder, enlarge)
     scene = gsmerge.read_scene(folder)
@@ -160,6 +161,7 @@ def save(folder: Path, *, shuffled: bool = True, tiny: Tiny = LARGE) -> Path:
     return save_export(folder, tiny, export_rows(SMOOTH, order))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["auto", "none"])
 def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> None:
     loaded = load_scene(save(tmp_path), order=order, max_side=48)
@@ -173,6 +175,7 @@ def test_views_of_unaligned_scenes_are_resized(tmp_path: Path, order: str) -> No
     assert np.abs(scene.images * 255 - small).max() < 0.6
 
 
+@pytest.mark.slow
 def test_small_enough_views_stay(tmp_path: Path) -> None:
     loaded = load_scene(save(tmp_path), max_side=96)
     assert loaded.scene.cameras.width == 96

@@ -142,6 +142,7 @@ def spoilt(monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
     monkeypatch.setattr(module, "compact", compact)
 
 
+@pytest.mark.slow
 @sweep(
     ("change", "words"),
     [

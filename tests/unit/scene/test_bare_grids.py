@@ -178,6 +178,7 @@ def test_photos_of_another_scene_are_not_used(tmp_path: Path) -> None:
     assert noted(loaded.notes, "images", "not used", f"3 views of {WIDTH} x {HEIGHT}")
 
 
+@pytest.mark.slow
 def test_other_pictures_beside_the_file_are_no_photos(tmp_path: Path) -> None:
     tiny = made()
     for i in range(2):

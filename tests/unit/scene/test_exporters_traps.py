@@ -353,6 +353,7 @@ def test_cameras_of_world_mirror_by_number_or_stem(tmp_path: Path, ids: tuple) -
     assert (scene.cameras.width, scene.cameras.height) == (48, 36)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", [True, False])
 def test_photos_that_a_model_cropped_for_rows_without_pixels(tmp_path: Path, shown: bool) -> None:
     """WorldMirror and its relatives crop upright photos to squares; the colours confirm it."""

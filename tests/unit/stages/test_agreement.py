@@ -72,6 +72,7 @@ def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
     assert 0.015 <= shares[2] < 0.09
 
 
+@pytest.mark.slow
 def test_an_automatic_budget_is_the_share_that_the_depths_bear(wall: Scene) -> None:
     auto = CompactOptions().with_settings({"budget": "auto"})
     for scene in (wall, with_nearer_half(wall, [0, 2])):

@@ -51,6 +51,7 @@ def some(count: int) -> Gaussians:
     return Gaussians(means, quats, scales, np.full(count, 0.5, np.float32), shN[:, :1], shN)
 
 
+@pytest.mark.slow
 @sweep("ending", FILES)
 def test_memory_is_within_the_budget(ending: str, tmp_path: Path) -> None:
     small, path = tmp_path / f"small{ending}", tmp_path / f"large{ending}"

@@ -69,12 +69,14 @@ def test_budgets_are_met(scene: Scene, method: str, count: int) -> None:
     scenes.assert_consistent(result.report, scene, result.gaussians)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", EXACT)
 def test_the_usual_count_without_a_budget(scene: Scene, method: str) -> None:
     assert len(made(scene, method, budget=None, superpixels="10%").gaussians) == 3 * 76
     assert len(made(scene, method, budget=None, superpixels="10%", k=2).gaussians) == 2 * 3 * 76
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", EACH)
 def test_a_run_repeats_on_any_number_of_threads(scene: Scene, method: str) -> None:
     one, other = (made(scene, method, threads=threads).gaussians for threads in (1, 3))
@@ -144,6 +146,7 @@ def test_only_its_stages_are_timed(scene: Scene) -> None:
     assert set(made(scene, "unmerged-fit").report.seconds) == around | {"fit"}
 
 
+@pytest.mark.slow
 def test_unmerged_is_the_input(scene: Scene) -> None:
     actual = made(scene, "unmerged")
     scenes.assert_same_set(actual.gaussians, scene.gaussians, atol=1e-5)

@@ -69,6 +69,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     return page_of(make_grid(budgets=("1%", "4.4%")), tmp_path_factory.mktemp("results"), most_figures=2)
 
 
+@pytest.mark.slow
 def test_the_page_is_well_formed(page: str) -> None:
     actual = outline(page)
     assert actual.open == []

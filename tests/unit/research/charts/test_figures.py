@@ -130,6 +130,7 @@ def test_two_scenes_have_no_interval_in_the_table() -> None:
     assert all(row[-2:] == ("", "") for row in figures_of(records)[0].rows)
 
 
+@pytest.mark.slow
 def test_drawings_repeat_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     draw_figures([figure_of(2)], tmp_path / "a")
     monkeypatch.setitem(matplotlib.rcParams, "font.size", 30)  # the user's own style does not matter

@@ -52,6 +52,7 @@ def test_the_folders_are_complete(folder: Path) -> None:
     assert len(list(folder.iterdir())) == len(STYLES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(len(STYLES)))
 def test_scenes_are_read_back_aligned(folder: Path, index: int) -> None:
     load = load_scene(folder / f"scene_{index:04d}")

@@ -107,6 +107,7 @@ def test_textures_have_no_seam(kind: str) -> None:
         assert seam < 1.6 * steps.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("style", STYLES)
 def test_stages_are_seen_from_their_paths(style: str) -> None:
     built = STYLES[style](Palette(np.random.default_rng(3), 64))

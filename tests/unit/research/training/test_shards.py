@@ -122,6 +122,7 @@ def test_preparing_goes_on_where_it_was(scenes: list[Path], tmp_path: Path, monk
     assert len(made) == 6
 
 
+@pytest.mark.slow
 def test_a_scene_s_shards_depend_on_its_files(scenes: list[Path], tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     copytree(scenes[0], copy)
