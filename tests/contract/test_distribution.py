@@ -61,6 +61,7 @@ def packed(source: Path) -> set[str]:
 
 
 def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
+    """The build is one of setuptools, in a process of its own."""
     (wheel,) = (built / "dist").glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert packed(built / "source") - names == set()

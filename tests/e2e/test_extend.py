@@ -66,6 +66,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    """The states are those of three batches, made here for the module."""
     outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
     assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
     first, second = outcome.out.splitlines()

@@ -51,6 +51,7 @@ def test_one_file_with_its_photo(run: Run, sharp: Path, tmp_path: Path) -> None:
 
 
 def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -> None:
+    """Three photos are matched and joined, and the result is fitted, which takes two seconds."""
     out, photos = tmp_path / "place.ply", sharp / "photos"
     files = [*(sharp / "out" / f"{name}.ply" for name in NAMES), sharp / "other/IMG_0009.ply"]
     report = json.loads(run("compact", *files, "--images", photos, "-o", out, *FIT, "--json", code=0).out)

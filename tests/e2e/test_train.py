@@ -101,6 +101,7 @@ def test_wrong_settings_are_refused_in_one_line(small_scene: Path, run: Run, tmp
 
 
 def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
+    """Training prepares three scenes, and begins with loading torch."""
     folder, out = tmp_path / "scenes", tmp_path / "scenes" / "run"
     for name in ("a", "deeper/b", "c"):
         copytree(small_copy, folder / name)

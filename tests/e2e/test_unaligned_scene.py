@@ -37,6 +37,7 @@ def made(made_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @sweep("settings", [{}, {"budget": "2%"}, {"k": 2}], ids=str)
 def test_floor(settings: dict, made: Path, tmp_path: Path, target_psnr: Measure, floor: Callable[..., None]) -> None:
+    """300 steps, as users' fits have."""
     scene = read_scene(made, order="none")
     result = gsmerge.compact(scene, fit_steps=300, **settings)
     assert len(result.gaussians) <= 0.044 * settings.get("k", 1) * len(scene.gaussians)

@@ -96,6 +96,7 @@ def picture(tab: Browser) -> np.ndarray:
 
 @pytest.mark.parametrize("views", [slice(1), pytest.param(slice(1, None), marks=pytest.mark.slow)], ids=str)
 def test_3d_is_what_we_render_at_every_input_view(views: slice, opened: tuple[Browser, Any]) -> None:
+    """The browser draws without a GPU."""
     tab, (scene, small, _) = opened
     tab.run(f"{BARE} set('mode', 'blink'); set('pixels', 'photo')")
     inputs = tab.run(

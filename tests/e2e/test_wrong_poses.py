@@ -45,6 +45,7 @@ def turn_cameras(folder: Path, degrees: float, only: int | None = None) -> None:
 
 
 def test_cameras_that_are_a_little_off_are_moved_and_written(exact: Path, tmp_path: Path, run: Run) -> None:
+    """Two scenes are compacted and scored at the size at which poses can be told."""
     wrong = Path(shutil.copytree(exact, tmp_path / "wrong"))
     turn_cameras(wrong, 0.8)
     psnr: dict[str, Any] = {}

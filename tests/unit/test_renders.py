@@ -38,6 +38,7 @@ def distance(gaussians: Gaussians, scene: Scene, cameras: Cameras) -> np.ndarray
 
 
 def test_nearer_to_the_input_than_superpixels(scene: Scene) -> None:
+    """Two fits to renders, which take half a second each."""
     pairs, superpixels = (compact(scene, budget="4%", **more).gaussians for more in ({}, {"max_color": 0.11}))
     for cameras, gain in (
         (between_cameras(scene.cameras, 0.25, 0.75), 0.7),

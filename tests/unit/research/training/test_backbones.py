@@ -177,6 +177,7 @@ def test_captures_and_shards_together(scene: Scene, data: Path, tmp_path: Path) 
 
 
 def test_what_cannot_be_trained_on_is_refused(scene: Scene, data: Path, tmp_path: Path) -> None:
+    """The first that trains here pays for what torch loads late."""
     captures = list_captures(data)
     with refuses(ValueError, "backbone", "room"):
         train(captures, [], tmp_path, RUN)
