@@ -24,6 +24,11 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
 # Many containers ask for none, and each process of the run would compile the package and the tests anew
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+if not os.access(ROOT, os.W_OK):  # where hypothesis keeps its examples
+    import hypothesis
+
+    hypothesis.settings.register_profile("read-only", database=None)
+    hypothesis.settings.load_profile("read-only")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from difflib import get_close_matches
 from typing import Any
 
@@ -156,7 +157,9 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
     if name in flat_settings(FileHints) and "hint" in names:
         return f"{option} is no option: use --hint {name}=VALUE"
-    positive, settings = name.removeprefix("no_"), listed_settings(getattr(command.callback, "kinds", ()))
+    positive, settings = name.removeprefix("no_"), {}
+    with suppress(ImportError):  # training's, where torch is not installed
+        settings = listed_settings(getattr(command.callback, "kinds", ()))
     if positive in settings:
         default = settings[positive].default
         value = str(not default).lower() if isinstance(default, bool) else "VALUE"

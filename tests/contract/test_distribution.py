@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import tomllib
 
 import gsmerge
 from gsmerge.errors import NO_TORCH
@@ -25,6 +24,7 @@ from gsmerge.io.formats import spz, usd
 from gsmerge.kernels.build import find_platform
 
 pytest.importorskip("setuptools", minversion="77")
+tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
 BUILD = "import sys; from setuptools import build_meta as b; to = sys.argv[1]; b.build_wheel(to); b.build_sdist(to)"
 # In the place of the compiler, which tests/kernels/test_build.py tries: what it makes is no matter here
 COMPILER = "import sys; open(sys.argv[-1], 'wb').close()"

@@ -61,9 +61,10 @@ def test_other_commands_need_none(words: str, bare: Path, tmp_path: Path, run: A
     if "SMALL" in words:
         gsmerge.write_ply(small, gsmerge.read_ply(bare).gaussians[::9])
     places = {"BARE": bare, "SMALL": small, "OUT": tmp_path / "out"}
+    parts = words.split()
     for name, place in places.items():
-        words = words.replace(name, str(place))
-    document = report_of(run, *words.split())
+        parts = [part.replace(name, str(place)) for part in parts]
+    document = report_of(run, *parts)
     assert document.get("reference", "renders of the input") == "renders of the input"
     notes = document.get("batches", [document])[0]["notes"]
     assert sum(noted([note], *PLACED) for note in notes) == 1

@@ -64,9 +64,7 @@ def test_failures_inside_the_work(
 def test_a_folder_without_permission(smallest_copy: Path, run: Run) -> None:
     locked = smallest_copy / "locked"
     locked.mkdir(mode=0o500)
-    assert_refused(
-        run("compact", smallest_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "Permission denied"
-    )
+    assert_refused(run("compact", smallest_copy, "-o", locked / "small.ply"), 3, locked / "small.ply", "no permission")
     assert list(locked.iterdir()) == []
 
 

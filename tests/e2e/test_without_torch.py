@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tomllib
 from tiny_scene import make_tiny
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
 from gsmerge.measure import lpips
 
+tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
 Call = Callable[..., subprocess.CompletedProcess[str]]
 FEW = ("--set", "superpixels=60")
 COMMANDS = (

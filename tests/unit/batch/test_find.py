@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pathlib
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,8 @@ def locked(monkeypatch: pytest.MonkeyPatch) -> None:
         return scandir(path)
 
     monkeypatch.setattr(os, "scandir", refuse)
+    if hasattr(pathlib, "_NormalAccessor"):  # of Python 3.10, which has its own name for it
+        monkeypatch.setattr(pathlib._NormalAccessor, "scandir", staticmethod(refuse))
 
 
 @pytest.mark.usefixtures("locked")

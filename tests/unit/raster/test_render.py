@@ -91,7 +91,7 @@ def test_geographic_coordinates_keep_their_detail() -> None:
     np.testing.assert_allclose(composite(tiled)[0], render(rows, camera()).images[0], atol=1e-5)
 
 
-def test_nothing_is_copied_that_need_not_be() -> None:
+def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
     for given in (gaussians, gaussians.to("cpu")):
         splats = prepare(given)
@@ -129,7 +129,7 @@ def test_arrays_give_arrays_and_tensors_tensors(with_depths: bool, count: int, t
 
 
 @pytest.mark.parametrize("gradients", [False, True])
-def test_results_go_to_where_the_gaussians_are(gradients: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_go_to_where_the_gaussians_are(gradients: bool, torch: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A device without memory stands for a GPU: what is copied to the CPU has to be given."""
     gaussians, cameras = balls((0, 0, 1, 0.02, 0.8, 1.0)).to("cpu"), camera().to("cpu")
     there = gaussians.to("meta")
