@@ -188,6 +188,10 @@ def _listed(file: Path, search: _Search) -> Iterator[Path]:
     for line in read_lines(file):
         if "\0" in line:
             raise SceneError(file, "expected a text file with one path per line, found no text")
+        if line.startswith("{"):
+            raise SceneError(
+                file, "expected a list of scenes, one path per line, found JSON", "name the scene's folder"
+            )
         lines[line.strip()] = None
         budget.check_memory(_JOB_BYTES * len(lines), f"{len(lines):,} scenes")
     for entry in lines:

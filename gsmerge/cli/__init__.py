@@ -38,8 +38,10 @@ def main(args: Sequence[str] | None = None) -> int:
         words = sys.argv[1:] if args is None else args
         if "--debug" in words:
             traceback.print_exc()
-        cause = f"{type(error).__name__}: {error}".splitlines()[0]
-        print(f"gsmerge: error: unexpected error: {cause}; run again with --debug", file=sys.stderr)
+        problem = f"unexpected error: {type(error).__name__}: {error}".splitlines()[0] + "; run again with --debug"
+        if isinstance(error, ModuleNotFoundError):  # of sources that nobody installed
+            problem = f"{error.name} is not installed, which this needs: pip install -e the folder of the project"
+        print(f"gsmerge: error: {problem}", file=sys.stderr)
         return 1
 
 

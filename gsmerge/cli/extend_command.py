@@ -12,7 +12,7 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.extend import SUFFIX, ExtendOptions
 
 
 @opt.command(
@@ -24,6 +24,8 @@ from gsmerge.settings.extend import ExtendOptions
 def extend(args: opt.Args) -> None:
     """Add the views of scenes to a state; gsmerge compact makes results of any size from it at any time."""
     start = perf_counter()
+    if args.state.suffix.lower() != SUFFIX:
+        raise UsageError(f"{args.state}: expected a state, which ends in {SUFFIX}")
     hints = args.hints()
     if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")

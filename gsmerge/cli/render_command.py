@@ -15,7 +15,6 @@ from gsmerge.errors import UsageError
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
 # Endings by which a name means a file that cannot be written, and no folder
-NO_FOLDER = (".avi", ".bmp", ".html", ".m4v", ".mkv", ".mov", ".mpg", ".ogv", ".pdf", ".svg", ".tif", ".tiff")
 SIDES = (16, 16384)  # pixels of a picture
 
 
@@ -86,7 +85,7 @@ def _choose_kind(args: opt.Args) -> str:
     """Choose what is drawn by the name of the output and ``--path``; UsageError if they do not fit."""
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
-    if suffix in NO_FOLDER:
+    if suffix and not is_clip and not is_picture and not args.output.is_dir():
         expected = f"a picture, {opt.join_words(PICTURES)}, a clip, {opt.join_words(CLIPS)}, or a folder"
         raise UsageError(f"{args.output}: expected {expected}")
     if is_clip and args.path is None:

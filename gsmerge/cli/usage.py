@@ -32,7 +32,7 @@ OTHER_WORDS = {
 # What other programs call an option
 OTHER_OPTIONS = {
     "overwrite": ("force", "f", "clobber", "replace", "yes", "y"),
-    "output": ("out", "outdir", "out_dir", "output_dir", "output_path", "outfile", "dest"),
+    "output": ("o", "out", "outdir", "out_dir", "output_dir", "output_path", "outfile", "dest"),
     "quiet": ("silent", "s", "no_progress"),
     "jobs": ("j", "workers", "num_workers", "processes"),
     "images": ("photos", "image", "image_dir", "image_path"),
@@ -77,14 +77,17 @@ class _Words:
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the words after a command's name; raise UsageError for empty, missing and repeated values."""
         words = list(args)
+        params = self.get_params(ctx)  # type: ignore[attr-defined]
+        names = {name for param in params for name in param.opts}
+        for word in words[: words.index("--") if "--" in words else None]:
+            if f"-{word.partition('=')[0]}" in names and not word.startswith("--"):
+                raise UsageError(f"{word}: expected two dashes, -{word}")
         try:
             rest: list[str] = super().parse_args(ctx, args)  # type: ignore[misc]
         except UsageErrors as error:
             error.ctx = getattr(error, "ctx", None) or ctx  # the parser's own have none
             raise
         values, _, order = self.make_parser(ctx).parse_args(args=words)  # type: ignore[attr-defined]
-        params = self.get_params(ctx)  # type: ignore[attr-defined]
-        names = {name for param in params for name in param.opts}
         for param in params:
             _check_words(param, values.get(param.name), order.count(param), names)
         return rest
@@ -98,7 +101,7 @@ def _check_words(param: Any, words: Any, times: int, names: set[str]) -> None:
     for place, word in enumerate(words):
         if not word:
             raise UsageError(f"{label}: expected a value, got an empty one")
-        if is_option and (word in names or word.startswith("--")):
+        if is_option and (word in names or word == "-" or word.startswith("--")):
             raise UsageError(f"{label}: expected a value, got {word}")
         if is_option and word in words[:place]:
             raise UsageError(f"{label}: expected each value once, got {word} twice")
@@ -137,6 +140,8 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
+        if match[1] == "help":
+            return f"help is no command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
         if match[1] in FORMER_COMMANDS:
             return f"{match[1]} is no command any more: use {FORMER_COMMANDS[match[1]]}"
         near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
@@ -152,6 +157,7 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
     """
     name = option.lstrip("-").replace("-", "_")
     names = {str(parameter.name): parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
+    names["help"] = "--help"
     if name in BUDGET_WORDS and "budget" in names:
         more = ", or --k" if "k" in names else ""
         return f"{option} is no option: use --budget, such as 2%, 40000 or 5MB{more}"
@@ -162,21 +168,26 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
         settings = listed_settings(getattr(command.callback, "kinds", ()))
     if positive in settings:
         default = settings[positive].default
-        value = str(not default).lower() if isinstance(default, bool) else "VALUE"
+        value = str(not default).lower() if isinstance(default, bool) else "VALUE" if positive == name else "none"
         more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
         return f"{option} is no option: use --set {positive}={value}{more}"
     same = [known for known, words in OTHER_OPTIONS.items() if name in words]
     for former in (name, *same):
         if former in FORMER_OPTIONS and former not in names:
             return f"{option} is no option{' any more' * (former == name)}: {FORMER_OPTIONS[former]}"
-    if name in FORMAT_WORDS:
-        if command.name == "convert":
-            return f"{option} is no option: the name of the last file decides, such as x.spz"
-        return f"{option} is no option: the name of -o decides, such as -o x.spz" if "output" in names else None
-    near = [known for known in same if known in names] or get_close_matches(name, names, 1, _NEAR)
-    if near:
+    if command.name == "convert" and ("output" in same or name in ("output", *FORMAT_WORDS)):
+        return f"{option} is no option: the last file is what is written, by its name: gsmerge convert a.ply x.spz"
+    if name in FORMAT_WORDS and "output" in names:
+        example = ", such as -o x.spz" if command.name in ("compact", LOOK) else ""
+        return f"{option} is no option: the name of -o decides{example}"
+    begun = [known for known in names if len(name) > 2 and known.startswith(name)]
+    near = [known for known in same if known in names] or (begun if len(begun) == 1 else [])
+    near = near or get_close_matches(name, names, 1, _NEAR)
+    if near and not name.startswith("no_"):
         return f"{option} is no option: use {names[near[0]]}"
-    owner = _owner({name, *same}, make_command())
+    owner = None if positive in names else _owner({name, positive, *same}, make_command())
+    if owner is not None and hasattr(command, "commands"):
+        return f"{option} comes after the name of a command or scene"
     return None if owner is None else f"{option} is no option of {place}: {PROGRAM} {owner} has it"
 
 

@@ -87,6 +87,16 @@ def test_an_empty_name_is_not_this_folder(
         ("compact x.ply --workers 2", "gsmerge batch has it"),
         ("compact x.ply --qualty 3", "use --quality"),
         ("render x.ply --data d", "gsmerge lab train has it"),
+        ("compact x.ply --over", "use --overwrite"),
+        ("compact x.ply --no-fit", "--set fit=none"),
+        ("compact x.ply --no-open", "gsmerge view has it"),
+        ("compact x.ply -overwrite", "two dashes, --overwrite"),
+        ("render x.ply -output=a.png", "two dashes, --output=a.png"),
+        ("compact x.ply -o -", "--output: expected a value"),
+        ("convert x.ply -o y.spz", "gsmerge convert a.ply x.spz"),
+        ("evaluate x.ply --format json", "the name of -o decides;"),
+        ("--quiet x.ply", "after the name of a command or scene"),
+        ("help compact", "gsmerge --help"),
     ],
 )
 def test_what_to_type_instead(words: str, suggestion: str, run: Run) -> None:
@@ -94,7 +104,7 @@ def test_what_to_type_instead(words: str, suggestion: str, run: Run) -> None:
     assert suggestion in outcome.err
 
 
-@pytest.mark.parametrize("option", ["--verbose", "--gpu", "--zzz", "-v"])
+@pytest.mark.parametrize("option", ["--verbose", "--gpu", "--zzz", "-v", "--no-overwrite"])
 def test_nothing_near_is_no_guess(option: str, run: Run) -> None:
     assert_refused(run("compact", "x.ply", option), 2, "", f"No such option: {option}; see 'gsmerge compact --help'")
 

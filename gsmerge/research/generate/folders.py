@@ -124,12 +124,18 @@ def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
     return isinstance(record, dict) and {name: record.get(name) for name in key} == dict(key)
 
 
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
+
+
 def check_replaceable(folder: Path, *, overwrite: bool) -> None:
     """Raise UsageError if a folder holds other files, or a scene of other options without ``overwrite``."""
-    if os.path.lexists(folder) and not (folder / RECORD).is_file():
+    if not os.path.lexists(folder) or _is_empty(folder):
+        return
+    if not (folder / RECORD).is_file():
         problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
         raise UsageError(f"{folder}: {problem}")
-    if os.path.lexists(folder) and not overwrite:
+    if not overwrite:
         problem = "holds a scene of other options; pass --set overwrite=true to replace it, or choose another OUT"
         raise UsageError(f"{folder}: {problem}")
 
