@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -133,16 +134,17 @@ def test_a_list_of_more_scenes_than_its_bytes_allow_is_refused() -> None:
 @pytest.fixture
 def locked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Folders named locked cannot be read; permissions mean nothing to root, which tests may run as."""
-    scandir = os.scandir
+    for name in ("scandir", "listdir"):  # pathlib calls the one or the other, by the version of Python
+        usual = getattr(os, name)
 
-    def refuse(path: str | Path) -> object:
-        if Path(path).name == "locked":
-            raise PermissionError(13, "Permission denied", str(path))
-        return scandir(path)
+        def refuse(path: str | Path, usual: Callable[[str | Path], object] = usual) -> object:
+            if Path(path).name == "locked":
+                raise PermissionError(13, "Permission denied", str(path))
+            return usual(path)
 
-    monkeypatch.setattr(os, "scandir", refuse)
-    if hasattr(pathlib, "_NormalAccessor"):  # of Python 3.10, which has its own name for it
-        monkeypatch.setattr(pathlib._NormalAccessor, "scandir", staticmethod(refuse))
+        monkeypatch.setattr(os, name, refuse)
+        if hasattr(pathlib, "_NormalAccessor"):  # Python 3.10 has its own names for them
+            monkeypatch.setattr(pathlib._NormalAccessor, name, staticmethod(refuse))
 
 
 @pytest.mark.usefixtures("locked")

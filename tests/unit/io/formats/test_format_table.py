@@ -9,7 +9,7 @@ import pytest
 from gsmerge.io.cameras import read as camera_reader
 from gsmerge.io.cameras.read import CAMERA_FORMATS
 from gsmerge.io.formats import glb, sog, splat, spz, streamed, usd
-from gsmerge.io.formats.table import FORMATS, LEVELS, output_format
+from gsmerge.io.formats.table import FORMATS, LEVELS
 from gsmerge.runtime.plugins import LazyFunction
 
 ENTRIES = [entry for row in (*FORMATS, *CAMERA_FORMATS) for entry in vars(row).values()]
@@ -26,5 +26,5 @@ def test_a_function_that_a_table_names_is_there(function: LazyFunction) -> None:
 def test_the_table_has_the_degrees_of_the_writers() -> None:
     writers = {".sog": sog, ".splat": splat, ".spz": spz, ".glb": glb, ".usdc": usd}
     degrees = {ending: writer.MAX_DEGREE for ending, writer in writers.items()}
-    assert {ending: output_format(f"a{ending}").max_degree for ending in degrees} == degrees
+    assert {row.ending: row.max_degree for row in FORMATS if row.ending in degrees} == degrees
     assert LEVELS.max_degree == streamed.MAX_DEGREE

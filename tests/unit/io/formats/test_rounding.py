@@ -32,6 +32,7 @@ def near() -> Gaussians:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_near_the_origin_nothing_is_lost_or_copied(near: Gaussians, name: str) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed") if "usd" in name else None
     assert rounding_notes(name, near) == []
     assert as_written(name, near) is near
 

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from made_gaussians import random_gaussians
 from messages import refuses
-from pxr import Sdf, Usd, UsdGeom, UsdVol
 
 from gsmerge import Gaussians
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.arrays import to_columns, turn_half
+
+pytest.importorskip("pxr", reason="usd-core is not installed: pip install 'usd-core>=26.3,<27'")
+from pxr import Sdf, Usd, UsdGeom, UsdVol
 
 ENDINGS = (".usdc", ".usdz")
 
