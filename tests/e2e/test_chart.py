@@ -102,6 +102,7 @@ def test_the_bytes_are_those_of_the_file(charted_scene: Path, tmp_path: Path) ->
 
 
 def test_nothing_is_run_twice(copied: Path, merges: list[CompactOptions], run: Run) -> None:
+    """The first to draw charts loads Matplotlib."""
     before = (copied / "out" / "batch.jsonl").read_bytes()
     outcome = again(run, copied)
     assert outcome.code == 0, outcome.err

@@ -88,7 +88,7 @@ OBLONG = np.array([[FOCAL, 0, 44], [0, 80, 38], [0, 0, 1]])
 
 @pytest.mark.parametrize(("views", "K"), [(1, SCENE.K), (3, OBLONG)])
 def test_photos_show_it_where_rows_are_no_pixels(tmp_path: Path, views: int, K: np.ndarray) -> None:
-    """VicaSplat's rows: sorted by opacity, the least opaque dropped, not on the rays of their pixels."""
+    """VicaSplat's rows: sorted by opacity, the least opaque dropped, not on the rays; a search of seconds."""
     rng = np.random.default_rng(0)
     scene = with_intrinsics(SCENE, K)
     means = scene.gaussians.means + rng.normal(0, 0.01, scene.gaussians.means.shape).astype(np.float32)

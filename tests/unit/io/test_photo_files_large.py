@@ -88,7 +88,7 @@ def test_cameras_may_have_the_photos_size(folder: Path) -> None:
 
 @pytest.mark.parametrize("k1", [pytest.param(0.0, marks=pytest.mark.slow), -0.05])
 def test_cropped_and_distorted_photos(folder: Path, k1: float) -> None:
-    """The grid is the middle of wider photos, which a lens has bent."""
+    """The grid is the middle of wider photos, which a lens has bent: a second to undistort them."""
     side = 31
     for path in sorted((folder / "images").iterdir()):
         image = cv2.imread(str(path))
