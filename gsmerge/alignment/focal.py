@@ -196,10 +196,10 @@ def _refine(gaussians: Gaussians, pictures: _Pictures, viewmats: np.ndarray, foc
         def color_error(K: np.ndarray) -> float:
             return _color_error(points[rows], colors[rows], pictures.cameras(viewmats, K), pictures.images)
 
+        steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
         for _ in range(_ROUNDS):
             before = K
             for change in _CHANGES:
-                steps = sorted(range(-_HALF, _HALF + 1), key=abs)  # where another place is no nearer, it stays
                 K = min((K + focal * span * step / _HALF * change for step in steps), key=color_error)
             if np.array_equal(K, before):
                 break

@@ -35,8 +35,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
         return run(args)
     except Exception as error:  # a library that is needed is broken, or explaining an error failed
-        words = sys.argv[1:] if args is None else args
-        if "--debug" in words:
+        if "--debug" in (sys.argv[1:] if args is None else args):
             traceback.print_exc()
         problem = f"unexpected error: {type(error).__name__}: {error}".splitlines()[0] + "; run again with --debug"
         if isinstance(error, ModuleNotFoundError):  # of sources that nobody installed

@@ -133,10 +133,8 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     parameters = [] if error.ctx is None else error.ctx.command.params
     has_output = any(parameter.name == "output" for parameter in parameters)
     if hasattr(error, "possibilities") and error.ctx is not None:
-        message = (
-            _suggest(error.option_name, error.ctx.command, place, make_command)
-            or f"No such option: {error.option_name}"
-        )
+        suggestion = _suggest(error.option_name, error.ctx.command, place, make_command)
+        message = suggestion or f"No such option: {error.option_name}"
     elif message.startswith("Got unexpected extra argument") and has_output:
         message += "; name what is written with -o"
     elif match := re.match(r"No such command '(\w+)'", message):
