@@ -23,6 +23,7 @@ from typing import Any
 import cv2
 import numpy as np
 from capture_exports import export
+from quality import setting
 from shared_scenes import Targets, read_held_out, scene_folders
 
 import gsmerge
@@ -115,16 +116,59 @@ def meter(share: float) -> Change:
     return change
 
 
+def one(change: Change) -> Change:
+    """The change in the third photo alone."""
+    return lambda place, photo: change(place, photo) if place == 2 else photo
+
+
+def swap(photos: list[np.ndarray]) -> list[np.ndarray]:
+    """The second and the fourth photo in each other's place."""
+    return [photos[place] for place in (0, 3, 2, 1, *range(4, len(photos)))]
+
+
+def cover_by_another(photos: list[np.ndarray]) -> list[np.ndarray]:
+    """A quarter of the third photo shows the middle of the first."""
+    height, width = photos[2].shape[:2]
+    top, left, covered = height // 4, width // 4, photos[2].copy()
+    covered[: height // 2, : width // 2] = photos[0][top : top + height // 2, left : left + width // 2]
+    return [*photos[:2], covered, *photos[3:]]
+
+
+def cover(_: float, photo: np.ndarray) -> np.ndarray:
+    """A grey disc over a tenth of the photo."""
+    height, width = photo.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    disc = (y - 0.6 * height) ** 2 + (x - 0.4 * width) ** 2 < height * width / (10 * np.pi)
+    return np.where(disc[..., None], (0.4, 0.42, 0.45), photo)
+
+
+def noise(place: float, photo: np.ndarray) -> np.ndarray:
+    return np.random.default_rng([7, int(place)]).random(photo.shape)
+
+
+def twice_as_large(_: float, photo: np.ndarray) -> np.ndarray:
+    return cv2.resize(photo, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC).clip(0, 1)
+
+
+def keep_all(photos: list[np.ndarray]) -> list[np.ndarray]:
+    return photos
+
+
+def sound(_: float, photo: np.ndarray) -> np.ndarray:
+    return photo
+
+
 @dataclass(frozen=True)
 class Case:
     change: Change
+    of_all: Callable[[list[np.ndarray]], list[np.ndarray]] = keep_all  # what needs several photos
     gaussians_too: bool = False  # whether the model saw the photos so
     targets_too: bool = False  # whether held-out photos were taken so
     masks: bool = False  # whether masks lie beside the photos
 
 
 CASES = {
-    "sound": Case(lambda _, photo: photo),
+    "sound": Case(sound),
     "band": Case(band),
     "ellipse": Case(mask_black),
     "alpha": Case(alpha),
@@ -136,6 +180,14 @@ CASES = {
     "half exposure": Case(lambda _, photo: 0.5 * photo),
     "gamma 1.8": Case(lambda _, photo: photo**1.8),
     "bgr": Case(lambda _, photo: photo[..., ::-1]),
+    "bgr of one": Case(one(lambda _, photo: photo[..., ::-1])),
+    "gamma 1.8 of one": Case(one(lambda _, photo: photo**1.8)),
+    "cover": Case(cover),
+    "cover by another": Case(sound, cover_by_another),
+    "one black": Case(one(lambda _, photo: 0 * photo)),
+    "swapped": Case(sound, swap),
+    "twice as large": Case(twice_as_large),
+    "one of noise": Case(one(noise)),
     "gain .5 to 2 in both": Case(gains(0.5, 2, 1), gaussians_too=True),
     "gain .8 to 1.25 in both": Case(gains(0.8, 1.25, 1), gaussians_too=True),
     "white balance .8 to 1.25 in both": Case(gains(0.8, 1.25, 3), gaussians_too=True),
@@ -181,8 +233,8 @@ def export_case(scene: Path, case: Case, out: Path, by: int, views: int) -> tupl
     small = shrink_scene(scene, out / "small", by, change, targets_too=case.targets_too)
     path = export(small, out / "export", "plain", views or None)
     photos = sorted((out / "export" / "images").iterdir(), key=lambda file: _order(out / "export", file.name))
-    for number, file in enumerate(photos):
-        photo = cv2.imread(str(file))[..., ::-1].astype(np.float64) / 255
+    images = case.of_all([cv2.imread(str(file))[..., ::-1].astype(np.float64) / 255 for file in photos])
+    for number, (file, photo) in enumerate(zip(photos, images, strict=True)):
         if case.masks:
             (out / "export" / "masks").mkdir(exist_ok=True)
             mask = ellipse(*photo.shape[:2]).astype(np.uint8) * 255
@@ -252,7 +304,7 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-photos")
     args = parser.parse_args()
-    SETTINGS.update(text.split("=", 1) for text in args.set)
+    SETTINGS.update({name: setting(value) for name, value in (text.split("=", 1) for text in args.set)})
     for scene in scene_folders(args.scenes):
         run(scene, args.cases, args.cache, args)
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.facts.mend_photos import CLIPPED, PhotoChange, change_large
+from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
 from gsmerge.geometry import camera_centres, camera_depths, correlation, project, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve_symmetric
@@ -269,6 +269,6 @@ def _divide(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     g, each = scene.gaussians, factors.repeat(scene.pixels_per_view, 0)[:, None]
     gaussians = replace(g, sh0=rgb_to_sh0(sh0_to_rgb(g.sh0) * each).astype(np.float32), shN=g.shN * each)
     large = scene.large_photos
-    large = None if large is None else change_large(large, changes, {})
+    large = None if large is None else change_large(large, changes)
     counting = scene.masks if masks.all() else masks
     return replace(scene, images=images, gaussians=gaussians, masks=counting, large_photos=large)

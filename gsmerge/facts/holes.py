@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.facts.mend_photos import fill_gaps
 from gsmerge.facts.place_cameras import between_cameras
+from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.geometry import nearest_views, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur

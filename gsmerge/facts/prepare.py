@@ -219,11 +219,11 @@ def _prepare_pixels(
     """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
     scene, views = _with_pictures(canonical, add_row_colors)
     every = tuple(range(len(scene)))
-    reference = Reference(PHOTOS, views, views) if views else Reference(ROW_COLORS, every, every)
+    reference = Reference(PHOTOS, every, views) if views else Reference(ROW_COLORS, every, every)
     given = _with_photos(given, scene, repeated)
-    scene = equalise_exposure(scene, reference.fit_views, options.exposure)
+    scene = equalise_exposure(scene, reference.score_views, options.exposure)
     fixed, always = options.poses == "fixed", options.poses == "free"
-    moved = None if fixed else align_views(scene, reference.fit_views, always=always)
+    moved = None if fixed else align_views(scene, reference.score_views, always=always)
     return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, scene.gaussians[:0])
 
 

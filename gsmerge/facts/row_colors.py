@@ -7,9 +7,9 @@ faint that their colours mean little, the drawing takes their place if it is sol
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from gsmerge.facts.mend_photos import fill_gaps
 from gsmerge.facts.views import camera_kinds, subset
 from gsmerge.geometry import camera_depths, sh0_to_rgb
 from gsmerge.kernels.pictures import blur
@@ -91,3 +91,15 @@ def _blurred_difference(first: np.ndarray, second: np.ndarray, weights: np.ndarr
     """
     apart = np.abs(blur((first - second) * weights[..., None], BLUR))
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))
+
+
+def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Fill unknown pixels of a picture ``[h,w,c]`` with the values of the nearest known pixel."""
+    if valid.all() or not valid.any():
+        return picture
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(int(labels.max()) + 1, np.int64)
+    nearest[labels[valid]] = np.flatnonzero(valid)
+    return np.asarray(picture.reshape(valid.size, -1)[nearest[labels]])

@@ -1,0 +1,66 @@
+"""What makes a photo look as its Gaussians, applied to it at every size that it is read in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gsmerge.types import LargePhotos
+
+CLIPPED = 0.985  # level from which on a pixel does not say how bright it is
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoChange:
+    """Change of one photo, in this order."""
+
+    reversed: bool = False  # whether red and blue change places
+    tones: np.ndarray | None = None  # [3,256] float32: what each level of each channel becomes
+    cover: np.ndarray | None = None  # [h,w] bool: where `colors` take the photo's place
+    colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
+
+    def __bool__(self) -> bool:
+        """Return whether the photo changes at all."""
+        return self.reversed or self.tones is not None or self.cover is not None
+
+    def __call__(self, photo: np.ndarray) -> np.ndarray:
+        """Change a photo ``[h,w,3]`` in [0, 1], at the size of the cover or a larger one; float32."""
+        if self.reversed:
+            photo = photo[..., ::-1]
+        if self.tones is not None:
+            photo = look_up(self.tones, photo)
+        if self.cover is not None and self.colors is not None:
+            cover, colors = self.cover, self.colors
+            if cover.shape != photo.shape[:2]:
+                cover, colors = _enlarge(cover, photo.shape) > 0, _enlarge(colors, photo.shape)
+            photo = np.where(cover[..., None], colors, photo)
+        return np.ascontiguousarray(photo, np.float32)
+
+
+def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Enlarge a picture in [0, 1] as whole numbers, which OpenCV resizes alike on every processor."""
+    levels = np.rint(255 * picture.astype(np.float32).clip(0, 1)).astype(np.uint8)
+    return np.asarray(cv2.resize(levels, shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255))
+
+
+def look_up(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
+    places = photo.astype(np.float32) * np.float32(255)
+    first = np.clip(places.astype(np.int64), 0, 254)
+    part, channel = places - first, np.arange(3)
+    return np.asarray(tones[channel, first] * (1 - part) + tones[channel, first + 1] * part)
+
+
+def change_large(large: LargePhotos, changes: Sequence[PhotoChange]) -> LargePhotos:
+    """Return larger photos that are changed whenever they are read."""
+
+    def read(view: int) -> np.ndarray:
+        photo = large.read(large.ids[view])
+        if not changes[view]:
+            return photo
+        return np.asarray(np.rint(255 * changes[view](photo / np.float32(255)).clip(0, 1)), np.uint8)
+
+    return replace(large, ids=tuple(range(len(changes))), read=read)
