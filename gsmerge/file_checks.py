@@ -23,8 +23,7 @@ from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.read import load_files
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import OpacityChoice, ReadHints
-from gsmerge.states.gsm_file import read_gsm
-from gsmerge.states.state_file import load_state
+from gsmerge.states.state_file import holds_features, load_state
 
 NETWORKS = ".safetensors"
 CAMERAS = (*CAMERA_ENDINGS, ".bin")
@@ -36,8 +35,8 @@ class FileCheck:
     """Content of a file, and why it is refused."""
 
     path: str
-    kind: str  # "Gaussians", "cameras", "networks" or "state"; "" where it cannot be read
-    count: int = 0  # Gaussians, views, parameters or groups
+    kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" where it cannot be read
+    count: int = 0  # of these: views of cameras, parameters of networks
     layout: str = ""  # of the columns or of the cameras' file
     file_bytes: int = 0
     problems: tuple[str, ...] = ()  # one sentence each, without a full stop
@@ -50,12 +49,11 @@ class FileCheck:
         """The result in one line for people."""
         if self.problems:
             return f"wrong  {self.path}: {'; '.join(self.problems)}"
-        units = {"Gaussians": "Gaussians", "cameras": "cameras", "networks": "parameters"}
-        unit = units.get(self.kind)
+        unit = {"networks": "parameters"}.get(self.kind, self.kind)
         size = f", {human_bytes(self.file_bytes)}" if self.file_bytes else ""
         layout = f", {self.layout}" if self.layout else ""
         views = f", {self.num_views:,} cameras, {self.num_photos:,} photos" if self.num_views else ""
-        return f"ok     {self.path}: {self.count:,} {unit or f'groups, {self.kind}'}{layout}{views}{size}"
+        return f"ok     {self.path}: {self.count:,} {unit}{layout}{views}{size}"
 
 
 def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = AUTO) -> FileCheck:
@@ -77,6 +75,8 @@ def holds_scene(path: Path) -> bool:
     suffix = path.suffix.lower()
     if suffix in SEVERAL_USES:
         return os.path.exists(path) and may_hold_gaussians(path)
+    if suffix == SUFFIX:
+        return os.path.isfile(path) and not holds_features(path)
     return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 
@@ -93,7 +93,7 @@ def damage(path: Path) -> list[str]:
 def _read(path: Path) -> FileCheck:
     suffix = path.suffix.lower()
     if suffix == SUFFIX:
-        return _read_gsm(path)
+        return FileCheck(str(path), "Feature Gaussians", len(load_state(path)))
     if path.name == streamed.INDEX:
         return _read_levels(path)
     if suffix == NETWORKS:
@@ -135,8 +135,3 @@ def _read_levels(path: Path) -> FileCheck:
     beside = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     notes = dict.fromkeys(note for info in infos for note in file_notes(info))
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, beside, notes=tuple(notes))
-
-
-def _read_gsm(path: Path) -> FileCheck:
-    notes = () if read_gsm(path).has_checksums else ("no checksums: an older gsmerge wrote it",)
-    return FileCheck(str(path), "state", len(load_state(path)), notes=notes)

@@ -1,11 +1,11 @@
-"""``gsmerge compact``: the main job, for scenes, and for views that are in a state of ``gsmerge extend`` already."""
+"""``gsmerge compact``: the main job, and Gaussians of Feature Gaussians that ``gsmerge extend`` made."""
 
 from __future__ import annotations
 
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -42,11 +42,8 @@ if TYPE_CHECKING:
 VIEWED = (".ply", ".spz", ".sog", ".splat", ".glb")  # endings that a page shows
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
-# Arguments and options that say something about a state, too
-OF_STATES = (
-    "scenes", "k", "budget", "fit", "effort", "set", "output", "overwrite", "dry_run", "json", "quiet",
-    "seed", "threads",
-)  # fmt: skip
+# Arguments and options that say something about Feature Gaussians, too
+OF_FEATURES = ("scenes", "k", "set", "output", "overwrite", "dry_run", "json", "quiet", "threads")
 
 
 PARAMETERS = (
@@ -71,12 +68,11 @@ def compact(args: opt.Args) -> None:
 @opt.command(*PARAMETERS)
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page with the result beside it: ``gsmerge SCENE``."""
-    is_state = any(path.suffix.lower() == SUFFIX for path in args.scenes)
-    scene = args.scenes[0]
-    usual = default_output(scene if is_state else args.files(*args.scenes).base)
+    scene, features = args.scenes[0], _features_in(args.scenes)
+    usual = default_output(scene if features else args.files(*args.scenes).base)
     args.output = output_file(args.output or usual, usual.name)
-    # Files that were joined, and a state, have no page of their own
-    shown = [args.output] if is_state or len(args.scenes) > 1 else [scene, args.output]
+    # Files that were joined, and Feature Gaussians, have no page of their own
+    shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
         raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
@@ -92,8 +88,9 @@ def look(args: opt.Args) -> None:
 
 def _compact(args: opt.Args, *, shown: bool = False) -> None:
     start = perf_counter()
-    if any(path.suffix.lower() == SUFFIX for path in args.scenes):
-        _compact_state(args, start)
+    features = _features_in(args.scenes)
+    if features is not None:
+        _decode(args, features, start)
         return
     hints = args.hints()
     from gsmerge.compaction.files import level_output
@@ -169,42 +166,35 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         raise TargetError("; ".join(filter(None, problems)))
 
 
-def _compact_state(args: opt.Args, start: float) -> None:
-    """Write a compact scene of a state, fitted to its photos; ``start``: the time when the command began."""
-    from gsmerge.io.formats.table import SITE
-
-    path = next(path for path in args.scenes if path.suffix.lower() == SUFFIX)
+def _decode(args: opt.Args, path: Path, start: float) -> None:
+    """Write Gaussians of the Feature Gaussians in a ``.gsm``; ``start``: the time when the command began."""
     if len(args.scenes) > 1:
-        raise UsageError(f"{path}: expected a state alone, got {len(args.scenes)} inputs")
-    args.require_scene(OF_STATES, path)
+        raise UsageError(f"{path}: expected Feature Gaussians alone, got {len(args.scenes)} inputs")
+    args.require_scene(OF_FEATURES, path)
     out = output_file(args.output or default_output(path), default_output(path).name)
-    if SITE.names(out):
-        raise UsageError(
-            f"{args.output}: expected a scene for a web site, {path} is a state; name a .ply, and convert it"
-        )
     check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
-    from gsmerge.fit import FitOptions
     from gsmerge.settings.stages import DecodeOptions
-    from gsmerge.states.decode import OF_MIXED
-    from gsmerge.states.files import compact_file, compact_line
+    from gsmerge.states.files import decode_file, decoding_line
 
-    kinds = FitOptions, FileOptions, DecodeOptions
-    left = {"viewer_cameras": False, "columns": "needed", "k": "auto", "min_opacity": 0.0}  # which a state has or lacks
-    wanted, writing, _ = args.make(*kinds, **left)
-    mixed = {name: value for name, value in args.values(*kinds, but=left).items() if name in OF_MIXED}
+    decoding, writing = args.make(DecodeOptions, FileOptions, viewer_cameras=False, columns="needed")
     check_format(out, writing)
-    run = args.given(("effort", "seed", "threads"))
-    with opt.usage_errors():
-        settings = replace(CompactOptions(fit=wanted), **run)
     before = {"import": perf_counter() - start}
-    with stage_progress(quiet=args.silent) as progress:
-        document = compact_file(
-            path, out, settings, k=args.k, budget=args.budget, mixed=mixed, always_fit=args.fit is not None,
-            normals=writing.normals, overwrite=args.overwrite,
-            dry_run=args.dry_run, progress=progress, seconds_before=before,
-        )  # fmt: skip
+    document = decode_file(
+        path, out, decoding, normals=writing.normals, overwrite=args.overwrite, dry_run=args.dry_run,
+        seconds_before=before,
+    )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
-    print_document(document, compact_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
+    print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)
+
+
+def _features_in(scenes: Sequence[Path]) -> Path | None:
+    """Return the first path that is a ``.gsm`` of Feature Gaussians; None without one."""
+    states = [path for path in scenes if path.suffix.lower() == SUFFIX and path.is_file()]
+    if not states:
+        return None
+    from gsmerge.states.state_file import holds_features
+
+    return next((path for path in states if holds_features(path)), None)
 
 
 def _check_scenes(args: opt.Args) -> None:

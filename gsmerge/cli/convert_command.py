@@ -40,8 +40,8 @@ def convert(args: opt.Args) -> None:
     *inputs, output = args.paths
     if not inputs:
         raise UsageError(f"expected files to read and one to write, got {output} alone")
-    if any(path.suffix.lower() == SUFFIX for path in inputs):
-        _convert_state(args, inputs, output)
+    if output.suffix.lower() == ".npz":
+        _convert_features(args, inputs, output)
         return
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else Path(photos.images)
@@ -62,16 +62,14 @@ def convert(args: opt.Args) -> None:
     print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)
 
 
-def _convert_state(args: opt.Args, inputs: list[Path], output: Path) -> None:
-    """Write the Feature Gaussians of a state as arrays."""
-    path = next(path for path in inputs if path.suffix.lower() == SUFFIX)
-    if len(inputs) > 1:
-        raise UsageError(f"{path}: expected a state alone, got {len(inputs)} inputs")
+def _convert_features(args: opt.Args, inputs: list[Path], output: Path) -> None:
+    """Write the Feature Gaussians of a ``.gsm`` as arrays."""
+    path = inputs[0]
+    if len(inputs) > 1 or path.suffix.lower() != SUFFIX:
+        raise UsageError(f"{output}: expected one {SUFFIX} of Feature Gaussians for arrays, got {path}")
     args.require_scene(("paths", "overwrite", "json", "quiet"), path)
-    from gsmerge.states.arrays import ENDING, conversion_line, convert_state
+    from gsmerge.states.files import arrays_line, convert_features
 
-    if output.suffix.lower() != ENDING:
-        raise UsageError(f"{output}: expected a name that ends in {ENDING}; of a state gsmerge compact makes Gaussians")
     check_outputs((output,), (path,), overwrite=args.overwrite)
-    document = convert_state(path, output, overwrite=args.overwrite)
-    print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)
+    document = convert_features(path, output, overwrite=args.overwrite)
+    print_document(document, arrays_line(document), as_json=args.json, quiet=args.quiet)

@@ -19,10 +19,10 @@ from gsmerge.settings.extend import SUFFIX, ExtendOptions
     opt.argument("state", Path, "STATE", "A .gsm file, which the first batch makes."),
     opt.argument("scenes", list[Path], "SCENE", "Batches of new views, in order: each a scene as compact takes it."),
     opt.READING,
-    opt.settings_option(CompactOptions, ExtendOptions, example="superpixels=2%"),
+    opt.settings_option(CompactOptions, ExtendOptions, example="budget=2%"),
 )
 def extend(args: opt.Args) -> None:
-    """Add the views of scenes to a state; gsmerge compact makes results of any size from it at any time."""
+    """Compact new views and add them to a state, which gsmerge compact makes results of at any time."""
     start = perf_counter()
     if args.state.suffix.lower() != SUFFIX:
         raise UsageError(f"{args.state}: expected a state, which ends in {SUFFIX}")

@@ -10,7 +10,7 @@ from os import PathLike
 from typing import Any
 from weakref import ref
 
-from gsmerge.compaction.methods import choose_method
+from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import add_target, level_counts, search_count
 from gsmerge.errors import UsageError
@@ -73,6 +73,11 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     """Compact a scene in one piece."""
     method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
     prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+    return compact_prepared(prepared, method, options).to(scene.gaussians.device)
+
+
+def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
+    """Compact a scene of which the facts are known."""
     plan = add_target(make_plan(prepared, options), prepared)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
     trial = replace(plan, clean=CleanOptions()) if plan.keeps_input else plan  # what is left out would count as errors
@@ -90,7 +95,7 @@ def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     if packed:
         best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
-    return make_result(best, levels, prepared, plan, search.facts()).to(scene.gaussians.device)
+    return make_result(best, levels, prepared, plan, search.facts())
 
 
 @record_part()

@@ -25,7 +25,7 @@ from gsmerge.raster import render
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures
 from gsmerge.runtime.record import choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import PicturedScene
+from gsmerge.types import PicturedScene, Scene
 
 # Differences are of colours in [0, 1]. Of 15 captures the photos differ from their pixels' own colours by 0.003 in the
 # median, and from drawings by 0.01 to 0.2; the order of the channels raises that by 8 % at the least.
@@ -70,17 +70,18 @@ class Shown:
 def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
     """Mend the photos of a canonical scene, and replace what does not show it.
 
-    Returns the scene and the views whose photos show it; there are none if most photos do not. The record gets notes
+    Returns the scene and the views whose photos show it, none if most photos do not; what masks leave out as a whole is
+    not among them. The record gets notes
     and the choices ``photos_changed`` and ``photos_left_out``.
     """
-    shown, names = show_photos(scene), scene.names
-    changes = find_tones(shown, names)
+    small, names = show_photos(scene), scene.names
+    changes = find_tones(small, names)
     if scene.aligned:
         covers, pictures = _find_covers(scene, changes)
         odd = np.flatnonzero(covers.mean((1, 2)) > OTHER).tolist()
     else:
         covers, pictures = np.zeros(scene.images.shape[:3], bool), None
-        odd = odd_photos(_mend_small(shown, changes))
+        odd = odd_photos(_mend_small(small, changes))
     covered = [view for view in range(len(scene)) if covers[view].any() and view not in odd]
     changed = sorted({*covered, *(view for view, change in enumerate(changes) if change)} - {*odd})
     if changed:
@@ -97,7 +98,13 @@ def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]
     covers[odd] = True
     if scene.masks is not None:
         covers |= ~scene.masks
-    return _change(scene, changes, covers, pictures), tuple(view for view in range(len(scene)) if view not in odd)
+    shown = [view for view in range(len(scene)) if view not in odd and not _is_left_out(scene, view)]
+    return _change(scene, changes, covers, pictures), tuple(shown)
+
+
+def _is_left_out(scene: Scene, view: int) -> bool:
+    """Return whether masks leave out a view as a whole."""
+    return scene.masks is not None and not scene.masks[view].any()
 
 
 def _leave_out(scene: PicturedScene, odd: Sequence[int]) -> bool:

@@ -237,6 +237,9 @@ def _prepare_others(
     scene, views = _with_pictures(canonical, blank_pictures)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views)
+    if views and scene.masks is not None:  # a view that masks leave out as a whole is drawn, and held by that
+        left_out = np.flatnonzero(~scene.masks.any((1, 2))).tolist()
+        reference = replace(reference, fit_views=tuple(sorted({*views, *left_out})))
     if not views:
         reference = Reference(RENDERS, every if given.images is None else (), every)
     unseen = scene.gaussians[:0]

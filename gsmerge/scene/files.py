@@ -27,10 +27,12 @@ from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.formats.table import DEPTHS, FRAMES, POSES, SEVERAL_USES, is_frame
 from gsmerge.io.image_names import list_images
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import StrPath
 
 _CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file")
 _NO_GAUSSIANS = LazyFunction("gsmerge.scene.no_gaussians", "no_gaussians")
+_HOLDS_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
 _FIND_DEPTH_MAPS = LazyFunction("gsmerge.io.formats.depth_maps", "find_depth_maps")
 # The first that exists and is no result wins; then the folder's only .ply.
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
@@ -59,7 +61,7 @@ class SceneFiles:
     """The files of a scene.
 
     Cameras may be a COLMAP folder or the ``.ply`` that holds its own, images the ``.npz`` or ``.torch`` that holds
-    them.
+    them; of a ``.gsm`` both are that.
     """
 
     ply: Path
@@ -115,6 +117,10 @@ def find_scene_files(
             scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
     path = Path(path)
+    if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
+        check_file(path)
+        own = path if _HOLDS_VIEWS(path) else None
+        return SceneFiles(path, _named(cameras) or own, _named(images) or (own if cameras is None else None))
     plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
@@ -137,7 +143,9 @@ def find_scene_files(
     if image_path is None and is_frame(ply):
         image_path = ply
     if image_path is None and camera_path is not None:
-        has_images = camera_path.suffix == CHUNK or (camera_path.suffix == ".npz" and holds_images(camera_path))
+        has_images = camera_path.suffix in (CHUNK, SUFFIX) or (
+            camera_path.suffix == ".npz" and holds_images(camera_path)
+        )
         image_path = camera_path if has_images else None
     if image_path is None:
         folders = [root / place for root in roots for place in IMAGE_PLACES]

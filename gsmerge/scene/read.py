@@ -299,6 +299,9 @@ def _make_load(
     masks = None if masks is None else masks[views]
     masks, described = check_masks(masks, files)
     more += described
+    if camera_file is not None and camera_file.pictured is not None:
+        left = camera_file.pictured[views][:, None, None]
+        masks = np.broadcast_to(left, (len(views), cameras.height, cameras.width))
     photos = images if len(images) else None
     scene = Scene(gaussians, cameras, photos, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     frame = None if result.recovery is None else result.recovery.best.frame
@@ -306,7 +309,8 @@ def _make_load(
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
-        more += [] if camera_file is None else [_unaligned_note(hints)]
+        expected = camera_file is None or camera_file.order == "none"
+        more += [] if expected else [_unaligned_note(hints)]
     else:
         assert camera_file is not None, "pixels are those of cameras"
         scene, note = _use_depths(scene, camera_file, layout, frame.scale)

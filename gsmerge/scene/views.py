@@ -46,6 +46,7 @@ from gsmerge.kernels.pictures import count_bars
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.files import MASK_PLACES, SceneFiles
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import Cameras, LargePhotos
 
 _READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
@@ -180,7 +181,7 @@ def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path]:
         ):
             paths = images_beside(files.ply)  # the format has no names; AnySplat writes its Gaussians among the photos
         return paths if len(paths) == len(camera_file) else []
-    return [] if files.images.suffix in (".npz", CHUNK) else match_images(files.images, camera_file.names)
+    return [] if files.images.suffix in (".npz", CHUNK, SUFFIX) else match_images(files.images, camera_file.names)
 
 
 def images_beside(ply: Path) -> list[Path]:

@@ -1,1 +1,1 @@
-"""States: the Feature Gaussians of views in a ``.gsm`` file, which batches of views extend (paper section 4.5)."""
+"""States: views that arrive batch by batch, and compact scenes of all of them at any time."""

@@ -1,121 +1,147 @@
-"""State and settings in one object: views in batches, Gaussians at any time."""
+"""A state and its settings in one object: views in batches, compact scenes at any time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from typing import Any
 
-from gsmerge.plan import resolve_fit
+from gsmerge.compaction.compact import compact
+from gsmerge.compaction.result import CompactResult
+from gsmerge.errors import UsageError
 from gsmerge.runtime.record import Progress
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import merge_settings
-from gsmerge.states.decode import OF_MIXED, decode_state
+from gsmerge.settings.extend import batch_settings
+from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
-from gsmerge.states.state import State
-from gsmerge.states.state_file import load_state, save_state
-from gsmerge.types import Gaussians, Scene
+from gsmerge.states.features import FeatureState, decode_features, extend_features
+from gsmerge.states.state_file import State, load_state, save_state
+from gsmerge.types import Gaussians, Scene, StrPath
+
+
+def extend_state(
+    state: State | None, scene: Scene, settings: Mapping[str, Any], *, progress: Progress | None = None
+) -> tuple[State, BatchReport]:
+    """Add a batch of views to a state, which is not changed; None: begin one.
+
+    ``settings``: those of a draft by default, see :func:`gsmerge.settings.extend.batch_settings`; with
+    ``recipe="paper"`` the first batch begins Feature Gaussians, and later ones go on with its networks. Raises
+    ValueError if a setting is unknown, out of range, or impossible for the state or the scene.
+    """
+    before = None if state is None else state.content
+    of_paper = isinstance(before, FeatureState) or (before is None and settings.get("recipe") == "paper")
+    if isinstance(before, Scene) and settings.get("recipe") == "paper":
+        raise UsageError("recipe paper: expected a state that began with it, found results; begin another state")
+    if of_paper:
+        settings = {"recipe": "paper", "effort": "default"} | dict(settings)
+    options, extend_options = batch_settings(settings)
+    content: Scene | FeatureState
+    if of_paper:
+        assert not isinstance(before, Scene)
+        content, report = extend_features(before, scene, options, progress=progress)
+    else:
+        assert not isinstance(before, FeatureState)
+        content, report = extend(before, scene, options, extend_options, progress=progress)
+    about = {} if state is None else dict(state.about)
+    about |= {"batches": [*about.get("batches", []), report.numbers]}
+    about |= {"pictures": sorted({*about.get("pictures", []), report.pictures}), "checkpoint": options.checkpoint}
+    return State(content, about), report
 
 
 class Compactor:
-    """Compact views that arrive in batches of any size (paper section 4.5, "Online reconstruction").
+    """Compact views that arrive in batches.
 
-    After one batch ``decode(k=2, fit="none")`` equals ``compact(scene, k=2, fit="none", poses="fixed",
-    exposure="fixed")`` bit for bit, unless a budget or the size of the input limits the number of superpixels, or
-    Gaussians that no view sees are kept.
+    Each batch is compacted when it comes. Its Gaussians, cameras and at most ``max_views`` pictures are kept: a scene
+    of which ``compact`` makes results. With ``recipe="paper"`` Feature Gaussians are kept instead, matched and merged
+    across batches (paper section 4.5, "Online reconstruction"), and ``decode`` makes results of any K.
 
     Args:
-        **settings: Settings by name, those of :class:`gsmerge.CompactOptions` and of
-            :class:`gsmerge.settings.extend.ExtendOptions`: ``Compactor(superpixels="3%", max_k=2)``.
+        **settings: Settings of the batches by name, those of :class:`gsmerge.CompactOptions` and of
+            :class:`gsmerge.settings.extend.ExtendOptions`: ``Compactor(budget="3%", max_views=16)``.
 
     Raises:
         ValueError: If a setting is unknown or out of range.
 
     Example:
-        >>> compactor = gsmerge.Compactor(superpixels="3%")
-        >>> outcome = compactor.extend(gsmerge.read_scene("demo"))
-        >>> len(compactor.decode(k=1, fit="none")) < 500
-        True
+        >>> compactor = gsmerge.Compactor(budget=300)
+        >>> report = compactor.extend(gsmerge.read_scene("demo"))
+        >>> len(compactor.compact(budget=200, effort="draft").gaussians)
+        200
     """
 
     def __init__(self, **settings: Any) -> None:
-        self._options, self._extend_options = merge_settings(settings)
+        batch_settings(settings)
+        self._settings = settings
         self._state: State | None = None
 
     @classmethod
-    def load(cls, path: str | PathLike[str], **settings: Any) -> Compactor:
-        """Load a saved state, with its settings unless others are given.
+    def load(cls, path: StrPath, **settings: Any) -> Compactor:
+        """Load a saved state; ``settings`` are for the batches to come.
 
         Raises:
             SceneError: If the file cannot be read or is damaged.
             ValueError: If a setting is unknown or out of range.
         """
-        state = load_state(path)
-        compactor = cls.__new__(cls)
-        compactor._state = state
-        compactor._options, compactor._extend_options = merge_settings(settings, state.about["options"])
+        compactor = cls(**settings)
+        compactor._state = load_state(path)
         return compactor
 
     def __repr__(self) -> str:
-        num_views = 0 if self._state is None else len(self._state.cameras)
-        return f"Compactor({len(self):,} Feature Gaussians of {num_views:,} views)"
+        return f"Compactor({len(self):,} Gaussians of {len(self.batches)} batches)"
 
     def __len__(self) -> int:
-        """Return the number of groups so far."""
+        """Return the number of Gaussians, or Feature Gaussians, so far."""
         return 0 if self._state is None else len(self._state)
 
     @property
-    def state(self) -> State | None:
-        """State after all batches so far; None before the first."""
-        return self._state
+    def content(self) -> Scene | FeatureState:
+        """Results and views so far as a scene, or Feature Gaussians; ValueError before the first batch."""
+        return self._begun().content
 
     @property
     def batches(self) -> Sequence[Mapping[str, Any]]:
-        """Report of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
+        """Numbers of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
     def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
-        """Add a batch of views, see :func:`gsmerge.states.extend.extend`."""
-        self._state, report = extend(self._state, scene, self._options, self._extend_options, progress=progress)
+        """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`."""
+        self._state, report = extend_state(self._state, scene, self._settings, progress=progress)
         return report
 
-    def decode(
-        self,
-        *,
-        k: int | str | None = None,
-        budget: int | str | None = None,
-        progress: Progress | None = None,
-        **fit: Any,
-    ) -> Gaussians:
-        """Decode the current state into Gaussians; see :func:`gsmerge.states.decode.decode_state`.
-
-        Args:
-            k: Gaussians of each group, 1 to ``max_k``, or ``"mixed"``; None: that of the settings.
-            budget: Gaussians in all instead: a number from one for each group on, a share of the input as "2%", a size
-                as "5MB", or ``"auto"``: up to the knee of the superpixels' distortion, where they help most.
-            progress: See :func:`gsmerge.compact`.
-            **fit: Settings of the fit to the stored photos, such as ``fit="none"`` or ``effort="fast"``, and
-                ``k_low``, ``k_high`` and ``k_rule`` of mixed K.
+    def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:
+        """Compact the scene of all batches so far, see :func:`gsmerge.compact`.
 
         Raises:
-            ValueError: If there was no batch yet, or K or the budget is out of range.
+            ValueError: If there was no batch yet, a setting is wrong, or the state is of Feature Gaussians.
         """
-        if self._state is None:
-            raise ValueError("expected at least one batch of views before decoding, got none")
-        mixed = {name: fit.pop(name) for name in OF_MIXED if name in fit}
-        options = resolve_fit(CompactOptions().with_settings(fit)) if fit else None
-        seed, threads = self._options.seed, self._options.threads
-        return decode_state(
-            self._state, k=k, budget=budget, mixed=mixed, options=options, seed=seed, threads=threads, progress=progress
-        ).gaussians
+        scene = self.content
+        if isinstance(scene, FeatureState):
+            raise ValueError("expected a state of results, found Feature Gaussians; decode makes Gaussians of them")
+        return compact(scene, progress=progress, **settings)
 
-    def save(self, path: str | PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the state to a file; see :func:`gsmerge.states.state_file.save_state`.
+    def decode(self, **settings: Any) -> Gaussians:
+        """Decode Feature Gaussians in the world frame.
+
+        Args:
+            **settings: ``k``: Gaussians of each group, 1 to 4, or ``"mixed"``; others of
+                :class:`gsmerge.settings.stages.DecodeOptions`.
+
+        Raises:
+            ValueError: If there was no batch yet, a setting is wrong, or the state is one of results.
+        """
+        features = self.content
+        if isinstance(features, Scene):
+            raise ValueError('expected a state begun with recipe="paper", found results; compact makes others of them')
+        return decode_features(features, DecodeOptions(**settings))
+
+    def save(self, path: StrPath, *, overwrite: bool = False) -> None:
+        """Write the state to a file.
 
         Raises:
             ValueError: If there was no batch yet.
             SceneError: If the file exists or cannot be written.
         """
+        save_state(path, self._begun(), overwrite=overwrite)
+
+    def _begun(self) -> State:
         if self._state is None:
-            raise ValueError("expected at least one batch of views before saving, got none")
-        save_state(path, self._state, overwrite=overwrite)
+            raise ValueError("expected at least one batch of views, got none")
+        return self._state

@@ -1,4 +1,4 @@
-"""States in files: extended by the views of a scene's files, and compacted into a file of Gaussians."""
+"""States in files: extended by scenes; of Feature Gaussians, decoded into files and written as arrays."""
 
 from __future__ import annotations
 
@@ -9,36 +9,30 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
-from gsmerge.budget import FileSize, file_size
-from gsmerge.compaction.file_size import drop_to_bytes
 from gsmerge.compaction.files import read_input
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.fit import FitOptions
-from gsmerge.io import atomic_output, lock_folder, lost_harmonics, output_format, write_gaussians
-from gsmerge.io.formats.arrays import RESULT_COMMENT, copied_comments
+from gsmerge.io import atomic_output, output_format, write_gaussians
+from gsmerge.io.archives import new_member
+from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.table import PLY, count_for_bytes
-from gsmerge.plan import resolve_fit
+from gsmerge.io.formats.write import lost_harmonics
+from gsmerge.io.locks import lock_folder
 from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
-from gsmerge.scene.read import Loaded
-from gsmerge.settings.budget import BudgetOptions
-from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import merge_settings
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.states.decode import check_fit, count_children, decode_state
-from gsmerge.states.extend import extend
-from gsmerge.states.groups import divide_groups
-from gsmerge.states.state import State
+from gsmerge.settings.stages import DecodeOptions
+from gsmerge.states.compactor import extend_state
+from gsmerge.states.features import FeatureState, decode_features, feature_arrays
 from gsmerge.states.state_file import load_state, save_state
 
-REMEDY = "extend a new state by the scene"
+ARRAYS = ".npz"  # ending of a file of Feature Gaussians as arrays
 
 
 def extend_file(
@@ -54,50 +48,50 @@ def extend_file(
     """Add a batch of views to the state in a file, or to a new file, and return the report as plain JSON types.
 
     The file is replaced at the end, and not if anything fails or another process has changed it. If two processes end
-    together, the second waits for the first and then sees its change. ``settings``: see :class:`gsmerge.Compactor`; by
-    default the state's own. ``seconds_before``: wall time by name of the caller's earlier steps. Raises SceneError if a
-    file cannot be read or written or was changed meanwhile, UsageError if a setting is unknown, out of range, or
-    requires what the state or the scene does not have.
+    together, the second waits for the first and then sees its change. A batch that the state has already is left out,
+    with a note. ``settings``: see :class:`gsmerge.Compactor`. ``seconds_before``: wall time by name of the caller's
+    earlier steps. Raises SceneError if a file cannot be read or written or was changed meanwhile, UsageError if a
+    setting is unknown, out of range, or requires what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
     state = None if identity is None else load_state(path)
-    try:
-        options, extend_options = merge_settings(settings, None if state is None else state.about["options"])
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    sha256 = file_sha256(*files.plys)
+    known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
+    document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}}
+    if sha256 in known:
+        place = {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(known)}
+        note = f"{files.ply}: left out, as it is batch {known.index(sha256) + 1} of {path.name} already"
+        return document | {"left_out": True, "state": place, "notes": [note]}
     with ExitStack() as until_renamed, atomic_output(path, overwrite=identity is not None) as temporary:
         loaded = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
-        is_first = state is None
-        state, report = extend(state, load.scene, options, extend_options, progress=progress)
-        if is_first:
-            state = replace(state, about={**state.about, "source": _source(files, load)})
+        try:
+            state, report = extend_state(state, load.scene, settings, progress=progress)
+        except ValueError as error:
+            raise error if isinstance(error, UsageError) else UsageError(str(error)) from error
+        *earlier, last = state.about["batches"]
+        comments = list(dict.fromkeys([*state.about.get("comments", []), *load.comments]))
+        about = {**state.about, "batches": [*earlier, last | {"sha256": sha256}], "comments": comments}
         done = perf_counter()
-        save_state(temporary, state, overwrite=True)
+        save_state(temporary, replace(state, about=about), overwrite=True)
         until_renamed.enter_context(lock_folder(path.resolve().parent))
         if _file_identity(path) != identity:
             raise SceneError(path, "was changed by another process meanwhile", "extend it again; it is as that left it")
     seconds = {**(seconds_before or {}), "load": loaded - start, "read": read - loaded, **report.seconds}
     seconds["other"] = done - read - sum(report.seconds.values())
     numbers = {name: value for name, value in asdict(report).items() if name not in ("seconds", "notes", "options")}
+    document["input"] |= load.recognised
     return {
-        **document_head(),
-        "input": {"path": str(files.ply), **load.recognised},
+        **document,
         **numbers,
-        "state": {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(state.about["batches"])},
+        "left_out": False,
+        "state": {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(about["batches"])},
         "options": dict(report.options),
         **seconds_document(seconds | {"write": perf_counter() - done}),
         "peak_memory_bytes": peak_memory(),
         "notes": [*load.notes, *report.notes],
     }
-
-
-def _source(files: SceneFiles, load: Loaded) -> dict[str, Any]:
-    """Return facts about the file of a scene as plain JSON types, without its folder."""
-    num_bytes = sum(path.stat().st_size for path in files.plys)
-    texts = {"comments": list(load.comments), "notes": list(load.notes)}
-    return {"name": files.ply.name, "sha256": file_sha256(*files.plys), "bytes": num_bytes, **texts}
 
 
 def _file_identity(path: Path) -> tuple[int, int, int] | None:
@@ -111,104 +105,91 @@ def _file_identity(path: Path) -> tuple[int, int, int] | None:
 
 def batch_line(document: Mapping[str, Any]) -> str:
     """Describe the report of a batch in one line."""
-    state, dropped = document["state"], document["num_covered"] + document["num_hidden"]
+    state = document["state"]
+    if document["left_out"]:
+        return f"{state['path']}: unchanged, {state['num_batches']} batches"
     return (
         f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"
-        f" {document['num_input']:,} Gaussians -> {document['num_new']:,} groups: {document['num_joined']:,} joined"
-        f" others, {dropped:,} not needed; {document['num_groups']:,} groups in all,"
+        f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all,"
         f" {human_bytes(state['bytes'])}; {seconds_line(document)}"
     )
 
 
-def compact_file(
+def decode_file(
     path: Path,
     out: Path,
-    settings: CompactOptions,
+    options: DecodeOptions,
     *,
-    k: int | str | None = None,
-    budget: int | str | None = None,
-    mixed: Mapping[str, Any] | None = None,
-    always_fit: bool = False,
     normals: bool = True,
     overwrite: bool = False,
     dry_run: bool = False,
-    progress: Progress | None = None,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Compact the state in a file, write the Gaussians to a file, and return the report as plain JSON types.
+    """Decode the Feature Gaussians in a ``.gsm``, write Gaussians to a file, and return the report as plain JSON types.
 
-    ``settings``: of the fit and the run; ``always_fit``: refuse a state without photos, which otherwise is not fitted.
-    ``dry_run``: write nothing. Other arguments and errors are those of :func:`gsmerge.states.decode.decode_state` and
-    :func:`gsmerge.compaction.files.compact_files`.
+    ``dry_run``: write nothing. Raises SceneError if a file cannot be read or written, UsageError for a K that the
+    networks do not make.
     """
     start, state = perf_counter(), load_state(path)
-    lost, read = lost_harmonics(out, state.sh_degree), perf_counter()
-    notes = [lost] if lost else []
-    fit_options = resolve_fit(settings) if always_fit or len(state.replay) else FitOptions(fit="none")
-    check_fit(state, fit_options)
-    size = _file_size(budget, out)
-    count = budget if size is None else count_for_bytes(size.file, size.num_bytes, state.sh_degree)
-    document: dict[str, Any] = {
-        **document_head(),
-        "input": {
-            "path": str(path), "bytes": path.stat().st_size, "num_groups": len(state),
-            "num_gaussians": state.settings.num_input, "state": dict(state.about),
-        },
-        "k": k,
-        "budget": budget,
-    }  # fmt: skip
+    features, batches = state.content, state.about["batches"]
+    assert isinstance(features, FeatureState)
+    num_input = sum(int(batch.get("num_input", 0)) for batch in batches)
+    given = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(features), "num_gaussians": num_input}
+    document: dict[str, Any] = {**document_head(), "input": given | {"batches": batches}, "k": options.k}
     if dry_run:
-        counts = count_children(state, divide_groups(state), k=k, budget=count, mixed=mixed)
-        most = int(counts.per_group.sum()) + len(state.kept)
-        output = {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}}
-        return document | output | {"notes": [*counts.notes, *notes]}
+        most = options.max_k * len(features)
+        return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}, "notes": []}
+    read = perf_counter()
     with atomic_output(out, overwrite=overwrite) as temporary:
-        decoded = decode_state(
-            state, k=k, budget=count, mixed=mixed, options=fit_options, seed=settings.seed, threads=settings.threads,
-            progress=progress,
-        )  # fmt: skip
-        gaussians, done = decoded.gaussians, perf_counter()
-        if size is not None and size.file is not PLY:
-            gaussians = drop_to_bytes(gaussians, [], size.num_bytes, size.file)
+        gaussians, done = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
-            raise SceneError(path, "expected visible Gaussians, found none", REMEDY)
-        if not all(np.isfinite(getattr(gaussians, name)).all() for name in ("means", "scales", "quats")):
-            raise SceneError(path, "expected Gaussians of finite numbers, found others", REMEDY)
+            raise SceneError(path, "expected visible Gaussians, found none", "extend a new state by the scene")
+        lost = lost_harmonics(out, gaussians.sh_degree)
         write_gaussians(
-            temporary, gaussians, overwrite=True, comments=_comments(state), ending=output_format(out).ending,
+            temporary, gaussians, overwrite=True, comments=[RESULT_COMMENT], ending=output_format(out).ending,
             normals=normals,
         )  # fmt: skip
     seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
     return document | {
         "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},
-        "ratio": len(gaussians) / max(state.settings.num_input, 1),
-        "fit": decoded.fit and decoded.fit.to_dict(),
+        "ratio": len(gaussians) / max(num_input, 1),
         **seconds_document(seconds),
-        "notes": [*decoded.notes, *notes, *rounding_notes(out, gaussians)],
+        "notes": [*([lost] if lost else []), *rounding_notes(out, gaussians)],
     }
 
 
-def _file_size(budget: int | str | None, out: Path) -> FileSize | None:
-    """Return the size in bytes that a budget asks for; None for any other budget."""
-    try:
-        return None if budget is None else file_size(BudgetOptions(budget, output=out.name))
-    except ValueError as error:
-        raise UsageError(str(error)) from error
-
-
-def _comments(state: State) -> list[str]:
-    """Return the comments of the header: those of a result, and those copied from the first batch's file."""
-    texts = state.about.get("source", {}).get("comments")
-    return [RESULT_COMMENT, *copied_comments(texts if isinstance(texts, list) else ())]
-
-
-def compact_line(document: Mapping[str, Any]) -> str:
-    """Describe the report of a compacted state in one line."""
+def decoding_line(document: Mapping[str, Any]) -> str:
+    """Describe the report of :func:`decode_file` in one line."""
     before, after = document["input"], document["output"]
     if "dry_run" in document:
         return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"
     return (
-        f"{after['path']}: {before['num_groups']:,} groups -> {after['num_gaussians']:,} Gaussians"
+        f"{after['path']}: {before['num_groups']:,} Feature Gaussians -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} % of the scene's), {human_bytes(before['bytes'])} ->"
         f" {human_bytes(after['bytes'])}; {seconds_line(document)}"
     )
+
+
+def convert_features(path: Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
+    """Write the Feature Gaussians in a ``.gsm`` as an ``.npz``; return the report as plain JSON types.
+
+    Raises SceneError if a file cannot be read or written, or holds results.
+    """
+    features = load_state(path).content
+    if not isinstance(features, FeatureState):
+        raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply, or another format of scenes")
+    arrays = feature_arrays(features)
+    with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(new_member(f"{name}.npy"), "w", force_zip64=True) as file:
+                np.save(file, array, allow_pickle=False)
+    before = {"path": str(path), "bytes": path.stat().st_size}
+    after = {"path": str(out), "bytes": out.stat().st_size, "num_groups": len(features), "format": ARRAYS}
+    after["arrays"] = {name: list(array.shape) for name, array in arrays.items()}
+    return document_head() | {"inputs": [before], "left_out": {}, "output": after, "viewer_cameras": None, "notes": []}
+
+
+def arrays_line(document: Mapping[str, Any]) -> str:
+    """Describe the report of :func:`convert_features` in one line."""
+    after = document["output"]
+    return f"{after['path']}: {after['num_groups']:,} Feature Gaussians, {human_bytes(after['bytes'])}"

@@ -29,6 +29,7 @@ from gsmerge.io.cameras.json_files import (
     read_world_mirror,
 )
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import StrPath
 
 
@@ -142,6 +143,7 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
 
 
 _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
+_READ_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 _SHARP = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
@@ -183,6 +185,7 @@ CAMERA_FORMATS = (
     CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-inside-a-ply))", ".ply", read_embedded,
                  C2W_OPENGL, "pixels", lambda file: bool(camera_lines(file.path))),
     _SHARP,
+    CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_VIEWS, W2C_OPENCV, "pixels"),
 )  # fmt: skip
 CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy

@@ -13,6 +13,7 @@ from gsmerge.errors import UsageError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import Gaussians, StrPath
 
 INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
@@ -94,8 +95,16 @@ DEPTHS = Format(
     ".npz", "depth maps with images and cameras: a Gaussian for each pixel", _lazy("depth_maps.read_rows"), None, -1,
     holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
 )  # fmt: skip
+STATE = Format(
+    SUFFIX,
+    "batches of views: Gaussians, cameras and pictures",
+    _lazy("gsm.read_rows"),
+    None,
+    -1,
+    each=(68.0,),
+)
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
-FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS)
+FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS, STATE)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 FORMER_ENDINGS = ".compressed.ply", ".usda"  # which versions before 0.2 wrote
 SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))

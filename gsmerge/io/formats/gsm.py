@@ -1,0 +1,207 @@
+"""The ``.gsm`` container: what ``extend`` keeps of views that arrive in batches, in one safetensors file.
+
+Its only metadata entry is a header in JSON, with checksums of itself and of each array. Of kind ``scene`` are results
+with their cameras and pictures, which are read here as those of any file; of kind ``features`` Feature Gaussians
+(:mod:`gsmerge.states.features`). Nothing in a file is executed; each array is checked before it is used.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import save
+
+from gsmerge import __version__
+from gsmerge.errors import SceneError
+from gsmerge.io.atomic import atomic_output
+from gsmerge.io.bounds import check_pixels, parse_json, read_budget
+from gsmerge.io.cameras.camera_file import View
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, copied_comments, to_stored
+from gsmerge.io.tensor_file import read_tensors
+from gsmerge.kernels.elementary import log
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath, as_array
+
+SCHEMA = 3  # of the whole file; those before were states of 0.1 and 0.2
+HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second of 0.1
+SCENE, FEATURES = "scene", "features"  # kinds
+REMEDY = "run extend again with all batches"
+# Each entry of the header, with its type
+ENTRIES: Mapping[str, type] = {
+    "schema": int, "gsmerge": str, "kind": str, "width": int, "height": int, "names": list, "about": dict,
+}  # fmt: skip
+NUM_HIGHER = (0, 3, 8, 15, 24)  # harmonics above degree 0
+_LEAST_SCALE = 1e-30  # whose logarithm is one
+
+
+@dataclass(frozen=True)
+class GsmFile:
+    """Content of a ``.gsm``: its header, each entry of its type, and arrays that match their checksums."""
+
+    path: Path
+    header: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray]
+
+    def error(self, problem: str) -> SceneError:
+        """Make the SceneError for a damaged file."""
+        return SceneError(self.path, problem, "copy it again, or " + REMEDY)
+
+    def array(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
+        """Return an array of a type and shape (None: any size); SceneError for another one."""
+        array = self.arrays.get(name)
+        wanted = f"{name}: expected {dtype.__name__} {['n' if n is None else n for n in shape]}"
+        if array is None:
+            raise self.error(f"{wanted}, found none")
+        sizes_fit = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        if array.dtype != dtype or not sizes_fit:
+            raise self.error(f"{wanted}, found {array.dtype} {list(array.shape)}")
+        return array
+
+    def finite(self, name: str, dtype: type[np.generic], *shape: int | None) -> np.ndarray:
+        """Return an array as :meth:`array`; SceneError also if a number of it is not finite."""
+        array = self.array(name, dtype, *shape)
+        if not np.isfinite(array).all():
+            raise self.error(f"{name}: expected finite numbers, found others")
+        return array
+
+
+def write_gsm(path: StrPath, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, overwrite: bool) -> None:
+    """Write a ``.gsm`` with the entries of a header; schema, version and checksums are added."""
+    header = {"schema": SCHEMA, "gsmerge": __version__, **header}
+    data = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    with atomic_output(path, overwrite=overwrite) as temporary:
+        header["checksums"] = _checksums(header, data)
+        temporary.write_bytes(save(data, {HEADER: json.dumps(header)}))  # one entry: several have no fixed order
+
+
+def _checksums(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Compute the CRC-32 of the header without its checksums, and of each array."""
+    plain = {name: value for name, value in header.items() if name != "checksums"}
+    text = json.dumps(json.loads(json.dumps(plain)), sort_keys=True)  # keys as they are read
+    sums = {"header": zlib.crc32(text.encode("utf-8", "replace"))}
+    return sums | {name: zlib.crc32(np.ascontiguousarray(array).tobytes()) for name, array in sorted(arrays.items())}
+
+
+def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
+    """Read a ``.gsm``, of one ``kind`` or of any; SceneError for other files, and where a checksum is wrong."""
+    path = Path(path)
+    metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
+    header = _read_header(path, metadata)
+    if kind not in (None, header["kind"]):
+        what = {SCENE: "results", FEATURES: "Feature Gaussians"}
+        raise SceneError(path, f"expected a .gsm of {what[str(kind)]}, found one of {what[header['kind']]}")
+    file, sums, found = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
+    if sums != found:
+        wrong = [name for name in found if not isinstance(sums, dict) or sums.get(name) != found[name]]
+        raise file.error(f"{wrong[0] if wrong else 'arrays'}: expected the checksum in the header, found another")
+    return file
+
+
+def _read_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Parse the header of a file of this schema."""
+    text = metadata.get(HEADER, metadata.get(ENCODED))
+    if text is None:
+        raise SceneError(path, "expected a .gsm of gsmerge, found another safetensors file", "name the .gsm")
+    try:
+        header = parse_json(text, read_budget(path))
+    except ValueError as error:
+        raise SceneError(path, "expected a header in JSON, found something else", REMEDY) from error
+    schema = header.get("schema") if isinstance(header, dict) else None
+    if schema != SCHEMA:
+        newer = isinstance(schema, int) and schema > SCHEMA
+        remedy = f"update gsmerge, this is {__version__}" if newer else REMEDY
+        raise SceneError(path, f"expected a .gsm of schema {SCHEMA}, found schema {schema!r:.40}", remedy)
+    for name, entry in ENTRIES.items():
+        if type(header.get(name)) is not entry:
+            raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)
+    if header["kind"] not in (SCENE, FEATURES):
+        raise SceneError(path, f"expected a kind {SCENE} or {FEATURES}, found {header['kind']!r:.40}", REMEDY)
+    return dict(header)
+
+
+def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Write a scene without pixels, with facts of plain JSON types.
+
+    Pictures are stored as whole numbers, but for those that masks leave out as a whole.
+    """
+    arrays = {name: as_array(column) for name, column in vars(scene.gaussians).items()}
+    cameras = scene.cameras
+    arrays |= {name: np.asarray(getattr(cameras, name), np.float64) for name in ("viewmats", "Ks")}
+    if scene.images is not None:
+        with_picture = np.arange(len(scene)) if scene.masks is None else np.flatnonzero(scene.masks.any((1, 2)))
+        arrays["images"] = np.rint(255 * scene.images[with_picture].clip(0, 1)).astype(np.uint8)
+        arrays["image_views"] = with_picture
+    header = {"kind": SCENE, "width": cameras.width, "height": cameras.height, "names": list(scene.names)}
+    write_gsm(path, header | {"about": dict(about)}, arrays, overwrite=overwrite)
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read the Gaussians of a ``.gsm`` of results; SceneError if it is damaged or holds Feature Gaussians."""
+    file = read_gsm(path, SCENE)
+    means = file.arrays.get("means", np.zeros(0, np.float32))
+    n = len(file.array("means", np.float64 if means.dtype == np.float64 else np.float32, None, 3))
+    num_higher = file.array("shN", np.float32, n, None, 3).shape[1]
+    if num_higher not in NUM_HIGHER:
+        raise file.error(f"shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
+    columns = {"quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (num_higher, 3)}
+    rows = Gaussians(means, *(file.array(name, np.float32, n, *shape) for name, shape in columns.items()))
+    check_count(read_budget(path), n, num_higher, 0)
+
+    def unpack(block: slice) -> Columns:
+        part = rows[block]
+        log_scales = log(np.maximum(part.scales, _LEAST_SCALE))
+        return Columns(part.means, part.quats, log_scales, part.opacities, part.sh0[:, 0], part.shN)
+
+    sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
+    comments = file.header["about"].get("comments")
+    stored = to_stored([Packed(n, num_higher, unpack)], "batches of views", sizes)
+    kept = copied_comments(comments if isinstance(comments, list) else ())
+    return replace(stored, format="binary little-endian", comments=kept, notes=_picture_notes(file.header["about"]))
+
+
+def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
+    """Note what stands in for photos in some batches."""
+    names = about.get("pictures")
+    others = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
+    return (f"without photos of some batches: {' and '.join(others)} stand in for them",) if others else ()
+
+
+def holds_views(path: Path) -> bool:
+    """Return whether a path is a ``.gsm`` with cameras; True for a damaged one, whose reader says what is wrong."""
+    try:
+        return len(read_gsm(path).header["names"]) > 0
+    except SceneError:
+        return True
+
+
+def read_views(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a ``.gsm``, with the pictures of results."""
+    file = read_gsm(source.path)
+    cameras, names = stored_cameras(file), file.header["names"]
+    if len(names) != len(cameras) or not all(isinstance(name, str) for name in names):
+        raise file.error(f"names: expected one of each of {len(cameras)} views, found others")
+    size = cameras.width, cameras.height
+    stored = file.array("images", np.uint8, None, cameras.height, cameras.width, 3)
+    places = file.array("image_views", np.int64, len(stored))
+    if not np.array_equal(np.unique(places), places) or not ((places >= 0) & (places < len(cameras))).all():
+        raise file.error("image_views: expected views of the file, each once and in order, found others")
+    pictured = np.zeros(len(cameras), bool)
+    pictured[places] = True
+    images = np.zeros((len(cameras), *stored.shape[1:]), np.uint8)
+    images[places] = stored
+    views = [View(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
+    return StoredCameras(views, images, "none", pictured=None if pictured.all() else pictured)
+
+
+def stored_cameras(file: GsmFile) -> Cameras:
+    """Return the cameras of a file."""
+    viewmats = file.finite("viewmats", np.float64, None, 4, 4)
+    width, height = file.header["width"], file.header["height"]
+    check_pixels(file.path, width, height)
+    return Cameras(viewmats, file.finite("Ks", np.float64, len(viewmats), 3, 3), width, height)

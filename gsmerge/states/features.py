@@ -1,0 +1,322 @@
+"""Feature Gaussians across batches (paper section 4.5, "Online reconstruction"), which ``recipe=paper`` extends by.
+
+New views are encoded, matched with the Feature Gaussians so far, merged into them and refined; decoder heads make any K
+of them, of one batch the same bytes as ``compact`` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from gsmerge import __version__
+from gsmerge.errors import UsageError
+from gsmerge.facts.prepare import Frame, prepare
+from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
+from gsmerge.kernels.gaussians.cluster import connected_components
+from gsmerge.networks.apply import NetworkContext, decode_with_group_features
+from gsmerge.networks.checkpoint import Checkpoint
+from gsmerge.networks.cross_view_stats import cross_view_stats
+from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
+from gsmerge.networks.weights import NetworkWeights
+from gsmerge.plan import make_plan
+from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
+from gsmerge.runtime.record import Progress, record_run, stage
+from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
+from gsmerge.stages.assign import assign
+from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
+from gsmerge.stages.encode import correct, encode
+from gsmerge.stages.match import match
+from gsmerge.stages.merge import merge, refine
+from gsmerge.stages.segment import segment_scene
+from gsmerge.stages.superpixels import scene_saliency
+from gsmerge.states.extend import BatchReport
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
+
+SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSamples:
+    """Gaussians of every view on a coarse grid of pixels, with which groups of other views are compared."""
+
+    means: np.ndarray  # [v,h,w,3] float32, canonical
+    opacities: np.ndarray  # [v,h,w] float32, 0 where the pixel has no Gaussian
+    sh0: np.ndarray  # [v,h,w,3] float32
+
+    @staticmethod
+    def concat(parts: list[ViewSamples]) -> ViewSamples:
+        """Concatenate the views of all parts."""
+        names = [f.name for f in fields(ViewSamples)]
+        return ViewSamples(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureState:
+    """Feature Gaussians of all views so far; the frame is that of the first batch."""
+
+    merged: FeatureGaussians  # g, canonical, as the merger left them, which later batches are matched with
+    refined: FeatureGaussians  # the same after the refiner, which heads read
+    views: np.ndarray  # [g] int64, the view that each group's frame belongs to
+    num_members: np.ndarray  # [g] int64, Gaussians that became the group
+    saliency: np.ndarray  # [g] float64, mean corner response of its pixels, by which K is mixed
+    group: np.ndarray  # [g,n] float32, the numbers that describe each group
+    samples: ViewSamples  # of all views
+    cameras: Cameras  # the views, canonical, at the size of the first batch's
+    unseen: Gaussians  # canonical, that no view sees
+    frame: Frame  # from canonical to world
+    networks: NetworkWeights
+    about: Mapping[str, Any] = field(default_factory=dict)  # facts of plain JSON types
+
+    def __len__(self) -> int:
+        return len(self.refined)
+
+    def __repr__(self) -> str:
+        return f"FeatureState({len(self):,} Feature Gaussians of {len(self.cameras):,} views)"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _JoinContext(NetworkContext):
+    """The networks' inputs for groups of a batch and of a state; ``cameras`` are those of all views.
+
+    Each Feature Gaussian lists, in place of its members, the rows of the parts it was pooled from: Gaussians of the
+    batch, or groups. Members of earlier batches are not stored.
+    """
+
+    samples: ViewSamples  # of all views
+    part_views: np.ndarray  # [p] int64, the view of each part
+    part_members: np.ndarray  # [p] int64, Gaussians that became the part
+    part_weights: np.ndarray  # [p] sum of their opacities
+
+    def describe(self, features: FeatureGaussians) -> GroupFeatures:
+        """Compute the networks' inputs for Feature Gaussians, from the samples of all views."""
+        views, num_members = self.trace(features)
+        height, width = self.samples.opacities.shape[1:]
+        nothing = np.zeros((0, 0), np.float32)  # which statistics do not read
+        shown = Members(
+            means=self.samples.means.reshape(-1, 3), quats=nothing, scales=nothing,
+            opacities=self.samples.opacities.reshape(-1), sh0=self.samples.sh0.reshape(-1, 1, 3), shN=nothing,
+            footprints=nothing,
+        )  # fmt: skip
+        grid = resize_cameras(self.cameras, width, height)
+        stats = cross_view_stats(features.means, features.sh0, views, shown, grid)
+        return describe_features(features, views, num_members, stats, self.cameras)
+
+    def trace(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
+        """Find each Feature Gaussian's view ``[g]``, the one with most of its weight, and its number of members."""
+        starts, rows = features.starts, features.members
+        owners = np.repeat(np.arange(len(features)), np.diff(starts))
+        keys, places = np.unique(owners * len(self.cameras) + self.part_views[rows], return_inverse=True)
+        of_keys, sums = keys // len(self.cameras), np.bincount(places, self.part_weights[rows])
+        order = np.lexsort((keys, -sums, of_keys))
+        _, first = np.unique(of_keys[order], return_index=True)
+        num_members = np.bincount(owners, self.part_members[rows], len(features))
+        return keys[order[first]] % len(self.cameras), num_members.astype(np.int64)
+
+
+def extend_features(
+    state: FeatureState | None, scene: Scene, options: CompactOptions, *, progress: Progress | None = None
+) -> tuple[FeatureState, BatchReport]:
+    """Add a batch of views to a state, or begin one; see :func:`gsmerge.states.extend.extend`.
+
+    Raises UsageError if the settings ask for other networks than the state's, a budget, or a fit; ValueError if the
+    harmonics are of another degree.
+    """
+    for name in options.compact_only:
+        raise UsageError(f"{name}: goes with a whole scene, not with Feature Gaussians of several batches")
+    if options.budget.budget is not None:
+        raise UsageError(f"budget {options.budget.budget}: expected superpixels, of which compact makes k Gaussians")
+    if options.fit.fit != "none":
+        raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
+    options = replace(options, prepare=replace(options.prepare, poses="fixed", exposure="fixed"))
+    with use_threads(options.threads), record_run(progress) as record:
+        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
+        plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
+        weights = plan.networks
+        if weights is None or not weights.options.encoder or not weights.options.makes_children:
+            raise UsageError(f"recipe paper: expected an encoder and absolute outputs, {options.checkpoint} lacks them")
+        pictured, cameras = prepared.scene, in_float64(prepared.scene.cameras)
+        segmentation = segment_scene(pictured, plan.superpixels, None)
+        members = assign(pictured, segmentation.groups, draws=plan.draws)
+        context = NetworkContext(weights, members, cameras, plan.seed)
+        pooled = encode(pictured, members, segmentation.groups)
+        features = correct(pooled, members, cameras, context, weaken=False)
+        samples = sample_views(members, cameras, state)
+        saliency = group_saliency(features, members, scene_saliency(pictured.images))
+        if state is None:
+            merged = merge(features, match(features, plan.match), context)
+            of_merged = group_saliency(merged, members, scene_saliency(pictured.images))
+            made = _refine(merged, context, of_merged, samples, prepared.frame, plan.unseen)
+        else:
+            _check_degree(state, scene)
+            made = _join(state, features, saliency, context, samples, plan.match)
+            made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
+    numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
+    report = BatchReport(
+        **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, seconds=record.seconds,
+        choices=record.choices | plan.network_facts, notes=tuple(record.notes), options=options.to_dict(),
+    )  # fmt: skip
+    return replace(made, about={} if state is None else state.about), report
+
+
+def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
+    """Return the networks of a state as a checkpoint; UsageError if the options name others."""
+    stored = str(state.about.get("checkpoint"))
+    if options.checkpoint != stored:
+        raise UsageError(
+            f"checkpoint {options.checkpoint}: expected the networks that made the state ({stored}), whose latents it"
+            " holds; leave the checkpoint out, or begin a new state"
+        )
+    return Checkpoint(state.networks, Path(stored), __version__, {})
+
+
+def _check_degree(state: FeatureState, scene: Scene) -> None:
+    degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
+    if degree != expected:
+        raise UsageError(f"expected Gaussians with harmonics of degree {expected} as the state's, got degree {degree}")
+
+
+def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
+    """Sample the Gaussians shown at the centres of the cells of a grid, that of a state if there is one."""
+    shape = -(-cameras.height // SAMPLE_STEP), -(-cameras.width // SAMPLE_STEP)
+    height, width = shape if state is None else state.samples.opacities.shape[1:]
+    rows = ((2 * np.arange(height) + 1) * cameras.height) // (2 * height)
+    columns = ((2 * np.arange(width) + 1) * cameras.width) // (2 * width)
+    pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
+    ids = (np.arange(len(cameras))[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
+    if members.pixels is not None:
+        ids = np.full_like(ids, -1) if members.fronts is None else members.fronts.reshape(-1)[ids]
+    means, sh0 = members.means[ids], members.sh0[ids, 0]
+    usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
+    grid = len(cameras), height, width
+    return ViewSamples(
+        np.where(usable[:, None], means, 0).astype(np.float32).reshape(*grid, 3),
+        np.where(usable, members.opacities[ids], 0).astype(np.float32).reshape(grid),
+        np.where(usable[:, None], sh0, 0).astype(np.float32).reshape(*grid, 3),
+    )
+
+
+def _refine(
+    merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame,
+    unseen: Gaussians,
+) -> FeatureState:  # fmt: skip
+    """Refine merged Feature Gaussians, and describe them for the heads."""
+    refined = refine(merged, context)
+    with stage("decode"):
+        described = context.describe(refined)
+        traced = context.trace(refined) if isinstance(context, _JoinContext) else (None, np.diff(refined.starts))
+    return FeatureState(
+        merged=_without_members(merged),
+        refined=_without_members(refined),
+        views=described.views,
+        num_members=traced[1],
+        saliency=saliency,
+        group=np.asarray(described.group),
+        samples=samples,
+        cameras=context.cameras,
+        unseen=unseen,
+        frame=frame,
+        networks=cast("NetworkWeights", context.networks),
+    )
+
+
+def _join(
+    state: FeatureState, features: FeatureGaussians, saliency: np.ndarray, context: NetworkContext,
+    samples: ViewSamples, options: MatchOptions,
+) -> FeatureState:  # fmt: skip
+    """Match a batch's Feature Gaussians with those of a state, merge and refine them.
+
+    The state's come first, so that a cluster of the merger begins with one of them.
+    """
+    size, members = (state.cameras.width, state.cameras.height), context.members
+    cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
+    views = features.views + len(state.cameras)
+    parts = FeatureGaussians.concat([state.merged, _without_members(replace(features, views=views))])
+    samples = ViewSamples.concat([state.samples, samples])
+    rows = np.arange(len(parts))
+    parts = replace(parts, starts=np.arange(len(parts) + 1), members=rows.astype(np.int32))
+    sizes = np.concatenate([state.num_members, np.diff(features.starts)])
+    joined = _JoinContext(
+        networks=context.networks, members=members, cameras=cameras, seed=context.seed, samples=samples,
+        part_views=np.concatenate([state.views, views]), part_members=sizes, part_weights=np.asarray(parts.weights),
+    )  # fmt: skip
+    merged = merge(parts, _match_parts(parts, len(state), options), joined)
+    owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
+    weights = sizes[merged.members].astype(np.float64)
+    values = np.concatenate([state.saliency, saliency])[merged.members]
+    mean = np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
+    return _refine(merged, joined, mean, samples, state.frame, state.unseen)
+
+
+def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
+    """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of the state.
+
+    Clusters are the union of both matchings. For the second the state counts as one view and the batch as another, so
+    that each is compared with its nearest there.
+    """
+    rows = np.arange(len(parts))
+    across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
+    alone = np.where(rows < num_old, -1, parts.views)
+    within = match(replace(parts, views=alone, extinctions=np.where(rows < num_old, 0, parts.extinctions)), options)
+    leaders = [
+        np.unique(clusters, return_index=True, return_inverse=True)[1:] for clusters in (across, within.clusters)
+    ]
+    neighbors = np.stack([first[places] for first, places in leaders], 1)
+    return Matches(*connected_components(neighbors, np.ones(neighbors.shape), 0.5))
+
+
+def _without_members(features: FeatureGaussians) -> FeatureGaussians:
+    return replace(features, starts=np.zeros(len(features) + 1, np.int64), members=np.zeros(0, np.int32))
+
+
+def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
+    """Decode a state into ``k`` Gaussians of each group in the world frame, or a number mixed by their saliency.
+
+    Raises UsageError if the networks' heads do not make so many, or for a rule that needs the groups' members.
+    """
+    most = state.networks.options.max_children
+    if options.k == MIXED and options.k_rule == "distortion":
+        raise UsageError("k_rule distortion: expected saliency for Feature Gaussians, whose members are not kept")
+    if options.max_k > most:
+        raise UsageError(f"k: expected mixed or 1 to {most}, got {options.k}")
+    counts = np.full(len(state), options.max_k)
+    if options.k == MIXED:
+        counts = counts_by_saliency(state.saliency, options)
+    children, parents = repeat(state.refined, counts)
+    described = make_group_features(state.refined, state.views, state.group, state.cameras)
+    nothing = gaussian_members(children[:0], np.zeros(0, np.float32))
+    context = NetworkContext(state.networks, nothing, state.cameras)
+    gaussians = decode_with_group_features(children, parents, described, context)
+    gaussians = gaussians[gaussians.opacities >= options.min_opacity]
+    return state.frame.leave(Gaussians.concat([gaussians, state.unseen]))
+
+
+def feature_arrays(state: FeatureState) -> dict[str, np.ndarray]:
+    """Return the g Feature Gaussians and v views of a state by name, in the world's frame and unit.
+
+    docs/reference/formats.md says what each array is, with its shape and unit.
+    """
+    features, unit = state.refined, state.frame.unit
+    ones, cameras = state.frame.leave(feature_to_gaussians(features)), state.frame.leave_cameras(state.cameras)
+    return {
+        **{name: np.asarray(column) for name, column in vars(ones).items()},
+        "covars": features.covars.astype(np.float64) * unit**2,
+        "weights": features.weights,
+        "masses": features.masses.astype(np.float64) * unit**3,
+        "extinctions": features.extinctions.astype(np.float64) * unit**2,
+        "gains": features.gains,
+        "footprints": features.footprints.astype(np.float64) * unit,
+        "latents": np.asarray(features.latents),
+        "views": state.views,
+        "num_members": state.num_members,
+        "saliency": state.saliency,
+        "viewmats": cameras.viewmats,
+        "Ks": cameras.Ks,
+        "size": np.array([cameras.width, cameras.height]),
+    }
