@@ -2,7 +2,7 @@
 
 python benchmarks/online.py fern,apples,lightfield            # as in the paper: 84 views, in steps of 12
 python benchmarks/online.py fern,apples,lightfield --size 84  # the same views at once
-python benchmarks/online.py desk --views 0 --size 3 --set     # its own views alone, and the defaults without a fit
+python benchmarks/online.py desk --views 0 --size 3           # its own views alone
 
 The naive way keeps all Gaussians of all batches. Captures have fewer views than the paper's: they are repeated from
 jittered poses (benchmarks/many_views.py). Two tables are printed, means over the scenes: growth, and what is there in
@@ -83,7 +83,7 @@ def merge_all(plys: Sequence[Path], settings: dict[str, Any], states: Path) -> l
         report = compactor.extend(scene)
         spent, num_views = time.process_time() - start, num_views + report.num_views
         path = states / f"{number:03d}.gsm"
-        steps.append({"views": num_views, "groups": report.num_groups, "GB": peak_memory(), "processor": spent})
+        steps.append({"views": num_views, "groups": report.num_gaussians, "GB": peak_memory(), "processor": spent})
         compactor.save(path)
         steps[-1]["MB"] = path.stat().st_size / 1e6
     return steps
@@ -104,7 +104,7 @@ def measure(plys: Sequence[Path], targets: Targets, settings: dict[str, Any]) ->
         growth = {int(step["views"]): step | other for step, other in zip(merged, naive, strict=True)}
         for step, path in zip(growth.values(), sorted(Path(place).iterdir()), strict=True):
             compactor = Compactor.load(path)
-            ways = {f"K = {k}": compactor.decode(k=k, fit="none") for k in KS}
+            ways = {f"K = {k}": compactor.decode(k=k) for k in KS}
             step |= {way: len(gaussians) for way, gaussians in ways.items()}
     ways = {NAIVE: Gaussians.concat([read_scene(ply).gaussians for ply in plys]), **ways}
     costs = measure_costs(ways, targets.cameras, (1,), NEAR)

@@ -23,10 +23,10 @@ def main() -> None:
     compactor = gsmerge.Compactor()
     for first in range(0, len(scene), args.size):
         report = compactor.extend(subset(scene, range(first, min(first + args.size, len(scene)))))
-        print(f"{report.num_new} new groups, {report.num_covered} not needed: {report.num_groups} in all")
-    gaussians = compactor.decode(effort="fast")
-    gsmerge.write_ply(args.output, gaussians, overwrite=True)
-    print(f"{scene.num_gaussians} -> {len(gaussians)} Gaussians")
+        print(f"{report.num_input} -> {report.num_new} Gaussians: {report.num_gaussians} in all")
+    result = compactor.compact(effort="fast")
+    gsmerge.write_ply(args.output, result.gaussians, overwrite=True)
+    print(f"{scene.num_gaussians} -> {len(result.gaussians)} Gaussians")
 
 
 if __name__ == "__main__":

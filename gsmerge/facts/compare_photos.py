@@ -18,6 +18,7 @@ import numpy as np
 from gsmerge.facts.photo_change import PhotoChange, change_large, look_up
 from gsmerge.facts.place_cameras import sampled
 from gsmerge.facts.row_colors import add_row_colors, fill_gaps
+from gsmerge.facts.views import camera_kinds, subset
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import convolve
@@ -70,8 +71,7 @@ class Shown:
 def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
     """Mend the photos of a canonical scene, and replace what does not show it.
 
-    Returns the scene and the views whose photos show it, none if most photos do not; what masks leave out as a whole is
-    not among them. The record gets notes
+    Returns the scene and the views whose photos show it; there are none if most photos do not. The record gets notes
     and the choices ``photos_changed`` and ``photos_left_out``.
     """
     small, names = show_photos(scene), scene.names
@@ -98,13 +98,7 @@ def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]
     covers[odd] = True
     if scene.masks is not None:
         covers |= ~scene.masks
-    shown = [view for view in range(len(scene)) if view not in odd and not _is_left_out(scene, view)]
-    return _change(scene, changes, covers, pictures), tuple(shown)
-
-
-def _is_left_out(scene: Scene, view: int) -> bool:
-    """Return whether masks leave out a view as a whole."""
-    return scene.masks is not None and not scene.masks[view].any()
+    return _change(scene, changes, covers, pictures), tuple(view for view in range(len(scene)) if view not in odd)
 
 
 def _leave_out(scene: PicturedScene, odd: Sequence[int]) -> bool:
@@ -148,8 +142,8 @@ def _change(
 def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
     """Find the pixels ``[v,h,w]`` where changed photos differ from their own rows, and what these show ``[v,h,w,3]``.
 
-    Pixels without a row are as the nearest with one. Only where the rows' base colours differ are the Gaussians drawn,
-    which takes longer.
+    Pixels without a row are as the nearest with one. Only where the rows' base colours differ are each view's own
+    Gaussians drawn from its camera, which takes longer; a photo that looks as the drawing does not differ.
     """
 
     def differ(pictures: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -169,9 +163,19 @@ def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     if covers.any() or not inside.all():
         with record_part(silent=True):
             colored = add_row_colors(scene)
-        pictures = colored.images
-        covers = differ(pictures, inside if colored.masks is None else inside & colored.masks)
+        pictures, known = colored.images, inside if colored.masks is None else inside & colored.masks
+        covers = differ(pictures, known) & differ(_draw_own(scene), known)
     return covers, pictures
+
+
+def _draw_own(scene: Scene) -> np.ndarray:
+    """Draw the Gaussians of each camera's own pixels ``[v,h,w,3]``."""
+    kinds, drawn = camera_kinds(scene.cameras), np.empty((*scene.valid.shape, 3), np.float32)
+    for kind in range(kinds.max() + 1):
+        views = np.flatnonzero(kinds == kind).tolist()  # its layers
+        part = subset(scene, views)
+        drawn[views] = np.asarray(render(part.gaussians, part.cameras[[0]]).images).clip(0, 1)
+    return drawn
 
 
 def find_tones(shown: Shown, names: Sequence[str]) -> list[PhotoChange]:

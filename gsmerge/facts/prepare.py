@@ -205,7 +205,7 @@ def prepare(
 
 def _without_holes(prepared: Prepared) -> Prepared:
     """Return a copy with Gaussians also where the photos show something and no Gaussian is."""
-    scene, views = prepared.scene, list(prepared.reference.fit_views)
+    scene, views = prepared.scene, list(prepared.reference.score_views)  # whose photos show the scene
     shown = np.zeros(scene.images.shape[:3], bool)
     by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
     shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
@@ -237,9 +237,6 @@ def _prepare_others(
     scene, views = _with_pictures(canonical, blank_pictures)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views)
-    if views and scene.masks is not None:  # a view that masks leave out as a whole is drawn, and held by that
-        left_out = np.flatnonzero(~scene.masks.any((1, 2))).tolist()
-        reference = replace(reference, fit_views=tuple(sorted({*views, *left_out})))
     if not views:
         reference = Reference(RENDERS, every if given.images is None else (), every)
     unseen = scene.gaussians[:0]

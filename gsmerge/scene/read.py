@@ -299,9 +299,6 @@ def _make_load(
     masks = None if masks is None else masks[views]
     masks, described = check_masks(masks, files)
     more += described
-    if camera_file is not None and camera_file.pictured is not None:
-        left = camera_file.pictured[views][:, None, None]
-        masks = np.broadcast_to(left, (len(views), cameras.height, cameras.width))
     photos = images if len(images) else None
     scene = Scene(gaussians, cameras, photos, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
     frame = None if result.recovery is None else result.recovery.best.frame

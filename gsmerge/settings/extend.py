@@ -16,14 +16,17 @@ SUFFIX = ".gsm"  # of the file of a state
 class ExtendOptions(Settings):
     """Settings of how new views enter a state."""
 
-    max_views: int = setting(32, "Most views that a state keeps with their pictures, the farthest apart, for the fit "
+    max_views: int = setting(96, "Most views that a state keeps with their pictures, the farthest apart, for the fit "
         "when it is compacted.",
         "Three bytes per pixel of each.", least=1, most=10_000)  # fmt: skip
 
 
 def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendOptions]:
-    """Make the settings of a batch: those given, else those of a draft without a fit; raise ValueError for unknown ones."""
+    """Make the settings of a batch: those given, else of a draft without a fit; raise ValueError for unknown ones."""
     names = ExtendOptions.__dataclass_fields__.keys()
     given = {"effort": "draft", "fit": "none"} | dict(settings)
     extend_options = ExtendOptions(**{name: given.pop(name) for name in names if name in given})
-    return CompactOptions().with_settings(given), extend_options
+    options = CompactOptions().with_settings(given)
+    if options.budget.levels > 1:
+        raise ValueError("levels: go with a whole scene, not with views that come one after the other; use compact")
+    return options, extend_options

@@ -12,7 +12,7 @@ from gsmerge.runtime.record import Progress
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
-from gsmerge.states.features import FeatureState, decode_features, extend_features
+from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
 
@@ -26,24 +26,20 @@ def extend_state(
     ``recipe="paper"`` the first batch begins Feature Gaussians, and later ones go on with its networks. Raises
     ValueError if a setting is unknown, out of range, or impossible for the state or the scene.
     """
-    before = None if state is None else state.content
-    of_paper = isinstance(before, FeatureState) or (before is None and settings.get("recipe") == "paper")
-    if isinstance(before, Scene) and settings.get("recipe") == "paper":
-        raise UsageError("recipe paper: expected a state that began with it, found results; begin another state")
-    if of_paper:
-        settings = {"recipe": "paper", "effort": "default"} | dict(settings)
-    options, extend_options = batch_settings(settings)
-    content: Scene | FeatureState
-    if of_paper:
-        assert not isinstance(before, Scene)
-        content, report = extend_features(before, scene, options, progress=progress)
-    else:
-        assert not isinstance(before, FeatureState)
-        content, report = extend(before, scene, options, extend_options, progress=progress)
     about = {} if state is None else dict(state.about)
+    scene_before, features = (None, None) if state is None else (state.scene, state.features)
+    of_paper = settings.get("recipe") == "paper"
+    if of_paper and scene_before is not None:
+        raise UsageError("recipe paper: expected a state that began with it, found results; begin another state")
+    made: dict[str, Any] = {}
+    if of_paper or features is not None:
+        options, _ = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
+        made["features"], report = extend_features(features, scene, options, progress=progress)
+    else:
+        made["scene"], report = extend(scene_before, scene, *batch_settings(settings), progress=progress)
     about |= {"batches": [*about.get("batches", []), report.numbers]}
-    about |= {"pictures": sorted({*about.get("pictures", []), report.pictures}), "checkpoint": options.checkpoint}
-    return State(content, about), report
+    about |= {"pictures": sorted({*about.get("pictures", []), report.pictures})}
+    return State(about, **made), report
 
 
 class Compactor:
@@ -92,9 +88,11 @@ class Compactor:
         return 0 if self._state is None else len(self._state)
 
     @property
-    def content(self) -> Scene | FeatureState:
+    def state(self) -> State:
         """Results and views so far as a scene, or Feature Gaussians; ValueError before the first batch."""
-        return self._begun().content
+        if self._state is None:
+            raise ValueError("expected at least one batch of views, got none")
+        return self._state
 
     @property
     def batches(self) -> Sequence[Mapping[str, Any]]:
@@ -112,10 +110,9 @@ class Compactor:
         Raises:
             ValueError: If there was no batch yet, a setting is wrong, or the state is of Feature Gaussians.
         """
-        scene = self.content
-        if isinstance(scene, FeatureState):
+        if self.state.scene is None:
             raise ValueError("expected a state of results, found Feature Gaussians; decode makes Gaussians of them")
-        return compact(scene, progress=progress, **settings)
+        return compact(self.state.scene, progress=progress, **settings)
 
     def decode(self, **settings: Any) -> Gaussians:
         """Decode Feature Gaussians in the world frame.
@@ -127,10 +124,9 @@ class Compactor:
         Raises:
             ValueError: If there was no batch yet, a setting is wrong, or the state is one of results.
         """
-        features = self.content
-        if isinstance(features, Scene):
+        if self.state.features is None:
             raise ValueError('expected a state begun with recipe="paper", found results; compact makes others of them')
-        return decode_features(features, DecodeOptions(**settings))
+        return decode_features(self.state.features, DecodeOptions(**settings))
 
     def save(self, path: StrPath, *, overwrite: bool = False) -> None:
         """Write the state to a file.
@@ -139,9 +135,4 @@ class Compactor:
             ValueError: If there was no batch yet.
             SceneError: If the file exists or cannot be written.
         """
-        save_state(path, self._begun(), overwrite=overwrite)
-
-    def _begun(self) -> State:
-        if self._state is None:
-            raise ValueError("expected at least one batch of views, got none")
-        return self._state
+        save_state(path, self.state, overwrite=overwrite)

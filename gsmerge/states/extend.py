@@ -12,7 +12,6 @@ import numpy as np
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
-from gsmerge.errors import UsageError
 from gsmerge.facts.exposure import camera_distances
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
@@ -22,8 +21,6 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
-
-CAMERAS = 3  # times as many views as have pictures keep their cameras
 
 
 @dataclass(frozen=True)
@@ -72,28 +69,25 @@ def extend(
     Raises:
         ValueError: If a setting is impossible for the scene.
     """
-    if options.budget.levels > 1:
-        raise UsageError("levels: go with a whole scene, not with views that come one after the other; use compact")
     options = replace(options, prepare=replace(options.prepare, poses="fixed", exposure="fixed"))
-    with use_threads(options.threads), record_run(progress) as record:
+    with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
         result = compact_prepared(prepared, method, options)
     gaussians, views = result.gaussians.numpy(), _keep_pictures(prepared)
     if before is not None:
         gaussians, views = _join_gaussians(before.gaussians, gaussians), _join_views(before, views)
-    views = _limit_pictures(views, extend_options.max_views)
-    joined = replace(views, gaussians=gaussians)
+    joined = replace(subset(views, choose_far(views.cameras, extend_options.max_views)), gaussians=gaussians)
     report = BatchReport(
         num_views=len(scene),
         num_input=scene.num_gaussians,
         num_new=len(result.gaussians),
         num_gaussians=len(gaussians),
-        num_kept=len(joined) if joined.masks is None else int(joined.masks.any((1, 2)).sum()),
+        num_kept=len(joined),
         pictures=prepared.reference.name,
         seconds=result.report.seconds,
         choices=result.report.choices,
-        notes=tuple(record.notes or result.report.notes),
+        notes=tuple(text for text in result.report.notes if text != result.report.worse),  # that is for results
         options=options.to_dict() | asdict(extend_options),
     )
     return joined, report
@@ -135,37 +129,12 @@ def _join_views(first: Scene, second: Scene) -> Scene:
             name, number = f"{number}-{name.split('-', 1)[-1] if number > 2 else name}", number + 1
         names.append(name)
         taken.add(name)
-    masks = [
-        np.ones(part.shape[:3], bool) if given is None else given
-        for part, given in ((first.images, first.masks), (images, None))
-    ]
     return replace(
         first,
         cameras=concat_cameras(first.cameras, cameras),
         images=np.concatenate([first.images, images]),
         names=(*first.names, *names),
-        masks=np.concatenate(masks),
     )
-
-
-def _limit_pictures(views: Scene, max_views: int) -> Scene:
-    """Keep at most so many pictures, of the views that are the farthest apart; of others masks leave out everything.
-
-    At most ``CAMERAS`` times as many views keep their cameras.
-    """
-    if views.images is None:
-        return views
-    ids = choose_far(views.cameras, CAMERAS * max_views)
-    views = subset(views, ids)
-    assert views.images is not None
-    with_picture = np.ones(len(views), bool) if views.masks is None else views.masks.any((1, 2))
-    places = np.flatnonzero(with_picture)
-    kept = np.zeros(len(views), bool)
-    kept[places[choose_far(views.cameras[places], max_views)]] = True
-    if kept.all():
-        return replace(views, masks=None)
-    shape = kept[:, None, None]
-    return replace(views, images=views.images * shape[..., None], masks=np.broadcast_to(shape, views.images.shape[:3]))
 
 
 def choose_far(cameras: Cameras, count: int) -> list[int]:
@@ -182,5 +151,7 @@ def choose_far(cameras: Cameras, count: int) -> list[int]:
     distances = camera_distances(replace(cameras, viewmats=viewmats))
     chosen = [0][:count]
     while len(chosen) < count:
-        chosen.append(int(np.argmax(distances[chosen].min(0))))
+        nearest = distances[chosen].min(0)
+        nearest[chosen] = -1
+        chosen.append(int(np.argmax(nearest)))
     return sorted(chosen)

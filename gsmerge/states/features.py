@@ -6,10 +6,9 @@ of them, of one batch the same bytes as ``compact`` does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -72,7 +71,7 @@ class FeatureState:
     unseen: Gaussians  # canonical, that no view sees
     frame: Frame  # from canonical to world
     networks: NetworkWeights
-    about: Mapping[str, Any] = field(default_factory=dict)  # facts of plain JSON types
+    checkpoint: str = ""  # the name by which they were given
 
     def __len__(self) -> int:
         return len(self.refined)
@@ -162,12 +161,12 @@ def extend_features(
         **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, seconds=record.seconds,
         choices=record.choices | plan.network_facts, notes=tuple(record.notes), options=options.to_dict(),
     )  # fmt: skip
-    return replace(made, about={} if state is None else state.about), report
+    return replace(made, checkpoint=options.checkpoint), report
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
     """Return the networks of a state as a checkpoint; UsageError if the options name others."""
-    stored = str(state.about.get("checkpoint"))
+    stored = state.checkpoint
     if options.checkpoint != stored:
         raise UsageError(
             f"checkpoint {options.checkpoint}: expected the networks that made the state ({stored}), whose latents it"

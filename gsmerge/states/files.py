@@ -26,10 +26,11 @@ from gsmerge.runtime.memory import human_bytes, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
+from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.compactor import extend_state
-from gsmerge.states.features import FeatureState, decode_features, feature_arrays
+from gsmerge.states.features import decode_features, feature_arrays
 from gsmerge.states.state_file import load_state, save_state
 
 ARRAYS = ".npz"  # ending of a file of Feature Gaussians as arrays
@@ -54,6 +55,10 @@ def extend_file(
     setting is unknown, out of range, or requires what the state or the scene does not have.
     """
     start, identity = perf_counter(), _file_identity(path)
+    try:
+        batch_settings(settings)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
     state = None if identity is None else load_state(path)
     sha256 = file_sha256(*files.plys)
     known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
@@ -66,10 +71,7 @@ def extend_file(
         loaded = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
-        try:
-            state, report = extend_state(state, load.scene, settings, progress=progress)
-        except ValueError as error:
-            raise error if isinstance(error, UsageError) else UsageError(str(error)) from error
+        state, report = extend_state(state, load.scene, settings, progress=progress)
         *earlier, last = state.about["batches"]
         comments = list(dict.fromkeys([*state.about.get("comments", []), *load.comments]))
         about = {**state.about, "batches": [*earlier, last | {"sha256": sha256}], "comments": comments}
@@ -131,8 +133,9 @@ def decode_file(
     networks do not make.
     """
     start, state = perf_counter(), load_state(path)
-    features, batches = state.content, state.about["batches"]
-    assert isinstance(features, FeatureState)
+    features, batches = state.features, state.about["batches"]
+    if features is None:
+        raise SceneError(path, "expected Feature Gaussians, found results", "compact it as a scene")
     num_input = sum(int(batch.get("num_input", 0)) for batch in batches)
     given = {"path": str(path), "bytes": path.stat().st_size, "num_groups": len(features), "num_gaussians": num_input}
     document: dict[str, Any] = {**document_head(), "input": given | {"batches": batches}, "k": options.k}
@@ -175,8 +178,8 @@ def convert_features(path: Path, out: Path, *, overwrite: bool = False) -> dict[
 
     Raises SceneError if a file cannot be read or written, or holds results.
     """
-    features = load_state(path).content
-    if not isinstance(features, FeatureState):
+    features = load_state(path).features
+    if features is None:
         raise SceneError(path, "expected Feature Gaussians, found results", "name a .ply, or another format of scenes")
     arrays = feature_arrays(features)
     with atomic_output(out, overwrite=overwrite) as temporary, ZipFile(temporary, "w") as archive:

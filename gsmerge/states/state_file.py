@@ -35,19 +35,21 @@ MOST = 1e37  # of any number: float32 ends at 3e38
 class State:
     """What batches of views became: results in a scene, or Feature Gaussians."""
 
-    content: Scene | FeatureState
     about: Mapping[str, Any]  # plain JSON types: `batches`, a report of each
+    scene: Scene | None = None
+    features: FeatureState | None = None  # where there is no scene
 
     def __len__(self) -> int:
-        return len(self.content.gaussians if isinstance(self.content, Scene) else self.content)
+        return len(self.scene.gaussians) if self.scene is not None else len(self.features or ())
 
 
 def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
     """Write a state to a file, whole or not at all; SceneError if the file exists or cannot be written."""
-    if isinstance(state.content, Scene):
-        write_scene(path, state.content, state.about, overwrite=overwrite)
+    if state.scene is not None:
+        write_scene(path, state.scene, state.about, overwrite=overwrite)
         return
-    features = state.content
+    features = state.features
+    assert features is not None
     arrays: dict[str, np.ndarray] = {f"merged.{name}": getattr(features.merged, name) for name in COLUMNS}
     arrays |= {f"refined.{name}": getattr(features.refined, name) for name in CORRECTED}
     arrays |= {name: getattr(features, name) for name in ("views", "num_members", "saliency", "group")}
@@ -58,7 +60,8 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
     arrays |= {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "merged.views": features.merged.views}
     arrays["origin"] = frame.origin
     header = {"kind": FEATURES, "width": cameras.width, "height": cameras.height, "names": [], "unit": frame.unit}
-    header |= {"networks": asdict(features.networks.options), "about": dict(state.about)}
+    header |= {"networks": asdict(features.networks.options), "checkpoint": features.checkpoint}
+    header |= {"about": dict(state.about)}
     write_gsm(path, header, arrays, overwrite=overwrite)
 
 
@@ -74,8 +77,8 @@ def load_state(path: StrPath) -> State:
     if not isinstance(batches, list) or not all(isinstance(batch, dict) for batch in batches):
         raise file.error("about: expected a list of batches in the header, found none")
     if file.header["kind"] == FEATURES:
-        return State(replace(_read_features(file), about=about), about)
-    return State(load_scene(path).scene, about)
+        return State(about, features=_read_features(file))
+    return State(about, load_scene(path).scene)
 
 
 def holds_features(path: Path) -> bool:
@@ -131,6 +134,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         unseen=Gaussians(*(_numbers(file, f"unseen.{name}", n, *shape) for name, shape in parts.items())),
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,
+        checkpoint=str(file.header.get("checkpoint")),
     )
 
 

@@ -29,7 +29,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "render --path spline": ("walk", "--frames", "3"),
 }
 OTHERS: dict[str, tuple[str, ...]] = {  # that take no scene, or several
-    "compact a state": ("decoded.ply",),
+    "compact a state": ("decoded.ply", "--effort", "draft"),
     "extend": ("state.gsm", "--set", "superpixels=100"),
     "generate": ("made", "--scenes", "1", "--views", "3", "--size", "24x16"),
 }
@@ -59,7 +59,7 @@ def call(command: str, scene: Path) -> list[object]:
     output, *rest = (WRITERS | OTHERS)[command]
     if command == "compact a state":
         if not (scene / "kept.gsm").exists():
-            small = ["--set", "superpixels=60", "--set", "replay=0", "--quiet"]
+            small = ["--set", "superpixels=60", "--quiet"]
             assert main(["extend", str(scene / "kept.gsm"), str(scene), *small]) == 0
         return ["compact", scene / "kept.gsm", "-o", scene / output]
     if command == "extend":

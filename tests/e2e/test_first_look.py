@@ -90,9 +90,9 @@ def test_threads_of_the_environment(smallest_copy: Path, monkeypatch: pytest.Mon
     assert_refused(run("inspect", smallest_copy), 2, "GSMERGE_THREADS", "'0'")
 
 
-def test_the_page_of_joined_files_is_the_result_s(smallest_scene: Path, tmp_path: Path, opened: list[str]) -> None:
+def test_a_state_has_a_page_as_a_scene_has(smallest_scene: Path, tmp_path: Path, opened: list[str]) -> None:
     state = tmp_path / "room.gsm"
-    assert main(["extend", str(state), str(smallest_scene), "--set", "superpixels=60", "--set", "replay=0", "-q"]) == 0
+    assert main(["extend", str(state), str(smallest_scene), "--set", "superpixels=60", "-q"]) == 0
     assert main([str(state), "-q"]) == 0
     assert [page.parent for page in pages_in(tmp_path)] == [tmp_path]
     assert len(opened) == 1

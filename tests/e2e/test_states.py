@@ -1,160 +1,308 @@
-"""A state of one batch, compacted as its scene is, and outputs in other formats."""
+"""``extend``, and what every command makes of a state, on scenes that the project makes itself."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import shutil
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hostile.gsm_files import Spoil, damaged, with_about
-from sweeps import sweep
+from hostile.gsm_files import Spoil, cut, damaged
+from scripts import load_script
 
 import gsmerge
+from gsmerge.cli import main
+from gsmerge.errors import SceneError
+from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.held_out import read_held_out
+from gsmerge.scene.read import load_scene
+from gsmerge.states.state_file import load_state, save_state
 
-from .conftest import Run, assert_refused
+from .conftest import Run, assert_refused, listing
 
-SMALL = ("--set", "superpixels=40")
-PLAIN = ("--fit", "none")
-
-
-@pytest.fixture(scope="module")
-def state(smallest_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The made scene as a state, by the command line. Read only."""
-    from gsmerge.cli import main
-
-    out = tmp_path_factory.mktemp("state") / "scene.gsm"
-    assert main(["extend", str(out), str(smallest_scene), *map(str, SMALL), "--quiet"]) == 0
-    return out
+SMALL = ("--set", "superpixels=60", "--set", "checkpoint=none")
+PAPER = ("--set", "recipe=paper", "--set", "superpixels=60")
+PATIENCE = 120  # seconds, on a machine that is busy with other things
 
 
-def test_it_is_compacted_as_its_scene_is(state: Path, smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    """Byte for byte; unless told otherwise with what the batch was asked for."""
-    asked, wish = tmp_path / "asked.gsm", ("--set", "budget=100", "--set", "k=2")
-    run("extend", asked, smallest_scene, *SMALL, *wish, code=0)
-    mixed = ("--k", "mixed", "--set", "k_low=20", "--set", "k_rule=distortion")
-    for number, (kept, now, then) in enumerate(((state, mixed, mixed), (asked, (), wish))):
-        one, other = tmp_path / f"one{number}.ply", tmp_path / f"other{number}.ply"
-        run("compact", kept, *PLAIN, *now, "-o", one, code=0)
-        run("compact", smallest_scene, *PLAIN, *SMALL, *then, "-o", other, code=0)
-        assert one.read_bytes() == other.read_bytes()
+@pytest.fixture(scope="session")
+def walks(make_scene: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[Path]]:
+    """Two scenes of the same room, three and four views of 24 x 16. Read only, which is checked."""
+    folder = tmp_path_factory.mktemp("walks")
+    scenes = [make_scene(folder / f"walk{n}", num_views=3 + n, width=24, height=16, seed=0) for n in range(2)]
+    before = digests(folder)
+    yield scenes
+    assert digests(folder) == before
 
 
-def test_feature_gaussians_as_arrays(state: Path, tmp_path: Path, run: Run) -> None:
-    out = tmp_path / "features.npz"
-    document = json.loads(run("convert", state, out, "--json", code=0).out)
-    with np.load(out) as arrays:
-        count = len(arrays["means"])
-        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
-    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
-    assert_refused(run("convert", state, out), 2, "features.npz", "--overwrite")
-    assert f"{count:,} Feature Gaussians" in run("convert", state, out, "--overwrite", code=0).out
-    assert run("convert", state, out, "--overwrite", "--quiet", code=0).out == ""
+@pytest.fixture(scope="session")
+def states(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The states after one and after two batches. Read only."""
+    folder = tmp_path_factory.mktemp("states")
+    assert main(["extend", str(folder / "1.gsm"), str(walks[0]), *SMALL, "--quiet"]) == 0
+    shutil.copy(folder / "1.gsm", folder / "2.gsm")
+    assert main(["extend", str(folder / "2.gsm"), str(walks[1]), *SMALL, "--quiet"]) == 0
+    return [folder / "1.gsm", folder / "2.gsm"]
 
 
-def test_what_a_state_is_not_made_into(state: Path, tmp_path: Path, run: Run) -> None:
-    for more, name, found in (
-        ((), "a.ply", "a.ply"), (("--up", "z"), "a.npz", "--up"), (("--cameras", "a.json"), "a.npz", "--cameras"),
-    ):  # fmt: skip
-        assert_refused(run("convert", state, tmp_path / name, *more), 2, found, "state")
-    assert_refused(run("convert", state, state, tmp_path / "a.npz"), 2, state, "alone", 2)
-    assert_refused(run("compact", state, "-o", tmp_path / "site"), 2, tmp_path / "site", state, "convert")
-    assert not list(tmp_path.iterdir())
-    damaged = tmp_path / "a.gsm"
-    damaged.write_bytes(state.read_bytes()[:1000])
-    assert_refused(run("convert", damaged, tmp_path / "a.npz"), 3, "a.gsm")
+@pytest.fixture(scope="session")
+def features(walks: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Feature Gaussians of two batches. Read only."""
+    path = tmp_path_factory.mktemp("features") / "room.gsm"
+    assert main(["extend", str(path), *map(str, walks), *PAPER, "--quiet"]) == 0
+    return path
 
 
-def test_no_files_of_the_scene_are_needed(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    scene, kept = Path(shutil.copytree(smallest_scene, tmp_path / "scene")), tmp_path / "alone.gsm"
-    run("extend", kept, scene / "scene.ply", *SMALL, code=0)
-    shutil.rmtree(scene)
-    outcome = run("compact", kept, *PLAIN, code=0)
-    assert outcome.out.count("\n") == 1
-    assert "groups ->" in outcome.out
-    assert len(gsmerge.read_ply(tmp_path / "alone.compact.ply").gaussians) > 50
+@pytest.fixture
+def state(states: list[Path], tmp_path: Path) -> Path:
+    """A state of one batch that a test may spoil."""
+    (tmp_path / "work").mkdir()
+    return Path(shutil.copy(states[0], tmp_path / "work" / "state.gsm"))
 
 
-def test_the_reports(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    kept, out = tmp_path / "scene.gsm", tmp_path / "out.ply"
-    (document,) = json.loads(run("extend", kept, smallest_scene, *SMALL, "--json").out)["batches"]
-    digest = hashlib.sha256((smallest_scene / "scene.ply").read_bytes()).hexdigest()
-    assert document["num_input"] == 1_152
-    assert document["state"]["bytes"] == kept.stat().st_size
-    document = json.loads(run("compact", kept, *PLAIN, "--k", 2, "-o", out, "--json").out)
-    assert document["input"]["num_gaussians"] == 1_152
-    assert document["input"]["state"]["source"]["sha256"] == digest
-    assert document["input"]["state"]["source"]["name"] == "scene.ply"
-    assert document["output"]["bytes"] == out.stat().st_size
-    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians)
-    assert set(document["seconds"]) == {"import", "read", "decode", "write"}
+def digests(folder: Path) -> dict[str, str]:
+    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_no_folder_of_this_machine_is_in_the_file(state: Path, smallest_scene: Path) -> None:
-    assert str(smallest_scene.parent).encode() not in state.read_bytes()
+# batches
+
+
+def test_several_batches_in_order(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    """The states are those of two batches, made here for the module."""
+    outcome = run("extend", tmp_path / "state.gsm", *walks, *SMALL)
+    assert (outcome.code, outcome.out.count("\n")) == (0, 2), outcome.err
+    first, second = outcome.out.splitlines()
+    assert "state.gsm: batch 1, 3 views, 1,152 ->" in first
+    assert "state.gsm: batch 2, 4 views" in second
+    assert list(listing(tmp_path)) == ["state.gsm"]
+    assert (tmp_path / "state.gsm").read_bytes() == states[1].read_bytes()
+
+
+def test_json_is_all_there_is_on_stdout(walks: list[Path], tmp_path: Path, run: Run) -> None:
+    state = tmp_path / "state.gsm"
+    outcome = run("extend", state, *walks, *SMALL, "--json")
+    assert (outcome.code, outcome.err) == (0, "")
+    batches = json.loads(outcome.out)["batches"]
+    assert [one["state"]["num_batches"] for one in batches] == [1, 2]
+    assert batches[1]["state"]["bytes"] == state.stat().st_size
+    for one, walk, num_views in zip(batches, walks, (3, 4), strict=True):
+        assert one["schema_version"] == 1
+        assert one["tool"]["version"] == gsmerge.__version__
+        assert Path(one["input"]["path"]) == walk / "scene.ply"
+        assert one["num_input"] == num_views * 24 * 16
+        assert one["options"]["superpixels"] == 60
+        assert {"load", "read", "write"} <= set(one["seconds"])
+        assert one["notes"] == []
+    assert "import" in batches[0]["seconds"]
+    assert "import" not in batches[1]["seconds"]
+    kept = load_state(state).about["batches"]
+    assert kept == [{name: one[name] for name in kept[0] if name != "sha256"} | {"sha256": one["input"]["sha256"]}
+                    for one in batches]  # fmt: skip
+
+
+def test_a_batch_is_added_once(states: list[Path], state: Path, walks: list[Path], run: Run) -> None:
+    """Also under another name."""
+    again = Path(shutil.copytree(walks[0], state.parent / "again"))
+    outcome = run("extend", state, again, *SMALL, code=0)
+    assert ("batch 1 of state.gsm" in outcome.err, "unchanged" in outcome.out) == (True, True)
+    assert state.read_bytes() == states[0].read_bytes()
+
+
+def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, run: Run) -> None:
+    scene = Path(shutil.copytree(walks[1], tmp_path / "scene"))
+    moved = shutil.move(scene / "transforms.json", tmp_path / "poses.json")
+    run("extend", state, scene / "scene.ply", "--cameras", moved, "--images", scene / "images", code=0)
+    assert len(load_scene(state).scene) == 7
+
+
+# what a state is, for the other commands: a scene
+
+
+def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    """Any budget, a score, cameras beside the result, levels, other formats; without the files of the batches."""
+    alone, out = Path(shutil.copy(states[1], tmp_path / "alone.gsm")), tmp_path / "out.ply"
+    few = ("--budget", "40", "--set", "fit_steps=4")
+    document = json.loads(run("compact", alone, *few, "--strict", "-o", out, "--json").out)
+    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians) == 40
+    assert document["psnr_input_views"]["before"] > 15
+    assert len(gsmerge.read_cameras(tmp_path / "out.cameras.json")) == 7
+    for words in (
+        ("compact", alone, *few, "-o", tmp_path / "small.spz"),
+        ("compact", alone, *few, "-o", tmp_path / "colmap"),
+        ("compact", alone, *few, "-o", tmp_path / "site"),
+        ("inspect", alone),
+        ("render", alone, "-o", tmp_path / "a.png"),
+        ("evaluate", alone, out, "--lpips", "none"),
+        ("view", alone, out, "-o", tmp_path / "page.html", "--no-open"),
+        ("convert", alone, tmp_path / "whole.ply"),
+    ):
+        run(*words, code=0)
+    whole = gsmerge.read_ply(tmp_path / "whole.ply").gaussians
+    assert len(whole) == len(load_state(alone))
+
+
+def test_a_word_makes_a_result_and_its_page(state: Path, run: Run) -> None:
+    run(state, "--effort", "draft", "--quiet", code=0)
+    assert {"state.compact.ply", "state.compact.compare.html"} <= set(listing(state.parent))
+
+
+def test_no_folder_of_this_machine_is_in_the_file(states: list[Path], walks: list[Path]) -> None:
+    assert str(walks[0].parent).encode() not in states[1].read_bytes()
 
 
 def test_comments_of_the_source_are_copied_as_by_compact(state: Path, tmp_path: Path, run: Run) -> None:
     """How to render the Gaussians, and nothing else: neither cameras nor megabytes."""
-    path, out = Path(shutil.copy(state, tmp_path / "scene.gsm")), tmp_path / "out.ply"
+    held, out = load_state(state), tmp_path / "out.ply"
     long = [f"SplatRenderMode: {i:01000}" for i in range(2000)]
     cameras = ["gsmerge cameras: AAAA", "of no use", 5, None, "SplatRenderMode: mip\nelement vertex 1"]
-    with_about(source={"comments": [*long, *cameras, "SplatRenderMode: mip"]})(path)
-    run("compact", path, *PLAIN, "-o", out, code=0)
-    assert gsmerge.read_ply(out).info.comments == ("gsmerge result", "SplatRenderMode: mip")
-    run("inspect", out, code=0)
+    about = {**held.about, "comments": [*long, *cameras, "SplatRenderMode: mip"]}
+    save_state(state, replace(held, about=about), overwrite=True)
+    run("compact", state, "--effort", "draft", "-o", out, code=0)
+    comments = [line for line in gsmerge.read_ply(out).info.comments if not line.startswith("gsmerge cameras")]
+    assert comments == ["gsmerge result", "SplatRenderMode: mip"]
 
 
-@sweep("ending", [".sog", ".spz", ".splat", ".glb"])
-def test_other_formats_by_name(ending: str, state: Path, smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    one, other = tmp_path / f"one{ending}", tmp_path / f"other{ending}"
-    run("compact", state, *PLAIN, "-o", one, code=0)
-    document = json.loads(run("compact", smallest_scene, "--fit", "none", *SMALL, "-o", other, "--json").out)
-    assert one.read_bytes() == other.read_bytes()
-    assert document["output"]["bytes"] == other.stat().st_size
-    assert not one.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment opacity")
-    assert json.loads(run("inspect", other, "--json").out)["bytes"] == other.stat().st_size
-    run("render", smallest_scene, other, "-o", tmp_path / "a.png", code=0)
-    assert f"other{ending}" in run("evaluate", smallest_scene, other, "--lpips", "none").out
+# Feature Gaussians
 
 
-def test_one_per_pixel_in_another_format(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
-    whole, out = tmp_path / "whole.spz", tmp_path / "out.ply"
-    gsmerge.write_gaussians(whole, gsmerge.read_scene(smallest_scene).gaussians)
-    places = ("--cameras", smallest_scene / "transforms.json", "--images", smallest_scene / "images")
-    run("compact", whole, *places, "--fit", "none", *SMALL, "-o", out, code=0)
-    assert len(gsmerge.read_ply(out).gaussians) > 10
+@pytest.mark.parametrize("k", ["1", "4", "mixed"])
+def test_feature_gaussians_are_decoded(k: str, features: Path, tmp_path: Path, run: Run) -> None:
+    out, words = tmp_path / "a.ply", ("--k", k, "-o", tmp_path / "a.ply")
+    most = json.loads(run("compact", features, *words, "--dry-run", "--json", code=0).out)["output"]
+    assert listing(tmp_path) == {}
+    document = json.loads(run("compact", features, *words, "--json", code=0).out)
+    assert document["input"]["num_gaussians"] == 7 * 24 * 16
+    assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians) <= most["num_gaussians_at_most"]
+    assert set(document["seconds"]) == {"import", "read", "decode", "write"}
+    assert "Feature Gaussians ->" in run("compact", features, *words, "--overwrite", code=0).out
 
 
-def test_no_normals(state: Path, tmp_path: Path, run: Run) -> None:
-    sizes = []
-    for name, extra in {"a": (), "b": ("--set", "normals=false")}.items():
-        assert run("compact", state, *PLAIN, "-o", tmp_path / f"{name}.ply", *extra).code == 0
-        sizes.append(gsmerge.read_ply(tmp_path / f"{name}.ply").info)
-    assert sizes[0].bytes_by_attribute["normals"] == 12 * sizes[0].count
-    assert "normals" not in sizes[1].bytes_by_attribute
-    assert sizes[1].count == sizes[0].count
+def test_feature_gaussians_as_arrays(features: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "features.npz"
+    document = json.loads(run("convert", features, out, "--json", code=0).out)
+    with np.load(out) as arrays:
+        count = len(arrays["means"])
+        assert {name: list(array.shape) for name, array in arrays.items()} == document["output"]["arrays"]
+    assert (document["output"]["num_groups"], document["output"]["bytes"]) == (count, out.stat().st_size)
+    assert_refused(run("convert", features, out), 2, "features.npz", "--overwrite")
+    assert f"{count:,} Feature Gaussians" in run("convert", features, out, "--overwrite", code=0).out
+    assert "Feature Gaussians" in run("inspect", features, code=0).out
 
 
-@pytest.mark.parametrize(
-    ("spoil", "found"),
-    [(damaged("features.sh0"), "features.sh0"), (with_about(options={"neighbors": 10**9}), "neighbors")],
-    ids=["damaged", "a setting without end"],
-)
-def test_what_nobody_wrote_is_refused_by_all(
-    spoil: Spoil, found: str, state: Path, smallest_scene: Path, tmp_path: Path, run: Run
-) -> None:
-    path = Path(shutil.copy(state, tmp_path / "scene.gsm"))
-    spoil(path)
-    before = path.read_bytes()
-    for command in (
-        ("compact", path, "-o", tmp_path / "out.ply"),
-        ("convert", path, tmp_path / "out.npz"),
-        ("extend", path, smallest_scene),
-        ("inspect", path),
+def test_what_feature_gaussians_are_not_made_into(features: Path, states: list[Path], tmp_path: Path, run: Run) -> None:
+    for words, place, *found in (
+        (("compact", features, "--budget", "10"), "--budget", features),
+        (("compact", features, states[0], "-o", tmp_path / "a.ply"), features, "alone", 2),
+        (("compact", features, "--k", "8", "-o", tmp_path / "a.ply"), "k", "1 to 4"),
+        (("convert", states[0], states[0], tmp_path / "a.npz"), tmp_path / "a.npz", ".gsm"),
     ):
-        assert found in run(*command, code=3).err
-    assert path.read_bytes() == before
-    assert [file.name for file in tmp_path.iterdir()] == ["scene.gsm"]
+        assert_refused(run(*words), 2, place, *found)
+    assert_refused(run("convert", states[0], tmp_path / "a.npz"), 3, states[0], "Feature Gaussians", "results")
+    assert_refused(run("convert", features, tmp_path / "a.ply"), 3, features, "results", "Feature Gaussians")
+    assert listing(tmp_path) == {}
+
+
+@pytest.mark.slow
+def test_the_papers_online_experiment(
+    walks: list[Path], tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The naive way beside K = 1, 2 and 4, after each batch and in the end, by one run of one command."""
+    monkeypatch.syspath_prepend(str(root / "benchmarks"))
+    online = load_script(root / "benchmarks" / "online.py")
+    views = read_held_out(load_scene(walks[0]), walks[0] / "targets")
+    targets = online.Targets(views.images, views.cameras, np.ones(views.images.shape[:3], bool))
+    monkeypatch.setattr(online, "scene_folders", lambda names: [Path(name) for name in names.split(",")])
+    monkeypatch.setattr(online, "make_batches", lambda *_: [walk / "scene.ply" for walk in walks])
+    monkeypatch.setattr(online, "read_held_out", lambda folder: targets)
+    monkeypatch.setattr(online, "in_own_process", lambda run, *given: run(*given))
+    monkeypatch.setattr(online, "lpips_available", lambda net: False)
+    online.main(["one,two", "--out", str(tmp_path / "online.svg")])
+    lines = capsys.readouterr().out.splitlines()
+    growth, ends = json.loads(lines[1])["one"]
+    assert [(views, step["naive"]) for views, step in growth.items()] == [("3", 1152), ("7", 2688)]
+    for step in growth.values():
+        assert step["K = 1"] <= step["groups"] < step["K = 2"] < step["K = 4"] < step["naive"]
+    assert growth["3"]["groups"] < growth["7"]["groups"]
+    assert {way: end["count"] for way, end in ends.items()} == {way: growth["7"][way] for way in online.WAYS}
+    kept = gsmerge.Gaussians.concat([gsmerge.read_scene(walk).gaussians for walk in walks])
+    assert ends["naive"]["PSNR"] == online.score(kept, targets)[0]
+    rows = [line.strip("|").split("|") for line in lines if line.startswith("|")]
+    assert [row[0] for row in rows[2:4]] == ["3", "7"]
+    assert [row[0] for row in rows[6:]] == [scene for scene in ("one", "two", "mean") for _ in range(4)]
+    assert rows[6][2:6] == rows[10][2:6] == rows[14][2:6]
+    assert "</svg>" in (tmp_path / "online.svg").read_text()
+
+
+# what may go wrong
+
+
+@pytest.mark.parametrize("spoil", [cut(0.5), damaged("sh0")], ids=["half", "a changed byte"])
+def test_a_damaged_state_is_refused_by_all(spoil: Spoil, state: Path, walks: list[Path], run: Run) -> None:
+    spoil(state)
+    (out := state.parent / "out.ply").write_text("precious")
+    before = digests(state.parent)
+    for words in (
+        ("extend", state, walks[1]), ("compact", state, "-o", out, "--overwrite"), ("inspect", state),
+        ("convert", state, out, "--overwrite"), ("convert", state, state.parent / "a.npz"),
+    ):  # fmt: skip
+        assert_refused(run(*words), 3, state)
+    assert digests(state.parent) == before
+
+
+def test_batches_before_a_broken_one_stay(states: list[Path], walks: list[Path], tmp_path: Path, run: Run) -> None:
+    broken = Path(shutil.copytree(walks[1], tmp_path / "broken"))
+    (broken / "scene.ply").write_bytes(b"ply\n")
+    outcome = run("extend", tmp_path / "state.gsm", walks[0], broken, *SMALL)
+    assert (outcome.code, outcome.err.count("\n")) == (3, 1)
+    assert (tmp_path / "state.gsm").read_bytes() == states[0].read_bytes()
+    run("extend", tmp_path / "state.gsm", walks[1], *SMALL, code=0)
+    assert (tmp_path / "state.gsm").read_bytes() == states[1].read_bytes()
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_two_that_end_together_lose_no_batch(
+    exists: bool, state: Path, walks: list[Path], make_scene: Callable[..., Path], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """Both have read the state before either goes on; whoever may rename waits until the other may as well, or not."""
+    import gsmerge.io.atomic as atomic
+    import gsmerge.states.files as files
+
+    path = state if exists else tmp_path / "new.gsm"
+    before = len(load_state(path).about["batches"]) if exists else 0
+    scenes = [walks[1], make_scene(tmp_path / "third", num_views=2, width=24, height=16, seed=0)]
+    extended, renamed = files.extend_state, atomic._rename_all
+    both_read, both_rename = threading.Barrier(2), threading.Barrier(2)
+
+    def extend_together(*arguments: Any, **named: Any) -> Any:
+        both_read.wait(PATIENCE)
+        return extended(*arguments, **named)
+
+    def rename_together(pairs: Any) -> None:
+        with suppress(threading.BrokenBarrierError):
+            both_rename.wait(1)
+        renamed(pairs)
+
+    monkeypatch.setattr(files, "extend_state", extend_together)
+    monkeypatch.setattr(atomic, "_rename_all", rename_together)
+    settings = {"superpixels": 60}
+    with ThreadPoolExecutor(2) as pool:
+        found = [find_scene_files(scene) for scene in scenes]
+        ends = [pool.submit(files.extend_file, path, scene, settings) for scene in found]
+    refusals = [end.exception() for end in ends if end.exception() is not None]
+    assert [type(refusal) for refusal in refusals] == [SceneError]
+    assert "another process" in str(refusals[0])
+    assert len(load_state(path).about["batches"]) == before + 1
+    monkeypatch.undo()
+    for scene, end in zip(scenes, ends, strict=True):
+        if end.exception() is not None:
+            files.extend_file(path, find_scene_files(scene), {})
+    assert len(load_state(path).about["batches"]) == before + 2

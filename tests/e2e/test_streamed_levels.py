@@ -75,13 +75,6 @@ def test_a_run_that_fails_leaves_no_folder(
     assert run("compact", small_scene, "-o", index.parent / "deep" / "lod-meta.json", *QUICK).code == 3
 
 
-@pytest.mark.parametrize("kind", ["state", "batch"])
-def test_others_write_no_levels(kind: str, small_scene: Path, index: Path, tmp_path: Path, run: Run) -> None:
-    state = tmp_path / "a.gsm"
-    index.parent.mkdir()
-    run("extend", state, small_scene, *QUICK[:2], "--set", "checkpoint=none", code=0)
-    words, place = {
-        "state": (("compact", state, "-o", index), index),
-        "batch": (("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json"), "output"),
-    }[kind]
-    assert_refused(run(*words), 2, place, ".ply")
+def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    words = ("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json")
+    assert_refused(run(*words), 2, "output", ".ply")

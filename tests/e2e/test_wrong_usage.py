@@ -9,13 +9,12 @@ from pathlib import Path
 import pytest
 from bare_files import write_without_grid
 
-from gsmerge import Compactor
 from gsmerge.cli import main
 
 from .conftest import Run, assert_refused, listing
 
-# Words after ``gsmerge``, run in a folder with the scene ``room`` of 5 views of 48 x 32, a state of it, and one
-# without photos: the place that the error line names, none for some, and values in it, with * between them
+# Words after ``gsmerge``, run in a folder with the scene ``room`` of 5 views of 48 x 32, two states and Feature
+# Gaussians of it: the place that the error line names, none for some, and values in it, with * between them
 USAGE = {
     "compact room --k 9": "k*9",
     "compact room --set superpixels=1537": "superpixels*1536*1537",
@@ -53,22 +52,18 @@ USAGE = {
     "batch room -o alone.ply": "--output*alone.ply",
     "encode room": "*encode*gsmerge extend room.gsm SCENE",
     "decode room.gsm --k 8": "*decode*gsmerge compact room.gsm --k 2",
-    "compact room.gsm --k 8": "k*1 to 4*8",
-    "compact room.gsm --k 2 --budget 900": "*k*budget*both",
-    "compact room.gsm --budget 10": "budget*{groups}*10",
     "compact room.gsm -o room.gsm --overwrite": "room.gsm*input",
     "compact room.gsm -o alone.ply": "alone.ply*--overwrite",
-    "compact room.gsm --set viewer_cameras=true": "--set viewer_cameras*unknown",
-    "compact room.gsm --fit full": "fit full*photos*none",
-    "compact room.gsm room": "room.gsm*alone*2",
-    "compact room.gsm --cameras room/transforms.json": "--cameras*room.gsm",
-    "compact room.gsm --strict": "--strict*room.gsm",
+    "compact paper.gsm --k 8": "k*1 to 4*8",
+    "compact paper.gsm --budget 10": "--budget*paper.gsm",
+    "compact paper.gsm --strict": "--strict*paper.gsm",
+    "compact paper.gsm --cameras room/transforms.json": "--cameras*paper.gsm",
+    "compact paper.gsm room": "paper.gsm*alone*2",
+    "extend state.gsm room --set max_views=0": "max_views*1*0",
+    "extend state.gsm room --set levels=2": "levels*compact",
     "compact state.gsm --fit some": "--fit*'some'",
     "extend state.gsm": "*'SCENE'",
     "extend state.gsm room --fit full": "*--fit*fit=VALUE",
-    "extend state.gsm room --set tolerance=2": "tolerance*2",
-    "extend state.gsm room --set max_k=9": "max_k*8",
-    "extend state.gsm room --set replay=-1": "replay*-1",
     "extend room/scene.ply room": "room/scene.ply*.gsm",
     "extend occupied room": "occupied*.gsm",
     "extend state.gsm room room --cameras a --images b": "--cameras and --images*several",
@@ -154,9 +149,9 @@ def prepared(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "occupied").mkdir()
     (folder / "occupied" / "mine.txt").write_text("precious")
     small = ["--set", "superpixels=60", "--set", "checkpoint=none", "--quiet"]
-    bare = ["--set", "replay=0"]
-    assert main(["extend", str(folder / "room.gsm"), str(small_scene), *small, *bare]) == 0
-    assert main(["extend", str(folder / "state.gsm"), str(small_scene), *small]) == 0
+    paper = ["--set", "superpixels=60", "--set", "recipe=paper", "--quiet"]
+    for name, words in (("room", small), ("state", small), ("paper", paper)):
+        assert main(["extend", str(folder / f"{name}.gsm"), str(small_scene), *words]) == 0
     return folder
 
 
@@ -173,8 +168,7 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)
-    groups = len(Compactor.load("room.gsm")) if "{groups}" in USAGE.get(words, "") else 0
-    parts = (USAGE | PLACES)[words].format(groups=groups).split("*")
+    parts = (USAGE | PLACES)[words].format().split("*")
     planned = words.startswith("compact") and ".gsm" not in words
     for more in ([], ["--dry-run"]) if planned else ([],):
         assert_refused(run(*shlex.split(words.format()), *more), 2 if words in USAGE else 3, *parts)

@@ -41,13 +41,6 @@ def with_header(**changes: Any) -> Spoil:
     return lambda path: with_text(json.dumps(header(path) | changes))(path)
 
 
-def with_settings(**changes: Any) -> Spoil:
-    def spoil(path: Path) -> None:
-        with_header(settings=header(path)["settings"] | changes)(path)
-
-    return spoil
-
-
 def with_about(**changes: Any) -> Spoil:
     def spoil(path: Path) -> None:
         with_header(about=header(path)["about"] | changes)(path)
@@ -94,35 +87,8 @@ def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def both(*spoils: Spoil) -> Spoil:
-    def spoil(path: Path) -> None:
-        for each in spoils:
-            each(path)
-
-    return spoil
-
-
 def cut(share: float) -> Spoil:
     return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-
-
-# What every file holds, in numbers that nothing real has; all finite but the last
-WILD_NUMBERS: dict[str, Spoil] = {
-    "intrinsics of zeros": with_array("cameras.Ks", np.zeros_like),
-    "intrinsics of 1e6": with_array("cameras.Ks", lambda a: a * [[1e9], [1e9], [1]]),
-    "views of zeros": with_array("cameras.viewmats", np.zeros_like),
-    "views of 3e38": with_array("cameras.viewmats", filled(3e38)),
-    "views of 1e300": with_array("cameras.viewmats", filled(1e300)),
-    "means of 3e38": with_array("features.means", filled(3e38)),
-    "negative weights": with_array("features.weights", filled(-1.0)),
-    "negative gains": with_array("features.gains", filled(-1.0)),
-    "gains of 1e12": with_array("features.gains", filled(1e12)),
-    "an origin of 1e20": with_array("frame.origin", filled(1e20)),
-    "a unit of 1e30": with_header(unit=1e30),
-    "views of 65536 x 65536": with_header(width=65536, height=65536),
-    "views of more pixels than bytes": with_header(width=8000, height=8000),
-    "infinity in features.means": with_array("features.means", filled(float("inf"))),
-}
 
 
 # What is wrong with any file
@@ -146,29 +112,18 @@ GSM_HEADERS: dict[str, Spoil] = {
     "networks": with_text("{}", "gsmerge-networks"),
     "no schema": without("schema"),
     "an older schema": with_header(schema=0),
-    "a newer schema": with_header(schema=3, gsmerge="9.9"),
-    "no settings": without("settings"),
-    "settings in a list": with_header(settings=[]),
-    "no unit": without("unit"),
-    "a unit of zero": with_header(unit=0.0),
-    "a unit that is none": with_header(unit=float("nan")),
+    "a newer schema": with_header(schema=9, gsmerge="9.9"),
+    "no kind": without("kind"),
+    "another kind": with_header(kind="mood"),
     "no width": without("width"),
     "views without pixels": with_header(width=0),
-    "k of nine": with_settings(k=9),
-    "k of words": with_settings(k="many"),
-    "most of none": with_settings(max_k=0),
-    "an opacity of two": with_settings(min_opacity=2.0),
-    "a share that is none": with_settings(min_contribution=float("nan")),
+    "views of 65536 x 65536": with_header(width=65536, height=65536),
     "a width of true": with_header(width=True),
-    "options and batches by number": with_about(options=5, batches=5),
-    "a source by number": with_about(source=5),
-    "notes in an object": with_about(notes={}),
-    "a version of true": with_about(gsmerge=True),
+    "no names": without("names"),
+    "batches by number": with_about(batches=5),
+    "batches of numbers": with_about(batches=[5]),
+    "about in a list": with_header(about=[]),
     "a million objects": with_about(notes=[[]] * 3_000_000),
-    "harmonics of degree 5": both(
-        with_array("features.shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
-        with_array("kept.shN", lambda a: np.zeros((len(a), 35, 3), np.float32)),
-    ),
 }
 
 

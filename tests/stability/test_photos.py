@@ -11,13 +11,12 @@ import scenes
 from messages import names, noted
 from sweeps import sweep
 
-from gsmerge import CompactResult, Gaussians, Scene, compact
+from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.prepare import PrepareOptions, prepare
 from gsmerge.facts.views import subset
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels import elementary
 from gsmerge.runtime.record import record_run
-from gsmerge.states.extend import extend
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]
@@ -148,6 +147,19 @@ def test_sound_photos_stay_as_they_are(room: Scene, sound: CompactResult) -> Non
     assert sound.report.notes == []
 
 
+def test_a_model_s_own_colours_are_no_difference_where_they_show_the_photo(room: Scene) -> None:
+    """Half of the rows too bright and half too dark: drawn together they are right."""
+    rows = np.arange(len(room.gaussians)) // 4 + np.arange(len(room.gaussians)) // (4 * WIDTH)
+    away = np.where(rows % 2, 0.1, -0.1)[:, None, None].astype(np.float32)
+    wide = replace(room.gaussians, sh0=room.gaussians.sh0 + away / 0.28, scales=6 * room.gaussians.scales)
+    scene = replace(room, gaussians=wide)
+    own = np.abs(sh0_to_rgb(wide.sh0[:, 0]).reshape(room.images.shape) - room.images).mean()
+    with record_run() as record:
+        changed = prepare(scene, PrepareOptions(exposure="fixed")).scene.images != room.images
+    assert own > 0.09
+    assert changed.mean() < 0.25, record.notes
+
+
 def exposed(room: Scene, gains: np.ndarray) -> Scene:
     """The scene as a model exports it from photos of several exposures ``[v,3]``."""
     g, each = room.gaussians, gains.astype(np.float32).repeat(room.pixels_per_view, 0)[:, None]
@@ -248,5 +260,5 @@ def test_covered_pixels_without_a_gaussian_get_the_nearest_colour(room: Scene) -
 
 
 def test_batches_of_views_keep_the_exposure_of_the_photos(room: Scene) -> None:
-    _, report = extend(None, exposed(room, random_gains(1)))
+    report = Compactor().extend(exposed(room, random_gains(1)))
     assert "exposure" not in report.choices

@@ -107,7 +107,7 @@ def test_rows_take_the_place_of_other_pictures(room: Scene, change: Callable[[Ph
     """Where the photo is that of another view, what both show alike stays."""
     compared, views = compare_photos(PicturedScene.of(canonicalise(room)[0], change(room.images), None))
     away = np.abs(compared.images - room.images).mean((1, 2, 3))
-    assert away.max() < 0.04
+    assert away.max() < 0.05
     assert set(range(VIEWS)) - set(views) <= set(odd)
 
 

@@ -83,7 +83,6 @@ class CameraFile:
     convention: Convention = W2C_OPENCV  # how the format stores poses
     images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
-    pictured: np.ndarray | None = None  # ``[c]`` bool, which views the file has an image of; None: all, or none
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
     # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
     focal: str | None = ""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from plyfile import PlyData
 
 from gsmerge.io.bounds import read_json
@@ -54,7 +53,6 @@ class StoredCameras(NamedTuple):
     images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
     convention: Convention | None = None  # where the numbers show another one than the format's
-    pictured: np.ndarray | None = None  # ``[c]`` bool, which views have an image, where some have none
 
 
 @dataclass(frozen=True)
@@ -76,5 +74,4 @@ class CameraFormat:
     def convert(self, path: Path, stored: StoredCameras) -> CameraFile:
         """Convert the cameras that a file stores; SceneError if one of them is invalid."""
         convention = stored.convention or self.convention
-        made = make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
-        return made if stored.pictured is None else replace(made, pictured=stored.pictured)
+        return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)

@@ -126,17 +126,12 @@ def _read_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Write a scene without pixels, with facts of plain JSON types.
-
-    Pictures are stored as whole numbers, but for those that masks leave out as a whole.
-    """
-    arrays = {name: as_array(column) for name, column in vars(scene.gaussians).items()}
+    """Write a scene without pixels, its cameras and pictures as whole numbers, and facts of plain JSON types."""
+    arrays = {name: np.asarray(column, np.float32) for name, column in vars(scene.gaussians).items()}
     cameras = scene.cameras
     arrays |= {name: np.asarray(getattr(cameras, name), np.float64) for name in ("viewmats", "Ks")}
     if scene.images is not None:
-        with_picture = np.arange(len(scene)) if scene.masks is None else np.flatnonzero(scene.masks.any((1, 2)))
-        arrays["images"] = np.rint(255 * scene.images[with_picture].clip(0, 1)).astype(np.uint8)
-        arrays["image_views"] = with_picture
+        arrays["images"] = np.rint(255 * scene.images.clip(0, 1)).astype(np.uint8)
     header = {"kind": SCENE, "width": cameras.width, "height": cameras.height, "names": list(scene.names)}
     write_gsm(path, header | {"about": dict(about)}, arrays, overwrite=overwrite)
 
@@ -144,8 +139,8 @@ def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwr
 def read_rows(path: Path) -> StoredRows:
     """Read the Gaussians of a ``.gsm`` of results; SceneError if it is damaged or holds Feature Gaussians."""
     file = read_gsm(path, SCENE)
-    means = file.arrays.get("means", np.zeros(0, np.float32))
-    n = len(file.array("means", np.float64 if means.dtype == np.float64 else np.float32, None, 3))
+    means = file.array("means", np.float32, None, 3)
+    n = len(means)
     num_higher = file.array("shN", np.float32, n, None, 3).shape[1]
     if num_higher not in NUM_HIGHER:
         raise file.error(f"shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
@@ -187,16 +182,9 @@ def read_views(source: CameraSource) -> StoredCameras:
     if len(names) != len(cameras) or not all(isinstance(name, str) for name in names):
         raise file.error(f"names: expected one of each of {len(cameras)} views, found others")
     size = cameras.width, cameras.height
-    stored = file.array("images", np.uint8, None, cameras.height, cameras.width, 3)
-    places = file.array("image_views", np.int64, len(stored))
-    if not np.array_equal(np.unique(places), places) or not ((places >= 0) & (places < len(cameras))).all():
-        raise file.error("image_views: expected views of the file, each once and in order, found others")
-    pictured = np.zeros(len(cameras), bool)
-    pictured[places] = True
-    images = np.zeros((len(cameras), *stored.shape[1:]), np.uint8)
-    images[places] = stored
+    images = file.array("images", np.uint8, len(cameras), cameras.height, cameras.width, 3)
     views = [View(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
-    return StoredCameras(views, images, "none", pictured=None if pictured.all() else pictured)
+    return StoredCameras(views, images, "none")
 
 
 def stored_cameras(file: GsmFile) -> Cameras:

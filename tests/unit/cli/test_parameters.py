@@ -68,11 +68,9 @@ def test_options_and_set_are_one() -> None:
 
 
 def test_several_kinds_of_settings() -> None:
-    assert Args(set=["k=2", "replay=3", "max_k=4"]).values(CompactOptions, ExtendOptions) == {
-        "k": 2, "replay": 3, "max_k": 4,
-    }  # fmt: skip
-    made, online = Args(set=["recipe=paper", "replay=3"]).make(CompactOptions, ExtendOptions)
-    assert (made.segment.segmentation, online.replay) == ("bass-st", 3)
+    assert Args(set=["k=2", "max_views=3"]).values(CompactOptions, ExtendOptions) == {"k": 2, "max_views": 3}
+    made, online = Args(set=["recipe=paper", "max_views=3"]).make(CompactOptions, ExtendOptions)
+    assert (made.segment.segmentation, online.max_views) == ("bass-st", 3)
 
 
 def test_the_seed_may_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

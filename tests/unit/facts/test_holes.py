@@ -171,7 +171,7 @@ def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
     images = scene.images.copy()
     images[1] = np.random.default_rng(0).random(images[1].shape)
     prepared = prepare(replace(scene, images=images))
-    assert prepared.reference.fit_views == (0, 2)
+    assert prepared.reference.score_views == (0, 2)
     assert (prepared.scene.valid & scene.missing).any((1, 2)).tolist() == [True, False, True]
 
 

@@ -211,4 +211,4 @@ def test_a_run_says_at_what_scale_it_looked(scene: Scene) -> None:
     assert [note for note in report.notes if "--set photo_scale=1 " in note]
     report = compact(with_large(scene, 2), superpixels="10%", fit_steps=30, photo_scale=1).report
     assert "photo_scale" not in report.choices
-    assert report.notes == []
+    assert not [note for note in report.notes if "photo_scale" in note]

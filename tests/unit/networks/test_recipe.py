@@ -16,11 +16,9 @@ from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import find_owners
 from gsmerge.stages.superpixels import segment
-from gsmerge.states.extend import extend
 
 SMALL = NetworkOptions(
     width=16, heads=2, latent=8, members=4, neighbors=4, outputs="absolute", merger_start="first", geometry="carried",
@@ -98,9 +96,6 @@ def test_networks_with_absolute_outputs_ship(scene: Scene) -> None:
 def test_more_children_than_a_head_has_are_refused(scene: Scene, absolute: Path) -> None:
     with refuses(UsageError, "k", 4, 5):
         scenes.compacted(scene, recipe="paper", checkpoint=str(absolute), k=5)
-    options = CompactOptions().with_settings({"recipe": "paper", "checkpoint": str(absolute)})
-    with refuses(UsageError, "max_k", 4, 8):
-        extend(None, scene, options, ExtendOptions(max_k=8))
 
 
 @pytest.mark.parametrize("rule", ["saliency", "distortion"])
