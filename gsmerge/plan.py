@@ -82,7 +82,7 @@ class Plan:
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
-    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels: only renders show the scene
+    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels, see :func:`merges_pairs`
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
@@ -162,7 +162,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
-        pairs = cuts and checkpoint is None and merges_pairs(size, asked)
+        pairs = checkpoint is None and merges_pairs(size, asked)
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
             fit = replace(fit, judged=False, tuning=fit.tuning.scaled(RENDERS_STEPS))
     if keeps and has_few_rows(size):
@@ -309,14 +309,14 @@ def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
 
 
 def merges_pairs(scene: SceneSize, options: CompactOptions) -> bool:
-    """Return whether neighbours are merged, not superpixels, because renders of the scene alone show it.
+    """Return whether neighbours are merged, not superpixels: no views show the scene, or renders of it alone.
 
     Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
     """
     segment, decode = replace(options.segment, superpixels=SHARE), replace(options.decode, k=DecodeOptions().k)
     usual = (segment, options.match, decode) == (SegmentOptions(), MatchOptions(), DecodeOptions())
     ours = options.method == OURS and choose_networks(options, scene) == "none"
-    return usual and ours and scene.rendered
+    return ours and (scene.num_views == 0 or (usual and scene.rendered))
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:

@@ -70,13 +70,11 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
-        """Raise UsageError for an option other than ``names``, which a state, the input ``path``, does not take."""
+        """Raise UsageError for an option not of ``names``, which are those for Feature Gaussians, the input ``path``."""
         for name, value in vars(self).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
-                raise UsageError(
-                    f"{flag}: expected a scene with it, {path} is a state, which gsmerge extend makes of scenes"
-                )
+                raise UsageError(f"{flag}: expected a scene with it, {path} holds Feature Gaussians")
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
         """Make settings of classes ``kinds`` from options, ``--set`` and ``changes``; UsageError if one is wrong."""

@@ -80,12 +80,13 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     """Compact a scene of which the facts are known."""
     plan = add_target(make_plan(prepared, options), prepared)  # every "auto" is decided once; options end here
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
-    trial = replace(plan, clean=CleanOptions()) if plan.keeps_input else plan  # what is left out would count as errors
+    cleans_last = plan.keeps_input and plan.clean.asked  # what is left out would count as errors in the search
+    searched = replace(plan, clean=CleanOptions()) if cleans_last else plan
     for count in search:
-        search.add(build_scored(method.build, prepared, trial, count))
+        search.add(build_scored(method.build, prepared, searched, count))
     rebuild = partial(build_scored, method.build, prepared, plan)
     best, packed = search.best, plan.size is not None and plan.size.packed
-    if trial is not plan and plan.clean.asked:
+    if cleans_last:
         best = clean_candidate(best, prepared, plan)
     if packed:
         from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
@@ -104,14 +105,30 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
     return score(count, build_cleaned(build, prepared, plan, count), prepared, plan)
 
 
+@record_part()
 def clean_candidate(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up a candidate as the plan says, and score it again."""
+    """Clean up a candidate as the plan says, and score it again; UsageError if the crop contains none of the scene."""
+    from gsmerge.stages.clean import clean
 
-    def again(*_: object) -> Fitted:
-        adopt(candidate.record)
-        return candidate.fitted
+    _share_inside(prepared, plan)
+    adopt(candidate.record)
+    gaussians, counts = clean(candidate.fitted.gaussians, plan.clean, prepared.scene, prepared.frame.leave)
+    _note_clean(counts, len(gaussians), None)
+    return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
-    return build_scored(again, prepared, plan, None)
+
+def _share_inside(prepared: Prepared, plan: Plan) -> float:
+    """Return the share of the input that the crop keeps; UsageError if it contains none of the scene."""
+    from gsmerge.stages.clean import inside_crop
+
+    crop = plan.clean.crop
+    if crop is None:
+        return 1.0
+    share = float(inside_crop(prepared.frame.leave(prepared.scene.finite_gaussians).means, crop).mean())
+    if share == 0:
+        remedy = "gsmerge inspect says where the scene is"
+        raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
+    return share
 
 
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
@@ -123,22 +140,17 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     options = plan.clean
     if not options.asked:
         return build(prepared, plan, count)
-    from gsmerge.stages.clean import clean, faintest_dropped, inside_crop
+    from gsmerge.stages.clean import clean, faintest_dropped
 
-    scene, to_world = prepared.scene, prepared.frame.leave
-    input_gaussians = scene.finite_gaussians
-    most, asked = len(input_gaussians), count
-    share = 1.0 if options.crop is None else float(inside_crop(to_world(input_gaussians).means, options.crop).mean())
-    if share == 0:
-        remedy = "gsmerge inspect says where the scene is"
-        raise UsageError(f"crop: expected Gaussians of the scene in {options.crop}, found none; {remedy}")
+    scene, share = prepared.scene, _share_inside(prepared, plan)
+    most, asked = len(scene.finite_gaussians), count
     if count is not None:
         asked = min(most, math.ceil(SURPLUS * count / share))
     best: tuple[Fitted, dict[str, int], Record] | None = None
     for _ in range(MAX_BUILDS):
         with record_part() as record:
             fitted = build(prepared, plan, asked)
-            gaussians, counts = clean(fitted.gaussians, options, scene, to_world)
+            gaussians, counts = clean(fitted.gaussians, options, scene, prepared.frame.leave)
         add_seconds(record.seconds)
         if best is None or count is None or len(best[0].gaussians) < len(gaussians):
             best = replace(fitted, gaussians=gaussians), counts, record
@@ -151,13 +163,13 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
     adopt(record)
-    choose(clean=counts)
-    for text in _clean_notes(counts, len(gaussians), count):
-        note(text)
+    _note_clean(counts, len(gaussians), count)
     return replace(fitted, gaussians=gaussians)
 
 
-def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> list[str]:
+def _note_clean(counts: Mapping[str, Any], left: int, count: int | None) -> None:
+    """Record what clean-up left out, and whether fewer than ``count`` are left."""
+    choose(clean=counts)
     words = {
         "cropped": "outside of the crop",
         "sky": "sky",
@@ -167,8 +179,8 @@ def _clean_notes(counts: Mapping[str, Any], left: int, count: int | None) -> lis
     }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
     shown = [name for name in ("cropped", "sky") if counts.get(name)]
-    scores = ["PSNR of the input views counts what is left out as errors"] * bool(shown)
-    short = []
+    note(f"left out by clean-up: {parts}")
+    if shown:
+        note("PSNR of the input views counts what is left out as errors")
     if count is not None and left < count:
-        short = [f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up"]
-    return [f"left out by clean-up: {parts}", *scores, *short]
+        note(f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up")

@@ -1,4 +1,4 @@
-"""All ways to compact a scene behind one interface: ours, that for scenes without cameras, and those of packages.
+"""All ways to compact a scene behind one interface: ours, and those of packages.
 
 A package adds one by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
 """
@@ -6,16 +6,15 @@ A package adds one by an entry point of the group ``gsmerge.methods`` that names
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare, prepare_alone
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
-from gsmerge.runtime.plugins import METHODS, LazyFunction, load_plugin
+from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.stages import PrepareOptions
@@ -28,7 +27,7 @@ COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop"}  # that every me
 
 @dataclass(frozen=True)
 class Method:
-    """A way to compact a scene: our own, one for scenes without cameras, or another, such as a baseline.
+    """A way to compact a scene: our own, or another, such as a baseline.
 
     Args:
         name: As on the command line.
@@ -63,10 +62,6 @@ class _Superpixels(Method):
 
 
 SUPERPIXELS = _Superpixels(OURS, lambda *arguments: build(*arguments).gaussians)
-_MERGE_NEIGHBORS = LazyFunction("gsmerge.stages.pair_merge", "merge_neighbors")
-PAIRS = Method(  # by positions and colours alone
-    "pairs", lambda prepared, _, count: _MERGE_NEIGHBORS(prepared.scene.gaussians, count), prepare=prepare_alone
-)
 
 
 def find_method(options: CompactOptions) -> Method:
@@ -84,14 +79,14 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
     Raises UsageError if the scene lacks what the method needs, or a program is missing.
     """
     if stands_alone(scene, options):
-        return PAIRS, _unused_alone(options)
+        return replace(SUPERPIXELS, prepare=prepare_alone), _unused_alone(options)
     method = find_method(options)
     if method is SUPERPIXELS:
         return method, []
-    place, size = f"method {method.name}", measure_size(scene)
+    place = f"method {method.name}"
     if "photos" in method.needs and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
-    if "pixels" in method.needs and not size.aligned:
+    if "pixels" in method.needs and not scene.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
     default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
     unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
@@ -23,11 +23,16 @@ from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import as_scene
 from gsmerge.types import Gaussians, Scene, StrPath, Views
 
-if TYPE_CHECKING:
-    from gsmerge.compaction.result import CompactResult
-
 MOST_SOLID = 600_000  # Gaussians of a scene of which a page has the stills alone: 8 MB of a notebook
 HEIGHT = 820  # pixels of a page in a notebook
+
+
+class Result(Protocol):
+    """What :func:`gsmerge.compact` returns, as far as a page needs it."""
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """Its Gaussians."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,7 +62,7 @@ class Page:
 
 def view(
     scene: Scene | StrPath,
-    results: Mapping[str, CompactResult | Gaussians | StrPath] | CompactResult | Gaussians | StrPath | None = None,
+    results: Mapping[str, Result | Gaussians | StrPath] | Result | Gaussians | StrPath | None = None,
     held_out: Views | None = None,
     *,
     light: bool | None = None,
@@ -101,13 +106,13 @@ def view(
     return Page(view_page(data), headline(data))
 
 
-def _gaussians_of(result: CompactResult | Gaussians | StrPath) -> Gaussians:
+def _gaussians_of(result: Result | Gaussians | StrPath) -> Gaussians:
     if isinstance(result, str | PathLike):
         return read_gaussians(result).gaussians
     return result if isinstance(result, Gaussians) else result.gaussians
 
 
-def _num_bytes(value: Scene | CompactResult | Gaussians | StrPath) -> int:
+def _num_bytes(value: Scene | Result | Gaussians | StrPath) -> int:
     """Return the size of a file; of what is in memory that of a ``.ply`` with it."""
     if isinstance(value, str | PathLike):
         return sum(path.stat().st_size for path in find_scene_files(value).plys)
