@@ -25,7 +25,7 @@ from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
 from gsmerge.report import file_sha256, finite
 from gsmerge.runtime.processes import ProcessPool
-from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, Pool, RayPool
+from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, Lost, RayPool, WorkerPool
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
     active: dict[str, Job] = {}
     with ExitStack() as stack:
         stack.callback(lambda: remove_unfinished(run, active.values()))
-        pool: Pool = ProcessPool(concurrency.jobs, concurrency.threads)
+        pool: WorkerPool = ProcessPool(concurrency.jobs, concurrency.threads)
         if options.engine == "ray":
             cluster = stack.enter_context(closing(Cluster(options.address, store_bytes=SMALL_STORE)))
             pool = RayPool(cluster, concurrency.threads, jobs=concurrency.jobs)

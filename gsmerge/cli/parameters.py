@@ -70,7 +70,7 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def require_scene(self, names: Collection[str], path: Path) -> None:
-        """Raise UsageError for an option not of ``names``, which are those for Feature Gaussians, the input ``path``."""
+        """Raise UsageError for an option not in ``names``, those that Feature Gaussians, the input ``path``, take."""
         for name, value in vars(self).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"

@@ -25,7 +25,7 @@ from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
-from gsmerge.scene.read import align_scene, read_rows
+from gsmerge.scene.read import align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
@@ -90,7 +90,7 @@ def inspect(
     files = find_scene_files(path, cameras=cameras, images=images, masks=masks)
     with use_threads(threads):
         report_progress("inspect: reading", 0, 3)
-        ply = read_rows(files, opacity=opacity, hints=read_hints)
+        ply = read_gaussian_file(files, opacity=opacity, hints=read_hints)
         report_progress("inspect: Gaussians", 1, 3)
         described = _describe_file(ply)
         report_progress("inspect: views", 2, 3)

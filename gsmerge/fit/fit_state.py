@@ -16,7 +16,7 @@ CARRIED = ("x0", "m", "v", "units", "box_shares", "min_sizes", "origins", "fixed
 
 
 @dataclass(eq=False)
-class State:
+class FitState:
     """Parameters under optimisation, and the same values as arrays for the rasterizer."""
 
     x: np.ndarray  # [n,14] float32: mean, log scale, quaternion, opacity logit, colour
@@ -31,7 +31,7 @@ class State:
     splats: Splats  # Means, quaternions, scales and opacities as the rasterizer takes them
     colors: np.ndarray  # [n,3] base colours
 
-    def __getitem__(self, rows: np.ndarray) -> State:
+    def __getitem__(self, rows: np.ndarray) -> FitState:
         """Return the state of some Gaussians, by mask or by row."""
         kept = state_of(self.x[rows], self.splats.shN[rows])
         for name in CARRIED:
@@ -46,7 +46,7 @@ class State:
         return None
 
 
-def start_state(gaussians: Gaussians) -> State:
+def start_state(gaussians: Gaussians) -> FitState:
     """Start the optimiser's state from Gaussians: their parameters, zero moments."""
     x = np.empty((len(gaussians), COLUMNS), np.float32)
     opacities = gaussians.opacities.astype(np.float64).clip(0.004, 0.999)
@@ -58,7 +58,7 @@ def start_state(gaussians: Gaussians) -> State:
     return state_of(x, gaussians.shN)
 
 
-def state_of(x: np.ndarray, shN: np.ndarray) -> State:
+def state_of(x: np.ndarray, shN: np.ndarray) -> FitState:
     """Start the optimiser's state at parameters ``x [n,14]`` and higher harmonics ``[n,k-1,3]``."""
     sizes = np.sort(x[:, SIZE:QUAT], 1)
     colors = np.ascontiguousarray(x[:, COLOR:])
@@ -74,7 +74,7 @@ def state_of(x: np.ndarray, shN: np.ndarray) -> State:
     units = exp((sizes[:, 1] + sizes[:, 2]) / 2)
     shares, least = np.ones_like(units), np.full_like(units, -np.inf)
     zero, rows, fixed = np.zeros_like(x), np.arange(len(x)), np.zeros(len(x), bool)
-    return State(x, x.copy(), zero, zero.copy(), units, shares, least, rows, fixed, splats, colors)
+    return FitState(x, x.copy(), zero, zero.copy(), units, shares, least, rows, fixed, splats, colors)
 
 
 def gaussians_of(x: np.ndarray, shN: np.ndarray) -> Gaussians:

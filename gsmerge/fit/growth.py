@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.fit.fit_state import CARRIED, State, state_of
+from gsmerge.fit.fit_state import CARRIED, FitState, state_of
 from gsmerge.geometry import lower_median, quat_to_rotmat
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
@@ -17,7 +17,7 @@ FADED = 0.005  # opacity that is as good as none; halves of what has more have a
 DEPTH = 0.8  # of the halves' optical depth: two narrower ones with 0.7 would cover the same, a little more closes gaps
 
 
-def grow_to(state: State, half: Photos, count: int) -> State:
+def grow_to(state: FitState, half: Photos, count: int) -> FitState:
     """Drop faded Gaussians, then split others until there are ``count``, or no visible one is left to split.
 
     ``half``: the half-size photos, whose errors decide which Gaussians are split.
@@ -30,7 +30,7 @@ def grow_to(state: State, half: Photos, count: int) -> State:
     return state
 
 
-def grow(state: State, masses: np.ndarray, count: int) -> State:
+def grow(state: FitState, masses: np.ndarray, count: int) -> FitState:
     """Split the Gaussians with the largest error ``masses [n]`` across their longest axis, until there are ``count``.
 
     Each is split at most once, so the number at most doubles. Gaussians that no photo shows are not split. Both halves
@@ -64,7 +64,7 @@ def grow(state: State, masses: np.ndarray, count: int) -> State:
     return grown
 
 
-def error_masses(state: State, half: Photos) -> np.ndarray:
+def error_masses(state: FitState, half: Photos) -> np.ndarray:
     """Sum ``[n]`` blending weight times absolute pixel error of each Gaussian over all half-size photos."""
 
     def one_view(view: int) -> np.ndarray:

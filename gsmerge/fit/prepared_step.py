@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gsmerge.fit.fit_state import State
+from gsmerge.fit.fit_state import FitState
 from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.project import CAMERA, CONIC, SUMS, TILE
 from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
@@ -25,7 +25,7 @@ OF_SPLATS = ("means", "quats", "scales", "opacities")
 OF_STEP = {"camera": CAMERA, "background": 3, "loss_weights": 2, "rates": 14, "limits": 3, "betas": 2, "regs": 2}
 
 
-def is_prepared(state: State) -> bool:
+def is_prepared(state: FitState) -> bool:
     """Return whether prepared steps are possible for a state."""
     return len(state.x) > 0 and state.splats.shN.shape[1] == 0 and not state.fixed.any()
 
@@ -34,7 +34,7 @@ def is_prepared(state: State) -> bool:
 class StepTables:
     """Buffers for the steps of a state, with a filled table for each size of the photos."""
 
-    state: State
+    state: FitState
     threads: int
     gaussians: dict[str, np.ndarray] = field(default_factory=dict)  # buffers over Gaussians, and those of a step
     room: dict[str, np.ndarray] = field(default_factory=dict)  # buffers over intersections

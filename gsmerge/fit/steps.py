@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.fit.fit_state import State
+from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import fog_gradients
 from gsmerge.fit.prepared_step import StepTables, is_prepared
@@ -80,7 +80,7 @@ class Optimiser:
         """Poses ``[v,4,4]`` that the fit has moved; None if cameras are fixed."""
         return None if self.poses is None else self.poses.viewmats
 
-    def step(self, state: State, step: Step) -> float:
+    def step(self, state: FitState, step: Step) -> float:
         """Take one Adam step on one view, in place; return the mean squared error of its training pixels."""
         photos, mode, opacities = self.photos[step.mode.size], step.mode, None
         weight = self.run.step_weights[mode.size][step.view]
@@ -106,7 +106,7 @@ class Optimiser:
         return error / max(3 * float(weight.sum()), 1)
 
     def _take_prepared(
-        self, state: State, step: Step, weight: np.ndarray, opacities: np.ndarray | None
+        self, state: FitState, step: Step, weight: np.ndarray, opacities: np.ndarray | None
     ) -> float | None:
         """Take a step in few calls and return its error; None if it has to be taken by single calls."""
         if self.poses is not None or not is_prepared(state):
@@ -128,7 +128,7 @@ class Optimiser:
                 step.number, np.ascontiguousarray(photos.image(step.view), np.float32), weight, drawn, numbers
             )
 
-    def _constants(self, state: State, step: Step) -> dict[str, np.ndarray]:
+    def _constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""
         options, count = self.run.job.options, max(len(state.x), 1)
         rates = options.tuning
@@ -139,12 +139,12 @@ class Optimiser:
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
 
-    def clear_fog(self, state: State, step: Step, view: int) -> None:
+    def clear_fog(self, state: FitState, step: Step, view: int) -> None:
         """Take one Adam step against fog: opacity in a view from outside where the start was empty."""
         assert self.run.job.outside is not None
         self._move(state, fog_gradients(state.splats, self.run.job.outside, view), step)
 
-    def _move(self, state: State, g: Gradients, step: Step) -> None:
+    def _move(self, state: FitState, g: Gradients, step: Step) -> None:
         """Take one Adam step along gradients."""
         s = state.splats
         if state.fixed.any():

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from gsmerge.fit.fit_state import State, start_state
+from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
 from gsmerge.raster import contributions, prepare, tile_view
@@ -92,7 +92,7 @@ def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> fl
     return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
 
 
-def score_state(state: State, plan: FitRun, half: Photos) -> float:
+def score_state(state: FitState, plan: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
     return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
 

@@ -46,7 +46,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
-from gsmerge.scene.read import Loaded, SceneViews, place_cameras_in_scene, read_rows
+from gsmerge.scene.read import Loaded, SceneViews, place_cameras_in_scene, read_gaussian_file
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians
 
@@ -269,10 +269,10 @@ def _lacks_cameras(files: SceneFiles) -> bool:
 def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     """Read the scenes, and place the cameras in the frame of ``options.like``."""
     files, like, paths = options.files, options.like, options.paths
-    first = read_rows(files, opacity=options.opacity, hints=options.hints)
+    first = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
-    rows = first if same_file else read_rows(like, opacity="auto", hints=AUTO)
+    rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
     load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]

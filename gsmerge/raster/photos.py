@@ -30,7 +30,7 @@ WHOLE = 0.98  # share of the pixels from which on Gaussians cover a view as a wh
 EPS2D = 0.3  # low-pass of the rasterizer, square pixels of the full-size image
 
 
-class ViewScore(NamedTuple):
+class RenderScore(NamedTuple):
     """Score of one render against a photo."""
 
     psnr: float  # dB over the pixels that count
@@ -41,7 +41,7 @@ class ViewScore(NamedTuple):
 
 @dataclass(frozen=True)
 class PhotoScore:
-    """Mean score of renders against photos; see :class:`ViewScore`."""
+    """Mean score of renders against photos; see :class:`RenderScore`."""
 
     psnr: float  # dB
     covered_psnr: float  # dB; NaN where nothing is covered
@@ -199,13 +199,13 @@ def score_photos(
     def tiles(view: int) -> np.ndarray | None:
         return scored_tiles(view, photos.width, photos.height) if quarter else None
 
-    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> ViewScore:
+    def score(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
         return _score_view(image, masks.get(view, transmittance < COVERED), photos, view, quarter=quarter)
 
     return _mean_score(photo_errors(gaussians, photos, score, views, tiles=tiles, **settings))
 
 
-def _mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
+def _mean_score(scores: Sequence[RenderScore]) -> PhotoScore:
     """Average the scores of views."""
     inside = [score.covered_psnr for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
@@ -213,7 +213,7 @@ def _mean_score(scores: Sequence[ViewScore]) -> PhotoScore:
     return PhotoScore(mean, float(np.mean(inside)) if inside else math.nan, share, tuple(s.covered for s in scores))
 
 
-def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> ViewScore:
+def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, *, quarter: bool) -> RenderScore:
     """Score a render ``[h,w,3]``, clipped in place, also over ``covered [h,w]``; see :func:`score_photos`."""
     tiles = scored_tiles(view, photos.width, photos.height) if quarter else None
     mask = None if tiles is None else tiles.repeat(TILE, 0).repeat(TILE, 1)[: photos.height, : photos.width]
@@ -225,8 +225,8 @@ def _score_view(image: np.ndarray, covered: np.ndarray, photos: Photos, view: in
     share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
     psnr_of_all = psnr(np.clip(image, 0, 1, out=image), photos.images[view], mask)
     if share >= WHOLE or share == 0:
-        return ViewScore(psnr_of_all, psnr_of_all if share else math.nan, share, covered)
-    return ViewScore(psnr_of_all, psnr(image, photos.images[view], covered), share, covered)
+        return RenderScore(psnr_of_all, psnr_of_all if share else math.nan, share, covered)
+    return RenderScore(psnr_of_all, psnr(image, photos.images[view], covered), share, covered)
 
 
 def scored_tiles(view: int, width: int, height: int) -> np.ndarray | None:

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, Lost, Pool
+from gsmerge.runtime.work import CALLS_PER_PROCESS, Call, Lost, WorkerPool
 
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 END_SECONDS = 10.0  # that a process has to end by itself
@@ -53,7 +53,7 @@ class Worker:
             self.process.join()
 
 
-class ProcessPool(Pool):
+class ProcessPool(WorkerPool):
     """A pool of up to ``jobs`` processes on this machine; each makes one call after the other."""
 
     def __init__(self, jobs: int, threads: int) -> None:

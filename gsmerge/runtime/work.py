@@ -41,7 +41,7 @@ class Lost(NamedTuple):
     reason: str
 
 
-class Pool(ABC):
+class WorkerPool(ABC):
     """Processes that make up to ``capacity`` calls at once."""
 
     capacity: int
@@ -170,7 +170,7 @@ def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> 
     return value, replace(record, progress=None)
 
 
-class RayPool(Pool):
+class RayPool(WorkerPool):
     """A pool of up to ``jobs`` calls on a Ray cluster; 0: as many as it has processors."""
 
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:

@@ -192,7 +192,10 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     """Read a scene from files that were found already, as :func:`load_scene` does."""
     with use_threads():
         each = (replace(files, more=()), *files.more)
-        loads = [align_scene(read_rows(source, opacity=opacity, hints=hints), source, hints=hints) for source in each]
+        loads = [
+            align_scene(read_gaussian_file(source, opacity=opacity, hints=hints), source, hints=hints)
+            for source in each
+        ]
     return loads[0] if len(loads) == 1 else _join_loads(loads, files)
 
 
@@ -217,7 +220,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
     )
 
 
-def read_rows(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
+def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: ReadHints) -> GaussianFile:
     """Read the Gaussians of a scene's files; the encoding of opacities is given by the option or the exporter."""
     exporter = find_exporter(hints.exporter)
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":

@@ -15,7 +15,7 @@ from typing import Any
 from gsmerge.batch import BatchOptions, Job, find_jobs
 from gsmerge.batch.records import RECORDS
 from gsmerge.batch.run import Run, read_index
-from gsmerge.runtime.work import Call, Pool
+from gsmerge.runtime.work import Call, WorkerPool
 from gsmerge.settings.compact import CompactOptions
 
 NAMES = [f"room{number}.ply" for number in range(4)]  # results of the fixture ``rooms``
@@ -73,7 +73,7 @@ def holders(folder: Path) -> list[int]:
     return [int(text) for text in texts if text.endswith("\n")]
 
 
-class InlinePool(Pool):
+class InlinePool(WorkerPool):
     """In place of :class:`gsmerge.runtime.processes.ProcessPool`: one call after the other in this process."""
 
     capacity = 1

@@ -10,7 +10,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.fit.fit_state import State, gaussians_of, start_state
+from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.growth import FADED, error_masses, grow, grow_to
 from gsmerge.fit.photo_sizes import holdout_psnr, reduced, training_weights
 from gsmerge.geometry import covariances
@@ -42,7 +42,7 @@ def photos(scene: Scene) -> Photos:
     return scene_photos(scene)
 
 
-def used(gaussians: Gaussians) -> State:
+def used(gaussians: Gaussians) -> FitState:
     """A state with some past."""
     state = start_state(gaussians)
     rng = np.random.default_rng(0)

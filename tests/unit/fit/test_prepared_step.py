@@ -11,7 +11,7 @@ import scenes
 
 from gsmerge import Gaussians
 from gsmerge.fit import FitJob, FitOptions, prepared_step, steps
-from gsmerge.fit.fit_state import State, start_state
+from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.schedule import Schedule, prepare_fit
 from gsmerge.fit.steps import Optimiser, make_optimiser
 from gsmerge.raster.photos import Photos
@@ -23,7 +23,7 @@ STEPS = 12  # half of them on half-size photos
 
 def take_steps(
     truth: Gaussians, photos: Pair, *, threads: int = 2, dropout: float = 0.0, fixed: bool = False
-) -> tuple[State, list[float], Optimiser]:
+) -> tuple[FitState, list[float], Optimiser]:
     """The state, the errors and the optimiser after steps from a spoiled start."""
     options = FitOptions(fit_steps=STEPS, holdout=0.2, dropout=dropout, half_res_share=0.5)
     run = prepare_fit(FitJob(photos, options))
@@ -34,7 +34,7 @@ def take_steps(
         return state, [optimiser.step(state, draw) for draw in draws], optimiser
 
 
-def same(first: State, second: State) -> bool:
+def same(first: FitState, second: FitState) -> bool:
     names = ("x", "m", "v", "colors")
     equal = [np.array_equal(getattr(first, name), getattr(second, name)) for name in names]
     return all(equal) and all(
