@@ -17,6 +17,7 @@ import pytest
 import scenes
 from messages import NO_FOLDER, refuses
 from slow_readers import corners, drawn
+from splat_transform_programs import needs_program
 
 from gsmerge import Gaussians, Scene
 from gsmerge.cli import main
@@ -26,11 +27,12 @@ from gsmerge.io import output_format, read_gaussians, read_ply, write_gaussians
 from gsmerge.io.atomic import temporary_path
 from gsmerge.io.formats import sog, streamed
 from gsmerge.io.formats.arrays import Columns
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.io.formats.streamed import read_level, write_levels
 from gsmerge.kernels import elementary
 
 from .test_sog import webp
-from .test_write import needs_program, program, psnr
+from .test_write import psnr
 
 COUNTS = (900, 230, 55)
 SPACING = 1.0  # of the grid that centres are on: a chunk rounds them by far less
@@ -181,19 +183,19 @@ def test_many_chunks_show_the_same(degree: int, scene: Scene, tmp_path: Path, sm
     assert ply.info.layout == f"Streamed SOG version 1, {len(gaussians):,} Gaussians at 1 level(s), SH degree {degree}"
 
 
-@needs_program
+@needs_program()
 def test_splat_transform_reads_the_same(scene: Scene, tmp_path: Path, small: None) -> None:
     gaussians, index, back = drawn(scene, 1), tmp_path / "lod-meta.json", tmp_path / "back.ply"
     write_levels(index, [gaussians, gaussians[::4], gaussians[::16]])
     for level in range(3):
-        command = [str(program()), "-q", "-w", "-g", "cpu", "-L", str(level), str(index), str(back)]
+        command = [find_program(), "-q", "-w", "-g", "cpu", "-L", str(level), str(index), str(back)]
         subprocess.run(command, check=True, capture_output=True)
         expected, actual = read_level(index, level).gaussians, read_ply(back).gaussians
         assert (len(actual), actual.sh_degree) == (len(expected), 1)
         assert psnr(scene, expected, actual) > 50
 
 
-@needs_program
+@needs_program()
 def test_what_splat_transform_writes_is_read(scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With a tree, an environment and names of its own."""
     gaussians, index = drawn(scene, 1), tmp_path / "scene" / "lod-meta.json"
@@ -201,12 +203,12 @@ def test_what_splat_transform_writes_is_read(scene: Scene, tmp_path: Path, capsy
     for level, path in paths.items():
         write_gaussians(path, gaussians[:: {0: 1, 1: 4, -1: 50}[level]])
     tagged = [part for level, path in paths.items() for part in (str(path), "--tag-lod", str(level))]
-    subprocess.run([str(program()), "-q", "-g", "cpu", *tagged, str(index)], check=True, capture_output=True)
+    subprocess.run([find_program(), "-q", "-g", "cpu", *tagged, str(index)], check=True, capture_output=True)
     actual = read_gaussians(index).gaussians
     assert len(actual) == len(gaussians) + len(gaussians[::50])
     assert len(read_level(index, 1).gaussians) == len(gaussians[::4])
     assert main(["inspect", str(index)]) == 0
-    assert capsys.readouterr().out.startswith("ok ")
+    assert capsys.readouterr().out.startswith("file ")
 
 
 def test_places_that_cannot_be_told_apart_stay_together(tmp_path: Path, small: None) -> None:
