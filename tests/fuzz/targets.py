@@ -20,6 +20,7 @@ from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
 from saved_cameras import camera_comments
+from splat_transform_programs import write_set
 from tiny_scene import (
     make_tiny,
     save_json,
@@ -213,7 +214,7 @@ def sharp(folder: Path) -> Iterable[bytes]:
 
 def levels(folder: Path) -> Iterable[bytes]:
     """Make two levels of detail."""
-    gsmerge.write_levels(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)])
+    write_set(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)], leaves=2)
     yield pack(folder)
 
 

@@ -57,8 +57,9 @@ PLY = Format(
     each=(68.0, 104.0, 164.0, 248.0),
 )  # fmt: skip
 LEVELS = Format(
-    INDEX, "levels of detail in chunks, each a .sog without its zip", _lazy("streamed.read_rows"), None,
-    3, each=_SOG, round_means=_lazy("sog.round_means"),
+    INDEX, "levels of detail in chunks; written by splat-transform",
+    _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
+    round_means=_lazy("sog.round_means"),
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
 SITE = Format(
