@@ -16,8 +16,8 @@ from shared_scenes import export, read_held_out, scene_folders
 
 import gsmerge
 from gsmerge.io import read_ply, write_ply
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.io.formats.streamed import read_level, write_levels
-from gsmerge.research.baselines.simple import find_program
 
 WAYS = ("decimate", "decimate-adaptive")
 

@@ -41,9 +41,9 @@ from gsmerge.errors import UsageError
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.cameras.colmap_model import POINTS
 from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.io.formats.table import FOLDER, PLACE
 from gsmerge.pages.page import ENGINE
-from gsmerge.research.baselines.simple import find_program
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "e2e"))
 

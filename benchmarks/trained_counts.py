@@ -20,9 +20,9 @@ from shared_scenes import read_held_out, scene_folders
 import gsmerge
 from gsmerge.geometry import quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_ply
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.measure.lpips import lpips
 from gsmerge.raster.metrics import psnr, ssim
-from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Cameras, Gaussians, Scene
 
 BETWEEN = 12  # cameras at random

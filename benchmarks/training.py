@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--size", default="160x120")
-    parser.add_argument("--views", default="4-6", help="least and most")
+    parser.add_argument("--views", type=int, default=5)
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--crops", type=int, default=2)
     parser.add_argument("--threads", type=int, default=1)
@@ -79,8 +79,7 @@ def main() -> None:
         measure(args, args.measure)
         return
     width, height = map(int, args.size.split("x"))
-    least, _, most = args.views.partition("-")
-    made = GenerateOptions(width=width, height=height, views=(int(least), int(most or least)))
+    made = GenerateOptions(width=width, height=height, views=args.views)
     generate(args.folder / "scenes", args.scenes, made)
     print(LINE.format("", "peak, GB", "steps per s", "processor s/step", "ratio"))
     prepared = run(args, "prepare")

@@ -3,7 +3,7 @@
     python examples/01_make_scene.py made
 
 A furnished room is photographed from an arc of views, and every pixel becomes one Gaussian with the errors of a
-predicted depth (docs: "generator"). `gsmerge lab generate` makes many such scenes, of other kinds too. The folder gets
+predicted depth (docs: "generator"). `gsmerge lab generate` makes many such scenes. The folder gets
 
     scene.ply          one Gaussian per pixel, 17 columns, view-major and row-major
     transforms.json    the cameras (nerfstudio: camera to world, OpenGL axes)
@@ -27,15 +27,14 @@ def make_scene(out: str | Path, *, num_views: int = 6, width: int = 240, height:
     """Write the scene folder and return it.
 
     Args:
-        out: Folder of the scene; a scene that was made there before is replaced.
+        out: Folder of the scene, new or empty; one with the same scene stays.
         num_views: Views with Gaussians, at least 2; the targets are one fewer.
         width: Image width, pixels.
         height: Image height, pixels.
         seed: Seeds the room and every error; the same seed writes the same bytes.
     """
-    views = (num_views, num_views)
-    options = GenerateOptions(views=views, width=width, height=height, style="room", path="arc", ranges=EXPORT)
-    return generate_scene(Path(out), options, seed=seed, overwrite=True)
+    options = GenerateOptions(views=num_views, width=width, height=height, ranges=EXPORT)
+    return generate_scene(Path(out), options, seed=seed)
 
 
 def main() -> None:

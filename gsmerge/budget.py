@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gsmerge.errors import UsageError
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 
@@ -15,7 +16,7 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
     if options.budget in (None, AUTO, *DEVICES):
         return None
     if size := file_size(options):
-        return min(count_for_bytes(size.file, size.finest, sh_degree), num_input)
+        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), num_input)
     return parse_budget(str(options.budget), num_input)
 
 
@@ -25,26 +26,21 @@ class FileSize:
 
     num_bytes: int
     file: Format  # of the output
-    levels: int = 1  # that are in it, each see LEVEL_FACTOR
 
     @property
     def packed(self) -> bool:
         """Whether the bytes depend on the content, so that only trials tell them."""
         return self.file is not PLY
 
-    @property
-    def finest(self) -> int:
-        """Approximate bytes that are left for the finest level."""
-        return int(self.num_bytes / sum(LEVEL_FACTOR**-level for level in range(self.levels)))
-
 
 def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the size that a budget in bytes asks for; None for any other budget."""
+    """Return the size that a budget in bytes asks for; None for any other, UsageError where no format counts them."""
     if not options.in_bytes:
         return None
     file = output_format(options.output or PLY.ending, levels=True)
-    in_one = file.encode is None and file is not PLY
-    return FileSize(parse_bytes(str(options.budget)), file, options.levels if in_one else 1)
+    if not file.each:
+        raise UsageError(f"budget: expected a number or a share of Gaussians for {file.ending}, got {options.budget}")
+    return FileSize(parse_bytes(str(options.budget)), file)
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:

@@ -15,7 +15,7 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import SCENE_SUFFIXES, SEVERAL_USES, may_hold_gaussians
+from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, input_format, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
@@ -77,6 +77,8 @@ def holds_scene(path: Path) -> bool:
         return os.path.exists(path) and may_hold_gaussians(path)
     if suffix == SUFFIX:
         return os.path.isfile(path) and not holds_features(path)
+    if path.name == META:
+        return input_format(path).holds(path)
     return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 

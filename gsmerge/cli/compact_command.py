@@ -95,7 +95,7 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import COLMAP, INDEX
+    from gsmerge.io.formats.table import INDEX, output_format
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -112,8 +112,8 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     if model and settings.budget.levels > 1:
         raise UsageError(f"{out}: expected no --levels for a web site or a COLMAP model")
-    if COLMAP.names(out) and settings.budget.in_bytes:
-        raise UsageError(f"{out}: expected a --budget in Gaussians for a COLMAP model")
+    if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
+        raise UsageError(f"{out}: expected a --budget in Gaussians for such files, got {settings.budget.budget}")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
     cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]

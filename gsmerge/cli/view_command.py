@@ -90,7 +90,7 @@ def _compact_sizes(
         results[name] = result.gaussians
         if pair.scene.aligned and len(result.cameras) == len(pair.scene):
             cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
-    return results, cameras, [measure_bytes([gaussians], PLY) for gaussians in results.values()]
+    return results, cameras, [measure_bytes(gaussians, PLY) for gaussians in results.values()]
 
 
 def _open(page: Path) -> bool:

@@ -89,13 +89,11 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
     if cleans_last:
         best = clean_candidate(best, prepared, plan)
     if packed:
-        from gsmerge.compaction.file_size import meet_bytes, meet_bytes_of_levels
+        from gsmerge.compaction.file_size import meet_bytes
 
         best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-    if packed:
-        best = meet_bytes_of_levels(best, levels, rebuild, prepared, plan)
     return make_result(best, levels, prepared, plan, search.facts())
 
 

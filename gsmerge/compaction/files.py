@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
+from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.runtime.memory import release_memory
@@ -31,9 +32,6 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES
 from gsmerge.types import Cameras, Scene
-
-if TYPE_CHECKING:
-    from gsmerge.compaction.streamed_parts import StreamedParts
 
 # Opacity times area of a scene's Gaussians together, of each view, as a share of its box's squared diagonal: all of it
 # that is left once they are merged is at most a tenth of this where each result is too transparent to be kept
@@ -86,17 +84,11 @@ def compact_files(
         if len(result.gaussians) == 0:
             raise nothing_left(files.ply)
         result = _padded(result) if outputs.full_columns else result
-        parts = None
-        if ending == INDEX:
-            from gsmerge.compaction.streamed_parts import split_levels
-
-            parts = split_levels(result, load.scene, settings, progress)
-            result = parts.noted(result)
         compacted, results = perf_counter(), (result, *result.coarser)
         comments = [RESULT_COMMENT, *load.comments]
         views_named = result.cameras[views], name_photos(files.images, names), scene_title(files.ply)
         notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
-        written = _write_results(add, outputs, first, results, comments, views_named, parts)
+        written = _write_results(add, outputs, first, results, comments, views_named)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         document = report_document(
@@ -107,8 +99,8 @@ def compact_files(
             recognised=load.recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
-    if parts is not None:
-        parts.remove_unused(out)
+    if ending == INDEX:
+        remove_unused_chunks(out)
     return document
 
 
@@ -141,13 +133,11 @@ def _write_results(
     results: Sequence[CompactResult],
     comments: Sequence[str],
     views: tuple[Cameras, Photos, str],
-    parts: StreamedParts | None,
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
 
-    A COLMAP model and a web site have the ``views``, too: cameras, names with photos, and the scene's title; ``parts``
-    are those of a ``lod-meta.json``. Returns the path of each result, in their order, with its files as they are before
-    they are renamed.
+    A COLMAP model and a web site have the ``views``, too: cameras, names with photos, and the scene's title. Returns
+    the path of each result, in their order, with its files as they are before they are renamed.
     """
     out = outputs.result
     ending = output_format(out, levels=True, cameras=True).ending
@@ -158,8 +148,9 @@ def _write_results(
         from gsmerge.pages.site import add_site
 
         return {out: add_site(add, out, first, results[0].gaussians, cameras, title, comments)}
-    if parts is not None:
-        return parts.write(add, out, first, comments)
+    if ending == INDEX:
+        (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments)
+        return {out: [first, *finest], **dict(coarser)}
     written = {out: [first]}
     for level in range(1, len(results)):
         path = level_output(out, level)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,18 +12,17 @@ from gsmerge.io.bounds import read_budget
 from gsmerge.types import StrPath
 
 # For others, zipfile unpacks each piece of packed bytes whole, whatever the directory promises
-_METHODS = {zipfile.ZIP_STORED: "stored", zipfile.ZIP_DEFLATED: "deflated"}
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _PIECE = 1 << 14  # bytes that are unpacked in a budget's step
 
 
 @contextmanager
-def open_archive(path: StrPath, methods: Collection[int] = tuple(_METHODS)) -> Iterator[zipfile.ZipFile]:
-    """Open an archive; SceneError unless all its members are stored or deflated, or packed by one of ``methods``."""
+def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; SceneError unless all its members are stored or deflated."""
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
-            if info.compress_type not in methods:
-                allowed = " or ".join(_METHODS[method] for method in methods)
-                problem = f"{info.filename!r:.80}: expected a member that is {allowed}, found one packed"
+            if info.compress_type not in _METHODS:
+                problem = f"{info.filename!r:.80}: expected a member that is stored or deflated, found one packed"
                 raise SceneError(path, f"{problem} by method {info.compress_type}", "pack it again")
         yield archive
 

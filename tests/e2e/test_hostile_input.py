@@ -39,7 +39,6 @@ OFTEN = (
     "views.npz: poses as an object", "results.npz: a bomb of floats", "image: PNG that claims 60000 x 60000",
     "image: .tiff masks of a tile of 26000 x 26000, <", "folder with line breaks", "scene.ply as a pipe",
     "images as a loop", "a device as cameras", "output out.ply, a pipe",
-    "chunk: a payload for cameras", "chunk: tuples 60 deep as a key",
 )  # fmt: skip
 NAMES = sorted(CASES, key=lambda name: name not in OFTEN)
 COMPACTED = ("one position 1e30", "half of the positions NaN", *(f"{what} 1e38" for what in ("colours", "opacities",

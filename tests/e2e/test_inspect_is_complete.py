@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-import copy
-import importlib
 import random
 import shutil
 import sys
@@ -22,6 +20,7 @@ from hostile import array_files, camera_models, places
 from hostile.case import cameras_of, without_transforms
 from messages import says
 from saved_cameras import embed as embed_cameras
+from tiny_scene import make_tiny
 
 import gsmerge
 from gsmerge.cli import main
@@ -75,16 +74,6 @@ class Kind:
     many: int = MANY  # mutations in the sweep
 
 
-def chunk(folder: Path) -> None:
-    chunks_module().saved(lambda entry, _: None)(folder)
-
-
-def chunks_module() -> Any:
-    """What writes chunks, which takes torch."""
-    pytest.importorskip("torch", reason="torch is not installed")
-    return importlib.import_module("hostile.chunks")
-
-
 STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
@@ -96,7 +85,6 @@ KINDS = {
     "results.npz": Kind("results.npz", of_views("results.npz")),
     "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), many=FEWER),
     "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), many=FEWER),
-    "chunk": Kind("*.torch", chunk),
     "state": Kind("a.gsm", extended("."), STATE),
     "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
@@ -146,17 +134,10 @@ def test_a_file_is_read_with_what_is_beside_it(smallest_scene: Path, tmp_path: P
     assert not check_content(folder / "views.npz").notes
 
 
-def test_all_scenes_of_a_chunk_are_read(smallest_scene: Path, tmp_path: Path) -> None:
-    folder, chunks = Path(shutil.copytree(smallest_scene, tmp_path / "scene")), chunks_module()
+def test_all_scenes_of_a_chunk_are_read(tmp_path: Path) -> None:
+    from re10k_chunks import entry, save
 
-    def twice(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
-        return [entry, {**copy.deepcopy(entry), "key": "other"}]
-
-    def damaged(entry: dict[str, Any], _: Path) -> list[dict[str, Any]]:
-        return [entry, {**entry, "key": "other", "images": copy.deepcopy(entry["images"][:2])}]
-
-    chunks.saved(twice)(folder)
-    assert check_content(folder / chunks.NAME).count == 6
-    shutil.copy(smallest_scene / "transforms.json", folder)
-    chunks.saved(damaged)(folder)
-    assert says(check_content(folder / chunks.NAME).problems[0], "", "3 images", "found 2")
+    one, other = entry(make_tiny(), "one"), entry(make_tiny(), "other")
+    assert check_content(save(tmp_path, one, other)).count == 6
+    problems = check_content(save(tmp_path, one, other | {"images": other["images"][:2]})).problems
+    assert says(problems[0], "", "3 images", "found 2")

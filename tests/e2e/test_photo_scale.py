@@ -25,9 +25,7 @@ ERRORS = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene of 96 x 64 with photos and targets of 192 x 128. Read only."""
-    options = GenerateOptions(
-        views=(NUM_VIEWS, NUM_VIEWS), width=96, height=64, style="room", path="arc", ranges=ERRORS, photo_scale=2
-    )
+    options = GenerateOptions(views=NUM_VIEWS, width=96, height=64, ranges=ERRORS, photo_scale=2)
     out = generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
     ply = out / "scene.ply"
     gsmerge.write_ply(ply, nudged(gsmerge.read_ply(ply).gaussians), overwrite=True)

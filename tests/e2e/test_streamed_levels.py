@@ -3,23 +3,45 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
+from splat_transform_programs import needs_program, put_stand_in
 
 import gsmerge
 from gsmerge.io import read_gaussians
+from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.streamed import read_index
 
 from .conftest import Run, assert_refused, listing
 
+FOUND = os.environ.get(VARIABLE)
 QUICK = ("--set", "superpixels=200", "--fit", "none", "--set", "checkpoint=none", "--threads", 1)
+
+
+@pytest.fixture(autouse=True)
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for splat-transform, in each test that does not take the program itself."""
+    put_stand_in(tmp_path / "program", monkeypatch)
 
 
 @pytest.fixture
 def index(tmp_path: Path) -> Path:
     return tmp_path / "web" / "lod-meta.json"
+
+
+@pytest.mark.slow
+@needs_program()
+def test_the_program_itself_writes_them(
+    small_scene: Path, index: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(VARIABLE) if FOUND is None else monkeypatch.setenv(VARIABLE, FOUND)
+    document = json.loads(run("compact", small_scene, "-o", index, *QUICK, "--json", code=0).out)
+    counts = [document["output"]["num_gaussians"], *(level["num_gaussians"] for level in document["levels"])]
+    assert read_index(index).counts == counts
+    assert json.loads(run("inspect", index, "--json", code=0).out)["count"] == counts[0]
 
 
 def test_three_levels_in_a_folder_of_their_own(small_scene: Path, index: Path, run: Run) -> None:
@@ -78,3 +100,12 @@ def test_a_run_that_fails_leaves_no_folder(
 def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json")
     assert_refused(run(*words), 2, "output", ".ply")
+
+
+@pytest.mark.parametrize("name", ["lod-meta.json", "a.html", "colmap"])
+def test_a_budget_in_bytes_needs_a_format_that_counts_them(
+    name: str, small_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    out = tmp_path / "new" / name
+    assert_refused(run("compact", small_scene, "-o", out, "--budget", "5MB"), 2, "", "--budget", "5MB")
+    assert not out.parent.exists()

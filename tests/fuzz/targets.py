@@ -16,11 +16,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import pytest
 from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
 from saved_cameras import camera_comments
+from splat_transform_programs import write_set
 from tiny_scene import (
     make_tiny,
     save_json,
@@ -214,7 +214,7 @@ def sharp(folder: Path) -> Iterable[bytes]:
 
 def levels(folder: Path) -> Iterable[bytes]:
     """Make two levels of detail."""
-    gsmerge.write_levels(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)])
+    write_set(folder / "lod-meta.json", [random_gaussians(n, n) for n in (6, 3)], leaves=2)
     yield pack(folder)
 
 
@@ -284,16 +284,6 @@ def arrays(folder: Path) -> Iterable[bytes]:
         yield (folder / f"{name}.npz").read_bytes()
 
 
-def chunk(folder: Path) -> Iterable[bytes]:
-    """Make a ``.torch`` chunk of one scene."""
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-
-    rows = torch.cat([torch.tensor([[0.9, 0.9, 0.5, 0.5, 0, 0]]), torch.eye(4)[:3].reshape(1, 12)], 1)
-    photo = torch.from_numpy(np.frombuffer(next(photos(folder, (".jpg",))), np.uint8).copy())
-    torch.save([{"key": "a", "cameras": rows, "images": [photo]}], folder / "a.torch")
-    yield (folder / "a.torch").read_bytes()
-
-
 def photos(folder: Path, endings: Sequence[str] = PHOTO_ENDINGS) -> Iterator[bytes]:
     """Make a small photo in every format, and PNG files with transparency, a palette and 16 bits."""
     picture = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
@@ -344,7 +334,6 @@ TARGETS: dict[str, Target] = {
     "long-lrm": Target("moved/opencv_cameras.json", moved, check_cameras),
     "dataparser": Target("moved/transforms.json", dataparser, lambda path: read_dataparser(path, path)),
     "npz": Target("results.npz", arrays, check_arrays),
-    "chunk": Target("000000.torch", chunk, check_cameras),
     "cameras-embedded": Target("a.ply", plys, check_cameras),
     "sharp": Target("a.ply", sharp, read_sharp_camera),
     "gsm": Target("a.gsm", states, load_state),

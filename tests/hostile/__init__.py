@@ -6,8 +6,6 @@ Read by ``tests/e2e/test_hostile_input.py``. What a reader refuses, and in which
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 from . import array_files, camera_files, camera_models, glb_files, packed_files, pictures, places, ply_files
 from .array_files import MARKER
 from .case import Case
@@ -22,9 +20,5 @@ CASES: dict[str, Case] = {
     **pictures.CASES,
     **places.CASES,
 }
-if find_spec("torch"):  # which writes them
-    from . import chunks
-
-    CASES |= chunks.CASES
 
 __all__ = ["CASES", "MARKER", "Case"]

@@ -149,8 +149,8 @@ _SHARP = CameraFormat(
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
 _RE10K = CameraFormat(
-    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`", CHUNK, _lazy("re10k.read_re10k"),
-    W2C_OPENCV, "divided by the size",
+    "re10k chunk", "`.torch` chunk of re10k, the scene named like the `.ply`; needs torch", CHUNK,
+    _lazy("re10k.read_re10k"), W2C_OPENCV, "divided by the size",
 )  # fmt: skip
 # In the order of trial: the first of a file's ending that recognises it
 CAMERA_FORMATS = (

@@ -13,7 +13,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import DEPTHS, PLY, SCENE_SUFFIXES, input_format
+from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, input_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, gather, make_array
@@ -147,7 +147,8 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     """Read a file of Gaussians; the ending of its name tells the format.
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2), ``.glb``, and ``.npz`` of depth maps; of a
-    ``lod-meta.json``, it is the finest level. Everything else is read by :func:`read_ply`, for which ``opacity`` is.
+    ``lod-meta.json``, it is the finest level. splat-transform reads ``.ksplat``, ``meta.json`` or its folder, ``.lcc``
+    and ``.lcc2``. Everything else is read by :func:`read_ply`, for which ``opacity`` is.
     SceneError if the file cannot be read, is damaged, or holds no finite Gaussian; ValueError for another ``opacity``.
 
     Example:
@@ -155,7 +156,9 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
         >>> len(gsmerge.read_gaussians("demo/small.spz").gaussians)
         7680
     """
-    path, chosen = Path(path), input_format(path)
+    path = Path(path)
+    path = path / META if path.is_dir() and (path / META).is_file() else path
+    chosen = input_format(path)
     if chosen.read is None:
         problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {chosen.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made of")

@@ -8,8 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gsmerge.io.formats.read import read_gaussians
-from gsmerge.io.formats.streamed import write_levels
-from gsmerge.io.formats.table import COLMAP, INDEX, LEVELS, PLY, SITE, SITE_SCENE, input_format, output_format
+from gsmerge.io.formats.table import COLMAP, HTML, LEVELS, PLY, SITE, SITE_SCENE, input_format, output_format
 from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
@@ -47,12 +46,9 @@ def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     if not rounding_notes(path, gaussians):
         return gaussians
     chosen = output_format(path, levels=True, cameras=True)
-    name = INDEX if chosen is LEVELS else SITE_SCENE if chosen is SITE else f"a{chosen.ending}"
+    name = SITE_SCENE if chosen in (LEVELS, SITE, HTML) else f"a{chosen.ending}"
     if input_format(name).read is None:
         name = "a.ply"  # in float32, as a USD file
     with TemporaryDirectory() as folder:
-        if chosen is LEVELS:
-            write_levels(Path(folder) / name, [gaussians])
-        else:
-            write_gaussians(Path(folder) / name, gaussians)
+        write_gaussians(Path(folder) / name, gaussians)
         return read_gaussians(Path(folder) / name).gaussians

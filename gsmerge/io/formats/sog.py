@@ -27,12 +27,12 @@ from gsmerge.errors import SceneError
 from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.formats import arrays
+from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 VERSION = 2
-META = "meta.json"
 GENERATOR = "gsmerge"
 # All that a writer makes
 FILES = (

@@ -1,9 +1,8 @@
 """Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format"): levels of detail that viewers load.
 
 ``lod-meta.json`` is a tree of boxes. For each level, a leaf names a run of rows in a chunk: an
-unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits:
-by distance, or by the ``errors`` of the leaf, one for each level from 0 on. What an
-``environment`` holds is shown with every level.
+unbundled ``.sog`` in a folder of its own. A viewer loads what it sees, at the level that fits. What an
+``environment`` holds is shown with every level. PlayCanvas' splat-transform writes all of it.
 """
 
 from __future__ import annotations
@@ -12,55 +11,39 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry import morton_codes, quat_to_rotmat
-from gsmerge.io.atomic import AddOutput, atomic_outputs, remove_stale
+from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
-from gsmerge.io.formats.arrays import MIP_COMMENT
 from gsmerge.io.formats.read import GaussianFile, convert_files
+from gsmerge.io.formats.splat_transform import run_program
 from gsmerge.io.formats.table import INDEX
-from gsmerge.io.formats.write import check_readable
-from gsmerge.kernels.elementary import exp, log1p
+from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
 
 VERSION = 1
 MAX_DEGREE = sog.MAX_DEGREE
-# Gaussians in a chunk: all of them have harmonics of their own in its palette, and its .85 MB are one download
-CHUNK_SIZE = 2**sog.PALETTE_BITS
-# Gaussians of all levels in a leaf, for which a viewer chooses one level: a quarter of a chunk, so that
-# the few hundred thousand of a room are some twenty places with levels of their own
-LEAF_SIZE = CHUNK_SIZE // 4
-ERROR_DIGITS = 4
+# Thousands of Gaussians of a place for which a viewer chooses one level: the few hundred thousand of a room are some
+# twenty places with levels of their own
+CHUNK_THOUSANDS = 16
+ITERATIONS = 1  # of the program's palettes: ten take four times as long and show nothing more
 MAX_LEVELS = 64  # no real file has more than a dozen
-ENVIRONMENT = "env"
-_CHUNK = re.compile(rf"(\d+_\d+|{ENVIRONMENT})-[0-9a-f]{{8}}")
-
-
-@dataclass
-class Leaf:
-    """A place and its Gaussians at each level."""
-
-    node: dict[str, Any]  # its part of the index
-    rows: list[np.ndarray]  # of each level
-
-
-# Errors [leaves, levels] of leaves, no smaller from level to level; 0 is the finest level's
-LeafErrors = Callable[[Sequence[Leaf]], np.ndarray]
+_CHUNK = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # a folder of a chunk: its level, its number, a hash
 
 
 def write_levels(
     path: StrPath, levels: Sequence[Gaussians], *, overwrite: bool = False, comments: Sequence[str] = ()
 ) -> None:
-    """Write levels of detail as Streamed SOG: an index, and chunks in folders beside it.
+    """Write levels of detail as Streamed SOG, by splat-transform: an index, and chunks beside it.
 
     A viewer loads the chunks that it sees, at the level that fits. All files are written, or none; the chunks of
     an index that is replaced are removed.
@@ -72,7 +55,7 @@ def write_levels(
         comments: Lines as of :func:`write_gaussians`, of which "SplatRenderMode: mip" is kept.
 
     Raises:
-        UsageError: If the name is another one.
+        UsageError: If the name is another one, or splat-transform is not installed.
         SceneError: If the file exists or cannot be written.
         ValueError: If there is NaN or inf, no Gaussian at some level, or a comment is no line of ASCII.
 
@@ -90,146 +73,41 @@ def write_levels(
 
 
 def add_levels(
-    add: AddOutput,
-    path: Path,
-    index: Path,
-    levels: Sequence[Gaussians],
-    comments: Sequence[str] = (),
-    *,
-    environment: Gaussians | None = None,
-    measure: LeafErrors | None = None,
+    add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
 ) -> list[tuple[Path, list[Path]]]:
     """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
 
-    ``environment`` and ``measure`` are as of :func:`streamed_files`. Returns, for each level, the final path
-    of its first chunk's ``meta.json``, and the present paths of all its files; an environment's are the finest level's.
+    Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
     """
-    for gaussians in levels if environment is None else (*levels, environment):
-        check_readable(gaussians, comments)
-    firsts: dict[str, Path] = {}
-    written: dict[str, list[Path]] = {}
-    mip = MIP_COMMENT in comments
-    for name, data in streamed_files(levels, mip=mip, environment=environment, measure=measure).items():
-        if name == INDEX:
-            index.write_bytes(data)
-            continue
-        target, level = path.parent / name, "0" if name.startswith(ENVIRONMENT) else name.partition("_")[0]
-        same = target.is_file() and target.read_bytes() == data  # its name has a hash of its content
-        written.setdefault(level, []).append(target if same else add(target))
-        if not same:
-            written[level][-1].write_bytes(data)
-        if target.name == sog.META:
-            firsts.setdefault(level, target)
-    return [(firsts[level], files) for level, files in written.items()]
+    with TemporaryDirectory(prefix="gsmerge-") as folder:
+        words: list[object] = []
+        for level, gaussians in enumerate(levels):
+            words += [ply := Path(folder) / f"{level}.ply", "-l", level]
+            write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=comments)
+        made = Path(folder) / "made" / INDEX
+        run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, made)
+        _name_by_content(made)
+        index.write_bytes(made.read_bytes())
+        written = []
+        for chunks in read_index(made).levels:
+            files = [file for chunk in chunks for file in sorted(chunk.parent.iterdir())]
+            places = [path.parent / file.relative_to(made.parent) for file in files]
+            written.append((next(place for place in places if place.name == sog.META), list(map(add, places))))
+            for file, temporary in zip(files, written[-1][1], strict=True):
+                temporary.write_bytes(file.read_bytes())
+    return written
 
 
-def streamed_files(
-    levels: Sequence[Gaussians],
-    *,
-    mip: bool = False,
-    environment: Gaussians | None = None,
-    measure: LeafErrors | None = None,
-) -> dict[str, bytes]:
-    """Encode levels of detail, the finest first, as files by path below one folder; the index comes last.
-
-    The name of a chunk's folder contains its level, its number and a hash of its content. So chunks of two results
-    never mix, on disk or in a browser's cache. ``mip`` marks antialiased Gaussians; the ``environment`` belongs to no
-    level; ``measure`` computes the errors of the leaves. ValueError if a level is empty or not finite.
-    """
-    if not levels or not all(len(level) for level in levels):
-        raise ValueError("levels: expected Gaussians in each, got none")
-    columns = [arrays.to_columns(level, MAX_DEGREE) for level in levels]
-    leaves: list[Leaf] = []
-    tree = _Boxes(columns).split(leaves)
-    if measure is not None:
-        for leaf, errors in zip(leaves, measure(leaves).tolist(), strict=True):
-            leaf.node["errors"] = [float(f"{error:.{ERROR_DIGITS}g}") for error in errors]
-    files: dict[str, bytes] = {}
-    names: list[str] = []
-    for level, level_columns in enumerate(columns):
-        for number, members in enumerate(_pack([len(leaf.rows[level]) for leaf in leaves])):
-            parts = [_along_curve(level_columns.means, leaves[i].rows[level]) for i in members]
-            offsets = np.cumsum([0, *map(len, parts)])
-            for i, part, offset in zip(members, parts, offsets, strict=False):
-                run = {"file": len(names), "offset": int(offset), "count": len(part)}
-                leaves[i].node["lods"][str(level)] = run
-            chunk = sog.sog_files(level_columns.take(np.concatenate(parts)), mip=mip)
-            folder = f"{level}_{number}-{_hash(chunk)}"
-            files |= {f"{folder}/{name}": data for name, data in chunk.items()}
-            names.append(f"{folder}/{sog.META}")
-    counts = [len(level_columns) for level_columns in columns]
-    index = {"version": VERSION, "asset": {"generator": sog.GENERATOR}, "count": sum(counts), "counts": counts}
-    index |= {"lodLevels": len(counts), "lodErrors": measure is not None}
-    if environment is not None:
-        chunk = sog.sog_files(arrays.to_columns(environment, MAX_DEGREE), mip=mip)
-        folder = f"{ENVIRONMENT}-{_hash(chunk)}"
-        files |= {f"{folder}/{name}": data for name, data in chunk.items()}
-        index["environment"] = f"{folder}/{sog.META}"
-    index |= {"filenames": names, "tree": tree}
-    return files | {INDEX: json.dumps(index).encode("ascii")}
-
-
-class _Boxes:
-    """The centres of all levels, and the boxes of what they show."""
-
-    def __init__(self, columns: Sequence[arrays.Columns]) -> None:
-        self.means = np.concatenate([level.means for level in columns])
-        self.starts = np.cumsum([0, *map(len, columns)])  # first row of each level
-        rotations = quat_to_rotmat(np.concatenate([level.quats for level in columns]))
-        scales = exp(np.concatenate([level.log_scales for level in columns]))
-        widths = (np.abs(rotations) * scales[:, None]).sum(-1)  # of the box about the turned ellipsoid
-        logs = log1p(np.abs(self.means).max(0))
-        rounding = (1 + np.abs(self.means)) * 2 * logs / 65535  # as far as a .sog moves a centre
-        self.low = self.means - widths - rounding
-        self.high = self.means + widths + rounding
-
-    def split(self, leaves: list[Leaf], rows: np.ndarray | None = None) -> dict[str, Any]:
-        """Halve rows along their longest side until they are few; return the node, and append its leaves."""
-        rows = np.arange(len(self.means)) if rows is None else rows
-        inside = self.means[rows]
-        extent = np.ptp(inside, axis=0)
-        node: dict[str, Any] = {
-            "bound": {
-                "min": [float(f"{value:.8g}") for value in self.low[rows].min(0)],
-                "max": [float(f"{value:.8g}") for value in self.high[rows].max(0)],
-            }
-        }
-        if len(rows) <= LEAF_SIZE or not extent.max() > 0:
-            ends = np.searchsorted(rows, self.starts)
-            level_rows = [rows[a:b] - start for a, b, start in zip(ends, ends[1:], self.starts, strict=False)]
-            leaves.append(Leaf(node | {"lods": {}}, level_rows))
-            return leaves[-1].node
-        places = inside[:, int(extent.argmax())]
-        middle = np.partition(places, len(rows) // 2)[len(rows) // 2]
-        first = places < middle if places.min() < middle else places <= middle
-        return node | {"children": [self.split(leaves, rows[first]), self.split(leaves, rows[~first])]}
-
-
-def _pack(sizes: Sequence[int]) -> Iterator[list[int]]:
-    """Yield the indices of neighbouring leaves that share a chunk; empty leaves have no chunk."""
-    members: list[int] = []
-    total = 0
-    for i, size in enumerate(sizes):
-        if members and total + size > CHUNK_SIZE:
-            yield members
-            members, total = [], 0
-        if size:
-            members.append(i)
-            total += size
-    if members:
-        yield members
-
-
-def _along_curve(means: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    return rows[np.argsort(morton_codes(means[rows]), kind="stable")]
-
-
-def _hash(files: dict[str, bytes]) -> str:
-    digest = hashlib.sha256()
-    for name, data in files.items():
-        digest.update(f"{name}:{len(data)}:".encode())
-        digest.update(data)
-    return digest.hexdigest()[:8]
+def _name_by_content(path: Path) -> None:
+    """Add a hash of its content to the name of each chunk's folder: chunks of two results never mix, nor in a cache."""
+    document = read_json(path)
+    for number, name in enumerate(document["filenames"]):
+        folder, digest = (path.parent / name).parent, hashlib.sha256()
+        for file in sorted(folder.iterdir()):
+            digest.update(file.read_bytes())
+        renamed = folder.rename(f"{folder}-{digest.hexdigest()[:8]}")
+        document["filenames"][number] = f"{renamed.name}/{sog.META}"
+    path.write_bytes(json.dumps(document).encode())
 
 
 @dataclass(frozen=True)
@@ -375,27 +253,14 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
 
 
 def remove_unused_chunks(path: Path) -> None:
-    """Remove chunks of :func:`streamed_files` beside an index that does not name them.
+    """Remove the chunks beside an index that it does not name: those of the one that it replaced.
 
-    Other files in the folders of the chunks stay, together with their folders; so do files that cannot be removed.
+    Other files in their folders stay, and so do files that cannot be removed.
     """
-    index = read_index(path)
-    chunks = [chunk for level in index.levels for chunk in level]
-    used = {chunk.parent.name for chunk in (*chunks, index.environment) if chunk is not None}
-    with suppress(OSError), os.scandir(path.parent) as entries:
-        for entry in list(entries):
-            if _CHUNK.fullmatch(entry.name) and entry.name not in used and entry.is_dir(follow_symlinks=False):
-                folder = Path(entry.path)
-                remove_stale(folder)
-                for name in sog.FILES if _is_ours(folder) else ():
-                    with suppress(OSError):
-                        os.unlink(folder / name)
-                with suppress(OSError):
-                    os.rmdir(folder)
-
-
-def _is_ours(folder: Path) -> bool:
-    try:
-        return bool(read_json(folder / sog.META)["asset"]["generator"] == sog.GENERATOR)
-    except (SceneError, LookupError, TypeError):
-        return False
+    used = {chunk.parent.name for level in read_index(path).levels for chunk in level}
+    for folder in path.parent.iterdir():
+        if _CHUNK.fullmatch(folder.name) and folder.name not in used and folder.is_dir() and not folder.is_symlink():
+            with suppress(OSError):
+                for name in sog.FILES:
+                    (folder / name).unlink(missing_ok=True)
+                folder.rmdir()

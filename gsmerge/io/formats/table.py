@@ -32,8 +32,9 @@ class Format:
     # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # of the harmonics that are written; -1: it is only read
-    require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package is missing
-    each: Sequence[float] = ()  # bytes of a Gaussian by degree: of a .sog or .spz those of results, as measured
+    require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package or program is missing
+    # bytes of a Gaussian by degree, of a .sog or .spz those of results, as measured; none where no budget counts them
+    each: Sequence[float] = ()
     round_means: Callable[[np.ndarray], np.ndarray] = lambda means: means  # as it holds them, but for float32
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
@@ -50,18 +51,20 @@ def _lazy(place: str) -> LazyFunction:
 
 
 _SOG = 13.0, 22.0, 36.5, 56.5
+_READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     each=(68.0, 104.0, 164.0, 248.0),
 )  # fmt: skip
 LEVELS = Format(
-    INDEX, "levels of detail in chunks, each a .sog without its zip", _lazy("streamed.read_rows"), None,
-    3, each=_SOG, round_means=_lazy("sog.round_means"),
+    INDEX, "levels of detail in chunks; written by splat-transform",
+    _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
+    round_means=_lazy("sog.round_means"),
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
 SITE = Format(
-    "index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3,
+    "index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3, each=_SOG,
     round_means=_lazy("sog.round_means"),
 )  # fmt: skip
 SITE_SCENE = "scene.sog"
@@ -103,11 +106,32 @@ STATE = Format(
     -1,
     each=(68.0,),
 )
+META = "meta.json"  # of a .sog that is a folder
+HTML = Format(
+    ".html", "PlayCanvas' viewer, by splat-transform", None, _lazy("splat_transform.html_bytes"), 3,
+    require=_lazy("splat_transform.require_html"), round_means=_lazy("sog.round_means"),
+)  # fmt: skip
+BY_PROGRAM = (  # which splat-transform reads or writes in our place
+    Format(".ksplat", "by splat-transform", _READ_BY_PROGRAM, None, -1),
+    Format(
+        META, "a .sog without its zip, by splat-transform", _READ_BY_PROGRAM, None, -1,
+        holds=_lazy("splat_transform.holds_sog"),
+    ),
+    Format(".lcc", "the finest level, by splat-transform", _READ_BY_PROGRAM, None, -1),
+    Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
+    HTML,
+)  # fmt: skip
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
-FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS, STATE)
+FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 FORMER_ENDINGS = ".compressed.ply", ".usda"  # which versions before 0.2 wrote
-SCENE_SUFFIXES = tuple(dict.fromkeys(Path(f"_{row.ending}").suffix for row in (*FILES, DEPTHS) if row.read is not None))
+SCENE_SUFFIXES = tuple(
+    dict.fromkeys(
+        Path(f"_{row.ending}").suffix
+        for row in (*FILES, DEPTHS, *BY_PROGRAM)
+        if row.read is not None and row.ending[0] == "."
+    )
+)
 
 
 def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
@@ -164,7 +188,7 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
     ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a web site, which have cameras.
     """
     allowed = {LEVELS: levels, COLMAP: cameras, SITE: cameras}
-    chosen = next((row for row in (*FORMATS, SITE) if row.names(path)), None)
+    chosen = next((row for row in (SITE, *FORMATS) if row.names(path)), None)
     if chosen is not None and (chosen.max_degree < 0 or not allowed.get(chosen, True)):
         chosen = None
     if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):

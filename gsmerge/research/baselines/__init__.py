@@ -7,6 +7,7 @@ from functools import partial
 from gsmerge.compaction.methods import Method
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import FitOptions
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.research.baselines import greedy, simple, voxel
 from gsmerge.settings.setting import flat_settings
 
@@ -23,4 +24,4 @@ CONTRIBUTION = _baseline("contribution", simple.prune_by_contribution)
 RANDOM = _baseline("random", simple.prune_at_random)
 BLOCKS = _baseline("blocks", partial(simple.merge_superpixels, "grid", "depth"), needs=("pixels",))
 GREEDY = _baseline("greedy", greedy.run)
-SPLAT_TRANSFORM = _baseline("splat-transform", simple.splat_transform, check=simple.find_program)
+SPLAT_TRANSFORM = _baseline("splat-transform", simple.splat_transform, check=find_program)

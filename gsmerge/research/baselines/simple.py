@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +9,10 @@ from typing import Literal
 
 import numpy as np
 
-from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
+from gsmerge.io.formats.splat_transform import run_program
 from gsmerge.plan import Plan
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.runtime.record import stage
@@ -27,9 +24,6 @@ from gsmerge.stages.encode import encode
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Decoded, Gaussians, Groups, Scene
 
-PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
-INSTALL = "npm install -g @playcanvas/splat-transform@3.7.0"
-MAX_OUTPUT = 300  # characters of the program's own output in an error
 MAX_TILED = 2_000_000  # Gaussians in the tiled views under way: each is as large as they are
 
 
@@ -130,34 +124,18 @@ def merge_superpixels(
         return decode(features, members, DecodeOptions(min_opacity=0.0))
 
 
-def find_program() -> str:
-    """Find the path of the program splat-transform; UsageError if it is not installed."""
-    named = os.environ.get(VARIABLE)
-    program = shutil.which(named or PROGRAM)
-    if program is None:
-        place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
-        problem = f"expected the program {place}, found none; install it with: {INSTALL}"
-        raise UsageError(f"method splat-transform: {problem}")
-    return program
-
-
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge by PlayCanvas' splat-transform, an installed program: ``-d COUNT`` on the CPU, with its own defaults.
 
     The input is returned if it has at most ``count`` Gaussians. Nothing is downloaded. Only the run of the program
     counts as time, start-up included, not the transfer of Gaussians.
     """
-    gaussians, program = own_gaussians(prepared.scene), find_program()
+    gaussians = own_gaussians(prepared.scene)
     if len(gaussians) <= count:
         return gaussians
     with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
         before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
         write_ply(before, gaussians)
-        command = [program, "-w", "-g", "cpu", str(before), "-d", str(count), str(after)]
         with stage("reduce"):
-            done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-        if done.returncode != 0 or not after.exists():
-            output = " ".join((done.stderr or done.stdout).decode(errors="replace").split())[-MAX_OUTPUT:]
-            problem = f"expected a decimated .ply, it ended with code {done.returncode}: {output or 'without output'}"
-            raise GsmergeError(f"{program}: {problem}")
+            run_program(before, "-d", count, after)
         return read_ply(after, opacity="logit").gaussians

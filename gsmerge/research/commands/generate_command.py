@@ -25,18 +25,16 @@ class SeriesOptions(Settings):
     """Settings of a series of scenes."""
 
     seed: int = setting(0, "Seed of all random numbers.", least=0)
-    overwrite: bool = setting(False, "Replace scenes that the folder holds.")
 
 
 @opt.command(
     *opt.panel(
         "Scenes",
         opt.option("scenes", int, "Number of scenes.", default=20, min=1),
-        opt.option("views", str, "Views of a scene, or a range to draw their number from.", default="6",
-                   metavar="N|N-M"),
+        opt.option("views", int, "Views of a scene.", default=6, min=2, max=200),
         opt.option("size", str, "Size of the views, pixels.", default="320x240", metavar="WxH"),
     ),
-    opt.settings_option(OPTIONS, SeriesOptions, example="style=room"),
+    opt.settings_option(OPTIONS, SeriesOptions, example="noise=0"),
     opt.output("Folder for the scenes: scene_0000 and on.", default=opt.REQUIRED),
 )  # fmt: skip
 def generate(args: opt.Args) -> None:
@@ -48,10 +46,7 @@ def generate(args: opt.Args) -> None:
     from gsmerge.research.generate import generate as generate_scenes
 
     with stage_progress(quiet=args.silent) as progress:
-        scenes = generate_scenes(
-            out, args.scenes, options, seed=series.seed, overwrite=series.overwrite,
-            progress=partial(progress, "generate"),
-        )  # fmt: skip
+        scenes = generate_scenes(out, args.scenes, options, seed=series.seed, progress=partial(progress, "generate"))
     document = {**document_head(), "options": options.to_dict(), "seed": series.seed, "notes": []}
     document["scenes"] = [{"folder": str(scene.folder), "kept": scene.kept} for scene in scenes]
     kept = sum(scene.kept for scene in scenes)
@@ -64,12 +59,9 @@ def _settings(args: opt.Args) -> tuple[GenerateOptions, SeriesOptions]:
     """Parse the settings of the scenes, and of their series."""
     from gsmerge.research.generate import GenerateOptions
 
-    counts = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", args.views)
-    if counts is None:
-        raise UsageError(f"--views: expected a number such as 6, or a range such as 4-10, got {args.views!r}")
     sides = re.fullmatch(r"(\d{1,5})x(\d{1,5})", args.size)
     if sides is None:
         raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
-    views, (width, height) = (int(counts[1]), int(counts[2] or counts[1])), map(int, sides.groups())
-    options, series = args.make(GenerateOptions, SeriesOptions, views=views, width=width, height=height)
+    width, height = map(int, sides.groups())
+    options, series = args.make(GenerateOptions, SeriesOptions, views=args.views, width=width, height=height)
     return options, series

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import UsageError
 from gsmerge.io import write_ply
-from gsmerge.io.atomic import remove_stale, temporary_path
+from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
 from gsmerge.research.generate.shapes import invert
@@ -33,31 +30,27 @@ class SceneFolder:
     kept: bool
 
 
-def generate_scene(
-    folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0, overwrite: bool = False
-) -> Path:
+def generate_scene(folder: Path, options: GenerateOptions | None = None, *, seed: int = 0, index: int = 0) -> Path:
     """Generate scene ``index`` of the series of ``seed`` into a folder, and return the folder.
 
-    A UsageError if the folder holds something else, a SceneError if it cannot be written.
+    A folder that holds the same scene stays. A UsageError if it holds something else, a SceneError if it cannot be
+    written.
     """
     options = options or GenerateOptions()
     key = scene_key(seed, index, options)
     if not is_complete(folder, key):
-        check_replaceable(folder, overwrite=overwrite)
         scene = make_scene(seed, index, options)
         record = {
             **key,
-            "style": scene.style,
-            "path": scene.path,
             "num_views": len(scene.cameras),
             "num_gaussians": len(scene.gaussians),
             "noise": asdict(scene.noise),
         }
-        with _folder(folder) as temporary:
-            _write_views(temporary, scene.cameras, scene.images)
-            _write_views(temporary / "targets", scene.targets, scene.target_images)
-            write_ply(temporary / "scene.ply", scene.gaussians)
-            (temporary / RECORD).write_bytes(json.dumps(record, indent=1).encode() + b"\n")
+        with atomic_outputs() as add:
+            _write_views(add, folder, scene.cameras, scene.images)
+            _write_views(add, folder / "targets", scene.targets, scene.target_images)
+            write_ply(add(folder / "scene.ply"), scene.gaussians)
+            add(folder / RECORD).write_bytes(json.dumps(record, indent=1).encode() + b"\n")
     return folder
 
 
@@ -67,7 +60,6 @@ def generate(
     options: GenerateOptions | None = None,
     *,
     seed: int = 0,
-    overwrite: bool = False,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[SceneFolder]:
@@ -80,7 +72,7 @@ def generate(
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
-        UsageError: If a folder holds a scene of other options and ``overwrite`` is False, or no synthetic scene.
+        UsageError: If a folder holds something else.
         SceneError: If a folder cannot be written.
     """
     options = options or GenerateOptions()
@@ -90,12 +82,10 @@ def generate(
     for index in range(count):
         folder = out / f"scene_{index:04d}"
         planned.append(SceneFolder(folder, is_complete(folder, scene_key(seed, index, options))))
-        if not planned[-1].kept:
-            check_replaceable(folder, overwrite=overwrite)
     todo = [i for i, scene in enumerate(planned) if not scene.kept]
 
     def work(index: int) -> None:
-        generate_scene(planned[index].folder, options, seed=seed, index=index, overwrite=overwrite)
+        generate_scene(planned[index].folder, options, seed=seed, index=index)
 
     with use_threads(threads) as workers:
         for first in range(0, len(todo), workers):
@@ -106,7 +96,7 @@ def generate(
 
 
 RECORD = "generated.json"
-RECORD_VERSION = 2  # increases when the same seed and options give other scenes
+RECORD_VERSION = 3  # increases when the same seed and options give other scenes
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 
 
@@ -116,61 +106,31 @@ def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]
 
 
 def is_complete(folder: Path, key: Mapping[str, Any]) -> bool:
-    """Return whether a folder holds the scene with this key, complete."""
+    """Return whether a folder holds the scene with this key, complete; a UsageError if it holds anything else."""
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(record, dict) and {name: record.get(name) for name in key} == dict(key)
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir())
-
-
-def check_replaceable(folder: Path, *, overwrite: bool) -> None:
-    """Raise UsageError if a folder holds other files, or a scene of other options without ``overwrite``."""
-    if not os.path.lexists(folder) or _is_empty(folder):
-        return
-    if not (folder / RECORD).is_file():
-        problem = "expected no folder, or a synthetic scene, found something else; choose another OUT"
+        record = None
+    if isinstance(record, dict) and {name: record.get(name) for name in key} == dict(key):
+        return True
+    if folder.is_dir() and any(folder.iterdir()):
+        problem = (
+            "expected no folder, or one with the same scene, found something else; remove it, or choose another OUT"
+        )
         raise UsageError(f"{folder}: {problem}")
-    if not overwrite:
-        problem = "holds a scene of other options; pass --set overwrite=true to replace it, or choose another OUT"
-        raise UsageError(f"{folder}: {problem}")
+    return False
 
 
-@contextmanager
-def _folder(folder: Path) -> Iterator[Path]:
-    """Make a hidden folder next to the final folder, whose place it takes when the block succeeds."""
-    remove_stale(folder.parent)
-    temporary, earlier = temporary_path(folder), temporary_path(folder)
-    try:
-        temporary.mkdir(parents=True)
-        yield temporary
-        if folder.exists():
-            folder.rename(earlier)
-        temporary.rename(folder)
-    except OSError as error:
-        raise SceneError(folder, f"cannot be written ({error.strerror})", "choose another folder") from error
-    finally:
-        if earlier.exists() and not folder.exists():
-            earlier.rename(folder)
-        for path in (temporary, earlier):
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def _write_views(folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
+def _write_views(add: AddOutput, folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
     """Write ``images/`` and ``transforms.json`` (nerfstudio: camera to world, OpenGL axes)."""
-    (folder / "images").mkdir(parents=True)
     frames, digits = [], max(3, len(str(len(images) - 1)))
     for i, image in enumerate(images):
         name = f"images/view_{i:0{digits}d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))
-        (folder / name).write_bytes(data.tobytes())
+        add(folder / name).write_bytes(data.tobytes())
         c2w = matmul(invert(cameras.viewmats[i]), FLIP)
         frames.append({"file_path": name, "transform_matrix": c2w.tolist()})
     K = cameras.Ks[0]
     shared = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": cameras.width, "h": cameras.height}
     document = {"camera_model": "PINHOLE", **shared, "frames": frames}
-    (folder / "transforms.json").write_bytes(json.dumps(document, indent=1).encode() + b"\n")
+    add(folder / "transforms.json").write_bytes(json.dumps(document, indent=1).encode() + b"\n")

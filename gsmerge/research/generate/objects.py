@@ -1,4 +1,4 @@
-"""Objects of synthetic scenes, each standing at the origin, and stages of them; y points down. Sizes are in metres."""
+"""Objects of a room, each standing at the origin, and the room itself; y points down. Sizes are in metres."""
 
 from __future__ import annotations
 
@@ -181,33 +181,6 @@ def random_rotation(rng: np.random.Generator) -> Array:
     return np.stack([sign * x, sign * y, z], 1)
 
 
-def bush(pal: Palette, radius: float, leaves: int) -> Shapes:
-    """Build an uneven core covered with leaves."""
-    rng, green = pal.rng, pal.material("foliage")
-    radii = radius * rng.uniform(0.7, 1.2, 3)
-    out = [blob((0, -0.8 * radii[1], 0), 0.8 * radii, pal.material("crown", repeat=1.2 / radius, gloss=0.0), rng, 0.5)]
-    flower = pal.material("foliage")
-    for _ in range(leaves):
-        away = rng.normal(size=3)
-        away *= radii * rng.uniform(0.8, 1.1) / norm(away)
-        size = radius * rng.uniform(0.08, 0.22)
-        material = flower if rng.random() < 0.15 else green
-        out.append(leaf(away - np.array([0, 0.8 * radii[1], 0]), (0.42 * size, size), material, random_rotation(rng)))
-    return out
-
-
-def tree(pal: Palette, height: float) -> Shapes:
-    """Build a trunk and branches that end in bushes."""
-    rng, bark = pal.rng, pal.material("bark", repeat=0.8, gloss=0.0)
-    fork = np.array([rng.normal(0, 0.05), -0.5, rng.normal(0, 0.05)]) * height
-    out = [rod((0, 0.1, 0), fork, 0.03 * height, bark)]
-    for _ in range(rng.integers(4, 8)):
-        tip = fork + rng.normal(0, 0.17, 3) * height + [0, -0.15 * height, 0]
-        out += [rod(fork, tip, 0.008 * height, bark)]
-        out += place(bush(pal, height * rng.uniform(0.06, 0.16), 20), tip)
-    return out
-
-
 def wire(pal: Palette, start: Array, end: Array, sag: float, radius: float) -> Shapes:
     """Build a hanging cable."""
     t = np.linspace(0, 1, 9)[:, None]
@@ -264,12 +237,8 @@ def clutter(pal: Palette, count: int, half: tuple[float, float], height: float) 
 FACING = axis_rotation(1, np.pi / 2)  # rotates -z to -x
 
 
-def _shell(shapes: list[Shape], *, glow: bool = False) -> list[Shape]:
-    return [replace(s, shell=True, glow=glow) for s in shapes]
-
-
-def light(rng: np.random.Generator, lamp_at: Array | None) -> Light:
-    """Draw a sun or a lamp above and in front of the scene, warm or cool."""
+def light(rng: np.random.Generator, lamp_at: Array) -> Light:
+    """Draw a lamp above and in front of the scene, warm or cool."""
     side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
@@ -287,7 +256,7 @@ def _walls(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     out = [quad((0, 0, 0), (w, d), floor, LYING), quad((0, -h, 0), (w, d), pal.material("plain", gloss=0.0), LYING)]
     out += [quad((0, -h / 2, z), (w, h / 2), papers[0]) for z in (d, -d)]
     out += [quad((x, -h / 2, 0), (d, h / 2), papers[k], FACING) for x, k in ((-w, 1), (w, rng.integers(2)))]
-    out = _shell(out)
+    out = [replace(shape, shell=True) for shape in out]
     skirting = pal.material("plain", "wood")
     out.append(box((-w, -0.09, d - 0.02), (w, 0, d), skirting))
     out += [box((x - 0.02, -0.09, -d), (x + 0.02, 0, d), skirting) for x in (-w, w)]
@@ -334,7 +303,7 @@ def room(pal: Palette) -> Stage:
     focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.4, 1.0), rng.uniform(0.15, 0.35) * d])
     lamp_at = np.array([rng.uniform(-0.3, 0.3) * w, -h + 0.1, rng.uniform(-0.3, 0.2) * d])
     reach = focus[2] + 0.42 * d
-    return Stage(tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.6 * reach, reach), (0.9, 1.8), 35)
+    return Stage(tuple(shapes), tuple(pal.textures), light(rng, lamp_at), focus, (0.6 * reach, reach))
 
 
 def sofa(pal: Palette) -> Shapes:
@@ -355,39 +324,3 @@ def _furniture(pal: Palette) -> Shapes:
     top = clutter(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
     out = table(pal, width, depth, height) + top
     return out + (place(chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])
-
-
-def garden(pal: Palette) -> Stage:
-    """Build bushes, plants and trees under the sky, near and far, behind a fence or wires."""
-    rng, size = pal.rng, 6.0
-    ground = pal.material("grass", "plaster", repeat=rng.uniform(0.3, 0.8), gloss=0.0)
-    shapes = [quad((0, 0, 0), (40 * size, 40 * size), ground, LYING)]
-    crown = pal.material("crown", repeat=2 / size, gloss=0.0)
-    for angle in rng.uniform(0, 2 * np.pi, rng.integers(0, 25)):
-        away, tall = size * rng.uniform(3, 12), size * rng.uniform(0.2, 0.9)
-        spot = away * sin(angle), -0.4 * tall, away * cos(angle)
-        shapes.append(blob(spot, (tall * rng.uniform(0.5, 2), tall, tall), crown, rng, 0.5))
-    dome = ball((0, 0, 0), (30 * size, 18 * size, 30 * size), pal.material("sky", gloss=0.0))
-    shapes = [*_shell(shapes), *_shell([dome], glow=True)]
-    for _ in range(rng.integers(2, 5)):
-        at = rng.uniform(-1.6, 1.6), 0, rng.uniform(-0.3, 1.2)
-        shapes += place(bush(pal, rng.uniform(0.25, 0.6), int(rng.integers(200, 500))), at)
-    for _ in range(rng.integers(1, 4)):
-        pot = plant(pal, rng.uniform(0.4, 1.0), int(rng.integers(30, 120)))
-        shapes += place(pot, (rng.uniform(-1.2, 1.2), 0, rng.uniform(-0.8, 0.4)))
-    for _ in range(rng.integers(1, 5)):
-        shapes += place(tree(pal, rng.uniform(2.0, 4.5)), (rng.uniform(-4, 4), 0, rng.uniform(2, 6)))
-    if rng.random() < 0.6:
-        wall = pal.material("bricks", "plaster", "wood", repeat=0.4)
-        shapes.append(box((-6, -rng.uniform(1, 3), 6.5), (6, 0, 7), wall))
-    post = pal.material("bark", "plain", "wood")
-    for x in np.arange(-2.5, 2.5, rng.uniform(0.1, 0.25)):  # a fence
-        shapes.append(rod((x, 0, 1.8), (x, -0.9, 1.8), 0.012, post))
-    poles = [np.array([x, -2.4, 2.0]) for x in (-2.5, 2.5)]
-    shapes += [rod((pole[0], 0, pole[2]), pole, 0.025, post) for pole in poles]
-    shapes += wire(pal, poles[0], poles[1], rng.uniform(0.1, 0.4), rng.uniform(0.004, 0.012))
-    focus = np.array([rng.normal(0, 0.2), -rng.uniform(0.2, 0.6), rng.uniform(0.0, 0.6)])
-    return Stage(tuple(shapes), tuple(pal.textures), light(rng, None), focus, (1.4, 3.0), (0.5, 1.6), 180)
-
-
-STYLES: dict[str, Callable[[Palette], Stage]] = {"room": room, "garden": garden}

@@ -41,7 +41,7 @@ class Light:
     """The lights of a scene."""
 
     towards: Array  # [3] unit vector to the light
-    lamp: Array | None  # [3] position, near which surfaces are brighter; None: far away, as the sun
+    lamp: Array  # [3] position, near which surfaces are brighter
     key: Array  # [3] linear colour of the direct light
     ambient: Array  # [3] linear colour of the light from all sides
     softness: float  # half width of the light, radians
@@ -56,8 +56,6 @@ class Stage:
     light: Light
     focus: Array  # [3] point at which cameras are aimed
     distance: tuple[float, float]  # range of the distance of cameras from the focus
-    height: tuple[float, float]  # range of the height of cameras above the ground
-    swing: float  # largest angle of cameras to either side of -z, seen from the focus, degrees
 
 
 @dataclass(frozen=True)
@@ -266,9 +264,8 @@ def _shade(view: LitStage, ids: NDArray[np.int32], albedo: Float, world: Float, 
     bias = 1.2 * 2 * view.radius / AMBIENT_SIZE
     around = view.axes[KEY_MAPS:], view.middle, view.radius, view.ambient, bias, view.weights
     add_light(world, normals, *around, indirect)
-    if light.lamp is not None:
-        away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
-        direct *= 2.5 / (1 + (away / norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
+    away = np.linalg.norm(world - light.lamp.astype(np.float32), axis=1)
+    direct *= 2.5 / (1 + (away / norm(light.lamp - view.stage.focus)) ** 2 * 1.5)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     half = light.towards.astype(np.float32) - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)

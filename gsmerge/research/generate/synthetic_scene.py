@@ -1,11 +1,10 @@
-"""One synthetic scene in memory: a stage, its photos, and the Gaussians that a network would predict from them."""
+"""One synthetic scene in memory: a room, its photos, and the Gaussians that a network would predict from them."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import cv2
@@ -16,7 +15,7 @@ from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
-from gsmerge.research.generate.objects import STYLES
+from gsmerge.research.generate.objects import room
 from gsmerge.research.generate.photograph import (
     FAR,
     SAMPLES,
@@ -39,14 +38,13 @@ from gsmerge.types import Cameras, Gaussians
 
 PATH_TRIES, STAGE_TRIES = 6, 6  # paths per stage, and stages, until all views are usable
 SMALL = 8  # views are checked, and exposures computed, at this fraction of the size
-MIXED = "mixed"
 FOCAL = 0.58, 1.75  # range of the focal length, in the longer sides of the photo
-METERED = 200  # views that the exposure is set by
-MAX_VIEWS = 2000
 MIN_NEAR = 0.22  # first percentile of the depths, as a share of their median
 MAX_TURN = 50  # degrees between neighbouring views
+ARC = 15, 60  # range of the angle that a path has around the focus, degrees
+SWING = 35  # largest angle of cameras to either side of -z, seen from the focus, degrees
+HEIGHT = 0.9, 1.8  # range of the height of cameras above the ground, metres
 Pose = Callable[[float], Array]  # camera to world at 0, the start of a path, to 1
-Path = Callable[[Stage, np.random.Generator, int], Pose]
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
@@ -62,64 +60,22 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     return out
 
 
-def _orbit_point(stage: Stage, angle: float, distance: float, height: float) -> Array:
-    """Compute the position ``[3]`` at an angle (degrees, 0 towards -z), a distance from the focus and a height."""
-    x, _, z = stage.focus
-    return np.array([x + distance * sin(np.deg2rad(angle)), -height, z - distance * cos(np.deg2rad(angle))])
-
-
-def arc(stage: Stage, rng: np.random.Generator, num_views: int, low: float, high: float) -> Pose:
-    """Move along an arc of ``low`` to ``high`` degrees around the focus, swaying up and down."""
+def draw_path(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
+    """Draw an arc around the focus that sways up and down."""
     limit = MAX_TURN * max(1, num_views - 1)
-    span = min(rng.uniform(min(low, limit), min(high, limit)), 2 * stage.swing)
-    start = rng.uniform(-stage.swing, stage.swing - span) if span < 2 * stage.swing else -span / 2
-    distance, height = rng.uniform(*stage.distance), rng.uniform(*stage.height)
-    swing = rng.uniform(0, 0.4) * (stage.height[1] - stage.height[0])
+    span = rng.uniform(min(ARC[0], limit), min(ARC[1], limit))
+    start = rng.uniform(-SWING, SWING - span)
+    distance, height = rng.uniform(*stage.distance), rng.uniform(*HEIGHT)
+    swing = rng.uniform(0, 0.4) * (HEIGHT[1] - HEIGHT[0])
     phase, closer = rng.uniform(0, 6.28), rng.uniform(-0.12, 0.12)
 
     def pose(s: float) -> Array:
-        eye = _orbit_point(stage, start + span * s, distance * (1 + closer * s), height + swing * sin(6 * s + phase))
+        angle, away = np.deg2rad(start + span * s), distance * (1 + closer * s)
+        x, _, z = stage.focus
+        eye = np.array([x + away * sin(angle), -(height + swing * sin(6 * s + phase)), z - away * cos(angle)])
         return look_at(eye, stage.focus, 0.03 * sin(5 * s + phase))
 
     return pose
-
-
-def forward(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Move back and forth in a plane with a constant viewing direction."""
-    angle, distance = rng.uniform(-0.5, 0.5) * min(stage.swing, 40), rng.uniform(*stage.distance)
-    eye = _orbit_point(stage, angle, distance, rng.uniform(*stage.height))
-    axes, reach = look_at(eye, stage.focus), rng.uniform(0.06, 0.2) * distance
-    sways, turn = rng.integers(2, 4), rng.normal(0, 0.03, 3)
-
-    def pose(s: float) -> Array:
-        across, down = reach * sin(2 * np.pi * sways * s), reach * (s - 0.5)
-        place = eye + across * axes[:3, 0] + down * axes[:3, 1]
-        return look_at(place, stage.focus + place - eye + turn * sin(7 * s + np.arange(3)), 0.02 * sin(9 * s))
-
-    return pose
-
-
-def walk(stage: Stage, rng: np.random.Generator, num_views: int) -> Pose:
-    """Walk in a line from one position towards another while the viewing direction varies."""
-    side = min(stage.swing, 40)
-    a, b = (_orbit_point(stage, rng.uniform(-side, side), d, rng.uniform(*stage.height)) for d in stage.distance[::-1])
-    b = a + rng.uniform(0.3, 0.9) * (b - a)
-    wander = rng.normal(0, 0.12, 3) * stage.distance[0]
-    phase = rng.uniform(0, 6.28, 3)
-
-    def pose(s: float) -> Array:
-        return look_at(a + (b - a) * s, stage.focus + wander * sin(4 * s + phase), 0.03 * sin(6 * s + phase[0]))
-
-    return pose
-
-
-PATHS: dict[str, Path] = {
-    "arc": partial(arc, low=15, high=60),
-    "forward": forward,
-    "walk": walk,
-    "orbit": partial(arc, low=200, high=340),
-    "wide": partial(arc, low=60, high=110),
-}
 
 
 def is_usable(hits: Hits) -> bool:
@@ -134,21 +90,15 @@ def is_usable(hits: Hits) -> bool:
 class GenerateOptions(Settings):
     """Settings of synthetic scenes."""
 
-    views: tuple[int, int] = setting((6, 6), "Range of the number of views in a scene.",
-        "One target is between any two neighbours.", least=2, most=MAX_VIEWS)  # fmt: skip
+    views: int = setting(
+        6, "Number of views in a scene.", "One target is between any two neighbours.", least=2, most=200
+    )
     width: int = setting(320, "Width of the views.", least=16, most=2048, unit="pixels")
     height: int = setting(240, "Height of the views.", least=16, most=2048, unit="pixels")
     photo_scale: int = setting(1, "Times the views' size that the photos have; the network sees the views' own.",
         least=1, most=8)  # fmt: skip
-    style: str = setting(MIXED, "Rooms or gardens; mixed: these two in turn.", choices=(MIXED, *STYLES))
-    path: str = setting(MIXED, "Path of the cameras; mixed: any.", choices=(MIXED, *PATHS))
     noise: float = setting(1.0, "Factor on the simulated errors of the network.", least=0, most=10)
     ranges: NoiseOptions = setting(NoiseOptions(), "The errors and habits.")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.views[0] > self.views[1]:
-            raise ValueError(f"views: expected the least and the most, got {self.views[0]} to {self.views[1]}")
 
     def to_dict(self) -> dict[str, Any]:
         """Convert all settings to JSON types."""
@@ -164,27 +114,22 @@ class SyntheticScene:
     images: tuple[Float, ...]  # the photos, [h,w,3] sRGB in [0, 1] each; larger than the views with a photo_scale
     targets: Cameras  # true cameras half-way between neighbouring views, of the photos' size
     target_images: tuple[Float, ...]  # their photos
-    style: str
-    path: str
     noise: Noise
 
 
 def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScene:
     """Generate scene ``index`` of a series; the same arguments give the same bits on any number of threads."""
     rng = np.random.default_rng([seed, index])
-    num_views = int(rng.integers(options.views[0], options.views[1] + 1))
-    style = options.style if options.style != MIXED else list(STYLES)[(seed + index) % len(STYLES)]
-    path = options.path if options.path != MIXED else list(PATHS)[rng.integers(len(PATHS))]
+    num_views = options.views
     noise = draw_noise(options.ranges, rng, options.noise)
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
     lens = Pinhole(options.width, options.height, focal)
     scale = options.photo_scale
     large = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)  # of the photos
-    scene, pose = _find_stage(rng, style, path, large, num_views)
+    scene, pose = _find_stage(rng, large, num_views)
     places = np.linspace(0, 1, 2 * num_views - 1)
     poses = [pose(s) for s in places]
-    metered = poses[:: 2 * -(-num_views // METERED)]
-    gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in metered], rng.uniform(0.22, 0.62))
+    gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
     world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
     moved = [_move_pose(pose, world, noise.unit) for pose in poses]
@@ -212,8 +157,6 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
         images=tuple(image for image, _, _ in shots[:num_views]),
         targets=_cameras([pose for _, pose, _ in shots[num_views:]], large),
         target_images=tuple(image for image, _, _ in shots[num_views:]),
-        style=style,
-        path=path,
         noise=noise,
     )
 
@@ -222,15 +165,13 @@ def _shrink(lens: Pinhole) -> Pinhole:
     return Pinhole(max(8, lens.width // SMALL), max(8, lens.height // SMALL), lens.focal / SMALL)
 
 
-def _find_stage(
-    rng: np.random.Generator, style: str, path: str, lens: Pinhole, num_views: int
-) -> tuple[LitStage, Pose]:
-    """Draw a stage and a path through it on which all views are usable; after too many tries, return the last."""
+def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple[LitStage, Pose]:
+    """Draw a room and a path through it on which all views are usable; after too many tries, return the last."""
     side = 1 << min(max(int(1.6 * max(lens.width, lens.height)).bit_length() - 1, 7), 10)  # of the textures, pixels
     for _ in range(STAGE_TRIES):
-        scene = light_stage(STYLES[style](Palette(rng, side)))
+        scene = light_stage(room(Palette(rng, side)))
         for _ in range(PATH_TRIES):
-            pose = PATHS[path](scene.stage, rng, num_views)
+            pose = draw_path(scene.stage, rng, num_views)
             poses = (pose(s) for s in np.linspace(0, 1, 2 * num_views - 1))
             if all(is_usable(trace(scene.shapes, at, _shrink(lens), 1)) for at in poses):
                 return scene, pose

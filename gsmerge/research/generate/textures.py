@@ -236,14 +236,6 @@ def carpet(rng: np.random.Generator, size: int) -> Picture:
     return out.astype(np.float32)
 
 
-def grass(rng: np.random.Generator, size: int) -> Picture:
-    """Draw meadow or leaf litter, from blades to patches."""
-    base = color(rng, hue=(0.18, 0.34) if rng.random() < 0.7 else (0.05, 0.12), strength=(0.3, 0.7), light=(0.25, 0.55))
-    low, high = shades(rng, base, 0.6)
-    blades = noise(rng, size, first=64, fade=0.9, stretch=2).T
-    return mix(low, high, 0.65 * blades + 0.35 * noise(rng, size, fade=0.6))
-
-
 def bark(rng: np.random.Generator, size: int) -> Picture:
     """Draw furrows along y."""
     base = color(rng, hue=(0.04, 0.12), strength=(0.1, 0.5), light=(0.25, 0.55))
@@ -264,7 +256,7 @@ def foliage(rng: np.random.Generator, size: int) -> Picture:
 
 
 def crown(rng: np.random.Generator, size: int) -> Picture:
-    """Draw leaves from afar, for bushes and trees."""
+    """Draw leaves from afar, as behind a window."""
     tone, edge = cells(rng, size, int(rng.integers(24, 56)))
     base = color(rng, hue=(0.18, 0.36), strength=(0.35, 0.8), light=(0.25, 0.55))
     low, high = shades(rng, base, 0.6)
@@ -348,7 +340,7 @@ def sky(rng: np.random.Generator, size: int) -> Picture:
 KINDS: dict[str, Callable[[np.random.Generator, int], Picture]] = {
     maker.__name__: maker
     for maker in (
-        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, grass, bark),
+        *(plain, plaster, granite, marble, wood, tiles, bricks, cloth, carpet, bark),
         *(foliage, crown, gradient, printed, label, spines, sky),
     )
 }

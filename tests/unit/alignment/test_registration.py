@@ -31,7 +31,7 @@ PATHS = [Path(f"{name}.ply") for name in "abcdef"]
 def made_scene(seed: int, views: int = VIEWS) -> Scene:
     """A photographed room with the depth errors of a network."""
     ranges = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))
-    options = GenerateOptions(views=(views, views), width=WIDTH, height=HEIGHT, style="room", path="arc", ranges=ranges)
+    options = GenerateOptions(views=views, width=WIDTH, height=HEIGHT, ranges=ranges)
     made = make_scene(seed, 0, options)
     ids = grid_ids(np.ones((views, HEIGHT, WIDTH), bool))
     return Scene(made.gaussians, made.cameras, np.stack(made.images), ids, tuple("abcdef"[:views]))

@@ -28,9 +28,7 @@ WIDTH, HEIGHT, SCALE = 48, 32, 3
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene whose photos are three times as large as its grid. Read only."""
-    options = GenerateOptions(
-        views=(3, 3), width=WIDTH, height=HEIGHT, style="room", path="arc", noise=0.3, photo_scale=SCALE
-    )
+    options = GenerateOptions(views=3, width=WIDTH, height=HEIGHT, noise=0.3, photo_scale=SCALE)
     return generate_scene(tmp_path_factory.mktemp("large") / "scene", options, seed=2)
 
 

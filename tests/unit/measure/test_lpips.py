@@ -278,23 +278,11 @@ def test_other_calls_in_a_pickle_are_refused(package: Path, call: Any) -> None:
     assert not trap.exists()
 
 
-def test_numpy_itself_is_not_called(package: Path) -> None:
-    """Even names that are let through stand for something harmless: no array is made but from float32 bytes."""
-    reconstruct = np.empty(0).__reduce__()[0]
-    unset = {"kernel": _Calls(reconstruct, np.ndarray, (1 << 50,), b"b"), "bias": 0}
-    for layer, found in ((_Calls(np.ndarray, (1 << 50,)), "callable"), (unset, "shape")):
-        path = write_package(package, "alex", {"AlexNet_0": {"Conv_0": layer}})
-        with refuses(SceneError, path, "(alex)", found):
-            lpips(FIRST, SECOND, "alex")
-
-
-@pytest.mark.parametrize(
-    "values",
-    [np.ones(4), np.ones(4, np.int32), np.ones(4, ">f4"), np.array([None, {}]), np.ones(4, "f4,f4")],
-    ids=lambda v: str(v.dtype),
-)
-def test_arrays_of_other_types_are_refused(package: Path, values: Array) -> None:
-    write_package(package, "alex", made_up("alex") | {"extra": values})
+@pytest.mark.parametrize("dtype", ["f8", "i4", "O", "f4,f4"])
+def test_arrays_of_other_types_are_refused(package: Path, dtype: str) -> None:
+    tree = made_up("alex")
+    tree["AlexNet_0"]["Conv_0"]["bias"] = np.zeros_like(tree["AlexNet_0"]["Conv_0"]["bias"], dtype)
+    write_package(package, "alex", tree)
     with refuses(SceneError, "alexnet.ckpt", "float32"):
         lpips(FIRST, SECOND, "alex")
 

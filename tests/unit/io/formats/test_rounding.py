@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,17 @@ import pytest
 from messages import noted
 
 from gsmerge.io.formats.rounding import as_written, rounding_notes
+from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.table import COLMAP, INDEX, OUTPUT_FORMATS
 from gsmerge.types import Gaussians
 
-NAMES = ("lod-meta.json", "site/index.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
+NAMES = ("lod-meta.json", "a.html", "site/index.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
+
+
+@pytest.fixture(autouse=True)
+def program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any program that exists: none is run."""
+    monkeypatch.setenv(VARIABLE, sys.executable)
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from former_formats import compressed_bytes
 from messages import noted, refuses
 from plyfile import PlyData
 from slow_readers import corners, drawn, read_back
+from splat_transform_programs import needs_program
 from sweeps import sweep
 from tiny_scene import Tiny
 
@@ -20,8 +21,8 @@ from gsmerge import Scene
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import normalize
 from gsmerge.io import OUTPUT_FORMATS, lost_harmonics, output_format, read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.kernels import elementary
-from gsmerge.research.baselines.simple import find_program
 from gsmerge.types import Gaussians
 
 QUANTISED = (".spz", ".sog", ".splat")
@@ -30,16 +31,6 @@ QUANTISED = (".spz", ".sog", ".splat")
 # dB between a render of the .ply and one of the file, of Gaussians with every parameter drawn at random; with rows in
 # another order alone, as in .compressed.ply and .sog, 44 of degree 0 and 37 of degree 3
 FLOORS = {(".spz", 0): 48, (".splat", 0): 48, (".sog", 0): 42, (".spz", 3): 32, (".sog", 3): 35}
-
-
-def program() -> str | None:
-    try:
-        return find_program()
-    except UsageError:
-        return None
-
-
-needs_program = pytest.mark.skipif(program() is None, reason="needs splat-transform")
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +64,12 @@ def test_a_compressed_ply_is_read_and_no_longer_written(scene: Scene, tmp_path: 
     assert [one.name for one in tmp_path.iterdir()] == ["a.compressed.ply"]
 
 
-@needs_program
+@needs_program()
 @pytest.mark.parametrize(("ending", "degree"), FLOORS)
 def test_splat_transform_reads_the_same(ending: str, degree: int, scene: Scene, tmp_path: Path) -> None:
     gaussians, path, back = drawn(scene, degree), tmp_path / f"a{ending}", tmp_path / "back.ply"
     write_gaussians(path, gaussians)
-    subprocess.run([str(program()), "-q", str(path), str(back)], check=True, capture_output=True)
+    subprocess.run([find_program(), "-q", str(path), str(back)], check=True, capture_output=True)
     actual = read_ply(back).gaussians
     assert (len(actual), actual.sh_degree) == (len(gaussians), degree)
     assert psnr(scene, gaussians, actual) > FLOORS[ending, degree]

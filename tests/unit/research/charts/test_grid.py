@@ -108,7 +108,7 @@ def test_lists_that_are_none() -> None:
 
 def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
-    with refuses(UsageError, "method splat-transform", "/nowhere/splat-transform", "@playcanvas/splat-transform@3.7.0"):
+    with refuses(UsageError, "splat-transform", "/nowhere/splat-transform", "@playcanvas/splat-transform@3.7"):
         make_jobs([], Grid(method=("gsmerge", "splat-transform"), budget=("1%",)), EvaluateOptions(()))
 
 

@@ -39,7 +39,7 @@ def example() -> Example:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two of ``gsmerge lab generate``'s. Read only."""
-    options = GenerateOptions(width=32, height=24, views=(2, 2), style="room")
+    options = GenerateOptions(width=32, height=24, views=2)
     return [scene.folder for scene in generate(tmp_path_factory.mktemp("made"), 2, options, threads=1)]
 
 

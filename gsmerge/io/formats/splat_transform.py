@@ -1,0 +1,109 @@
+"""PlayCanvas' program splat-transform, for what it reads and writes and gsmerge does not, by a temporary ``.ply``."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from gsmerge.errors import GsmergeError, SceneError, UsageError
+from gsmerge.io.bounds import check_file, read_json
+from gsmerge.io.formats import ply
+from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.io.formats.write import write_ply
+from gsmerge.types import Gaussians
+
+PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+PACKAGE = "@playcanvas/splat-transform@3.7"
+TIME_LIMIT = 1800  # seconds
+MAX_OUTPUT = 300  # characters of the program's own output in an error
+MAX_DEGREE = 3
+
+
+def find_program() -> str:
+    """Find the path of the program; UsageError, which says how to get it, where it is not installed."""
+    named = os.environ.get(VARIABLE)
+    program = shutil.which(named or PROGRAM)
+    if program is None:
+        place = f"at {VARIABLE}={named}" if named else f"on PATH or named by {VARIABLE}"
+        problem = f"expected the program {place}, found none; install it with: npm install -g {PACKAGE}"
+        raise UsageError(f"{PROGRAM}: {problem}")
+    return program
+
+
+def require_html() -> None:
+    """Raise UsageError, with the command that makes a page of a ``.ply``, where the program is not installed."""
+    try:
+        find_program()
+    except UsageError as error:
+        problem = f"{PROGRAM} writes it, which is not installed"
+        raise UsageError(f".html: {problem}; convert a .ply with: npx {PACKAGE} scene.ply scene.html") from error
+
+
+def holds_sog(path: Path) -> bool:
+    """Return whether a ``meta.json`` is that of a ``.sog``, and not another program's."""
+    try:
+        document = read_json(path)
+    except SceneError:
+        return False
+    return isinstance(document, dict) and {"means", "scales", "quats", "sh0"} <= document.keys()
+
+
+def run_program(*words: object) -> None:
+    """Run the program on the CPU; its last word is the file that it writes.
+
+    GsmergeError if it fails or takes longer than ``TIME_LIMIT``, UsageError if it is not installed.
+    """
+    program = find_program()
+    command = [program, "-q", "-w", "-g", "cpu", *map(str, words)]
+    try:
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIME_LIMIT, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise GsmergeError(f"{program}: expected an end within {TIME_LIMIT} seconds, found none") from error
+    if done.returncode or not Path(str(words[-1])).exists():
+        lines = (done.stderr or done.stdout).decode(errors="replace").strip().splitlines() or ["without output"]
+        reason = next((line for line in lines if "Error: " in line), lines[-1]).rpartition("Error: ")[2]
+        problem = f"expected {Path(str(words[-1])).name}, it ended with code {done.returncode}"
+        raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
+
+
+def read_rows(path: Path) -> StoredRows:
+    """Read the finest Gaussians of a file that the program reads.
+
+    SceneError if it cannot be read, with the command that converts it where the program is not installed.
+    """
+    check_file(path)
+    with TemporaryDirectory(prefix="gsmerge-") as folder:
+        made = Path(folder) / "scene.ply"
+        try:
+            run_program(path.absolute(), "-L", 0, made)
+        except UsageError as error:
+            target = path.with_name("scene.ply") if path.suffix == ".json" else path.with_suffix(".ply")
+            command = shlex.join(["npx", PACKAGE, str(path), "-L", "0", str(target)])
+            problem = f"expected the program {PROGRAM}, which reads it, found none"
+            raise SceneError(path, problem, f"convert it with: {command}") from error
+        except GsmergeError as error:
+            raise SceneError(path, f"cannot be read by {error}") from error
+        stored = ply.read_rows(made)
+        with ply.open_rows(made, stored.rows) as read:
+            rows = read(slice(None))
+    alone = path.suffix.lower() == ".ksplat"
+    others = [] if alone else [file for file in path.parent.iterdir() if file.is_file() and file != path]
+    return replace(
+        stored, rows=rows, layout=f"{stored.layout}, by {PROGRAM}", encoding="logit",
+        bytes_beside=sum(file.stat().st_size for file in others),
+    )  # fmt: skip
+
+
+def html_bytes(gaussians: Gaussians, comments: Sequence[str]) -> bytes:
+    """Make a page with PlayCanvas' viewer and the Gaussians in it."""
+    with TemporaryDirectory(prefix="gsmerge-") as folder:
+        scene, page = Path(folder) / "scene.ply", Path(folder) / "scene.html"
+        write_ply(scene, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=comments)
+        run_program(scene, "-i", 1, page)
+        return page.read_bytes()
