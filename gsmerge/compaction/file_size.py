@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from gsmerge.compaction.result import Candidate, shrink
 from gsmerge.facts.prepare import Prepared
@@ -39,20 +39,17 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         if room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count):
             break
         candidate = rebuild(room)
-    kept = drop_to_bytes(candidate.gaussians, [], most, file)
+    kept = drop_to_bytes(candidate.gaussians, most, file)
     return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)
 
 
-def drop_to_bytes(gaussians: Gaussians, beside: Sequence[Gaussians], most: int, file: Format) -> Gaussians:
-    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; this may be none.
-
-    ``beside``: what takes its part of the bytes in files of its own.
-    """
+def drop_to_bytes(gaussians: Gaussians, most: int, file: Format) -> Gaussians:
+    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; this may be none."""
     low, high = 0, len(gaussians)
     kept, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):
         tried = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        size = sum(measure_bytes(part, file) for part in (tried, *beside))
+        size = measure_bytes(tried, file)
         if size <= most:
             low, kept = count, tried
         else:
