@@ -1,4 +1,4 @@
-"""Eight results of a scene of exact numbers, the same on every machine: ``python tests/helpers/exact_results.py``.
+"""Nine results of a scene of exact numbers, the same on every machine: ``python tests/helpers/exact_results.py``.
 
 It prints their hashes as JSON, and one of all. Another processor than this one, or an emulated one, runs it with the
 package and the native library for it.
@@ -27,9 +27,10 @@ RESULTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "without pixels, no fit": ("rows", ("compact {scene} -o {out} --fit none",)),
     "a file alone": ("alone", ("compact {scene} -o {out} --effort fast",)),
     "nothing known": ("unknown", ("compact {scene} -o {out}",)),
-    "decoded": (
+    "a state": ("exact", ("extend {out}.gsm {scene}", "compact {out}.gsm -o {out} --effort fast")),
+    "feature gaussians": (
         "exact",
-        ("extend {out}.gsm {scene} --set superpixels=2%", "compact {out}.gsm -o {out} --k 2 --fit none"),
+        ("extend {out}.gsm {scene} --set recipe=paper --set superpixels=2%", "compact {out}.gsm -o {out} --k 2"),
     ),
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.fit.fit_state import State, start_state
+from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.prepared_step import OF_STEP, StepTables
 from gsmerge.kernels.raster.step import PHASES, STEP, fit_phase
 from gsmerge.raster.tiled_view import camera_numbers
@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 37, 21
 ODD = np.array([0, -0.0, 1, -1, 1e-40, 1e30, -1e30, 3e38, np.nan, np.inf, -np.inf], np.float32)
 
 
-def some_state(count: int, rng: np.random.Generator) -> State:
+def some_state(count: int, rng: np.random.Generator) -> FitState:
     means = rng.normal(0, 1, (count, 3))
     means[:, 2] += 4
     colors, empty = rng.normal(0, 1, (count, 1, 3)), np.zeros((count, 0, 3), np.float32)
