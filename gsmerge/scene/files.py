@@ -78,6 +78,11 @@ class SceneFiles:
         return self.parts or (self.ply,)
 
     @property
+    def is_state(self) -> bool:
+        """Whether it is a state, whose Gaussians have no pixels."""
+        return self.ply.suffix.lower() == SUFFIX
+
+    @property
     def base(self) -> Path:
         """Path from which names of results are derived: the file, or ``scene.ply`` in a folder of parts or frames."""
         if is_frame(self.ply):

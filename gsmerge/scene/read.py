@@ -255,7 +255,12 @@ def align_scene(
     limited, smaller = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
 
     depths, frames = partial(read_depths, Path(camera_file.path)), partial(read_dataparser, files.ply, files.cameras)
-    result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
+    if files.is_state and files.cameras == files.ply:  # which see its Gaussians
+        problem = "expected one Gaussian per pixel, found results of batches"
+        cameras = to_cameras(pinholes, photo_size(limited))
+        result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
+    else:
+        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
     notes += [*chosen, *cut, *smaller, *result.notes]
     if result.pixel_ids is None:
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
@@ -309,8 +314,7 @@ def _make_load(
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
-        expected = camera_file is None or camera_file.order == "none"
-        more += [] if expected else [_unaligned_note(hints)]
+        more += [] if camera_file is None or files.is_state else [_unaligned_note(hints)]
     else:
         assert camera_file is not None, "pixels are those of cameras"
         scene, note = _use_depths(scene, camera_file, layout, frame.scale)

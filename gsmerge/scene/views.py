@@ -71,6 +71,8 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
         if stored.focal is not None:
             return stored
+    if stored is None and files.is_state:
+        return None
     sharp = read_sharp_camera(files.ply) if stored is None else None
     if sharp is not None:
         return sharp
