@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.cameras import describe_reading, other_conventions
-from gsmerge.alignment.judge import accept_reading
+from gsmerge.alignment.frames import ray_directions, scale_by, solve_frame, solve_pose, usual_frames
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, exact_layouts, plain_layout, subsample
-from gsmerge.alignment.readings import read_grid
 from gsmerge.alignment.score import (
     MAX_CHECKED,
     Alignment,
     AlignmentInput,
-    candidate_similarities,
+    beats_shuffled,
     check_alignment,
     check_pairs,
     find_correspondences,
     pixel_errors,
     sample_pixels,
-    solve_pose,
+    score_layout,
+    score_shuffled,
 )
 from gsmerge.errors import SceneError
 from gsmerge.geometry import median
@@ -58,9 +58,13 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
                 raise misalignment_error(camera_file.path, alignment, reason)
             problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
         elif count > views * width * height and count % (width * height) == 0:
-            size = views * width * height
+            size, plain = views * width * height, plain_layout(views, width, height)
             first = replace(inputs, gaussians=inputs.gaussians[:size], valid=inputs.valid[:size], order="view-major")
-            if accept_reading(first, read_grid(first)) is not None:  # more views than cameras, the first in order
+            # more views than cameras, the first of them in order
+            readings = (score_layout(first, plain, frame) for frame in usual_frames(cameras, first.scale))
+            if any(
+                beats_shuffled(each, score_shuffled(first, each)[0]) for each in readings
+            ):  # more views than cameras
                 raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
     return SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
 
@@ -107,7 +111,6 @@ def explain_misalignment(
     """Name another convention of the cameras, or order of the rows, that fits the scene; None if none does."""
     pairs = sample_pixels(gaussians, cameras, valid)
     input_viewmats = cameras.viewmats
-    frames = candidate_similarities(pairs, cameras, effort=1)
     readings = [
         (describe_reading(poses.convention, convention), poses.viewmats)
         for poses in other_conventions(input_viewmats, convention)
@@ -121,10 +124,10 @@ def explain_misalignment(
         mirrored = input_viewmats.copy()
         mirrored[:, axis] *= -1
         readings.append((f"the cameras fit with the {words}", mirrored))
-    scaled = [frame for frame in frames if frame.kind == "scaled"]
-    readings += [
-        (f"the cameras fit with their {frame.description}", frame.move_viewmats(input_viewmats)) for frame in scaled
-    ]
+    frame = solve_frame(pairs.points, ray_directions(pairs, cameras), np.eye(3), shifted=False)
+    if frame is not None:
+        text = f"the cameras fit with their {scale_by(frame.scale).description}"
+        readings.append((text, frame.move_viewmats(input_viewmats)))
     for reason, viewmats in readings:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason

@@ -51,6 +51,12 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
     return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
 
 
+def find_shapes(gaussians: Gaussians, valid: np.ndarray) -> list[tuple[int, int]]:
+    """List the shapes (columns, lines) that the grid of the rows may have: lines are rows of pixels, or columns."""
+    size = _find_size(gaussians, valid)
+    return [] if size is None else [size[1:], size[:0:-1]]
+
+
 def _calibrate_layouts(
     means: np.ndarray, valid: np.ndarray, layouts: Iterable[Layout]
 ) -> list[tuple[Layout, Calibration]]:

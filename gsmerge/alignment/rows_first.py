@@ -1,0 +1,554 @@
+"""Find which row is which pixel: by the grid that rows show, whose views are then found among the file's cameras.
+
+Most files are plain: rows are the pixels in order, which the stored cameras show. Otherwise rows show by themselves
+whether they are the pixels of a grid, since some camera shows them in their pixels then, and the pose of each of its
+views. What is left to find is which of the file's cameras each view is, and how their world lies in that of the
+Gaussians: one similarity, for every convention of the poses and every likely order of the views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment.cameras import describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.frames import own_poses, scale_by, solved_frames, usual_frames
+from gsmerge.alignment.grids import (
+    Grid,
+    check_photo_size,
+    file_grids,
+    grids_of,
+    network_sizes,
+    photo_grid,
+    shown_sizes,
+    with_photo_size,
+)
+from gsmerge.alignment.judge import Fit, Recovery, judge
+from gsmerge.alignment.layouts import (
+    ESTIMATED,
+    MAY_BE_UNALIGNED,
+    Layout,
+    depth_layouts,
+    dropped_layout,
+    every_nth,
+    exact_layouts,
+    move_layout,
+    plain_layout,
+    subsample,
+    view_orders,
+)
+from gsmerge.alignment.resection import projective_error
+from gsmerge.alignment.score import (
+    QUICK_SAMPLES,
+    SAMPLES,
+    SHUFFLED_MARGIN,
+    SMALLEST_PX,
+    AlignmentInput,
+    Correspondences,
+    Reading,
+    pixel_limit,
+    sample_layout,
+    score_layout,
+)
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.runtime.memory import free_pages
+from gsmerge.types import Cameras
+
+_PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
+_ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
+_SIMPLER, _SIMPLER_PX = 1.15, 0.02  # a simpler frame wins unless it is worse than this factor and these pixels
+_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
+# pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
+_SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
+_SHOWN_SAMPLES = 200  # Gaussians of a view that it is judged by
+_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
+_MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
+
+_Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
+
+    # ``[n]`` int64, the pixel ``(part·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
+    # A part is a view, or one layer of a view with several Gaussians per pixel
+    pixel_ids: np.ndarray | None
+    cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
+    images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
+    camera_file: CameraFile | None  # as it was read in the end; None where there are no cameras
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    transform: PhotoTransform | None = None  # what was done to the photos
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses to which each view's Gaussians are yet to be moved with it
+    problem: str | None = None  # why the rows belong to no pixels; None where they do
+
+    @property
+    def layout(self) -> Layout | None:
+        """Pixel of each row, part by part; None for rows without pixels."""
+        return None if self.recovery is None else self.recovery.best.layout
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Camera of each part; for rows without pixels, all cameras."""
+        return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The Gaussians, the cameras, the photos and the known facts about the rows."""
+
+    ply: GaussianFile
+    camera_file: CameraFile
+    photos: Photos
+    order: str
+    scale: float | None
+    depths: Callable[[], np.ndarray | None]
+
+    @property
+    def size(self) -> Size | None:
+        """(width, height) of the photos; None without any."""
+        return photo_size(self.photos)
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """Photos at their own size, ``[c,h,w,3]`` float32."""
+        return as_floats(self.photos)
+
+    def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
+        """Bring rows, cameras and photos to the size of a grid; without photos if only positions matter."""
+        images = NO_IMAGES
+        if photos:
+            images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
+        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
+
+    def orders(self, grid: Grid) -> list[tuple[int, ...]]:
+        """List the orders that the views may be in: the file's, and that of the names.
+
+        Orders that only exchange views of equal poses and photos are all right, and left out.
+        """
+        first, *others = view_orders(self.camera_file.names)
+        cameras, photos = grid.cameras, self.photos
+
+        def same(a: int, b: int) -> bool:
+            pairs = [(cameras.viewmats[a, :3], cameras.viewmats[b, :3]), (cameras.Ks[a], cameras.Ks[b])]
+            pairs += [(photos[a], photos[b])] if len(photos) else []
+            return all(np.array_equal(one, other) for one, other in pairs)
+
+        alike = (all(a == b or same(a, b) for a, b in zip(first, other, strict=True)) for other in others)
+        return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
+
+
+def align(
+    ply: GaussianFile,
+    camera_file: CameraFile,
+    photos: Photos = (),
+    *,
+    order: str = "auto",
+    scale: float | None = None,
+    depths: Callable[[], np.ndarray | None] = lambda: None,
+    frames: Callable[[], Sequence[Similarity]] = tuple,
+) -> AlignmentResult:
+    """Find the pixel of every row; for rows without pixels, choose the camera poses that see them.
+
+    Also finds the size of the grid, the frame and convention of the poses, and the transform of the photos.
+
+    Args:
+        ply: The file's rows.
+        camera_file: Its cameras.
+        photos: c uint8 photos of one size, or none.
+        order: The order of the rows where it is known, see :class:`gsmerge.settings.reading.ReadHints`.
+        scale: Size of the Gaussians' world in units of the cameras', where it is given.
+        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
+        frames: Reads the frames that a file names in which the cameras may see rows without pixels.
+
+    Raises:
+        SceneError: If sizes do not agree, several conventions fit, the Gaussians are not those of the cameras' views,
+            or other cameras would make pixels of the rows.
+    """
+    camera_file = with_photo_size(camera_file, photo_size(photos))
+    source = _Source(ply, camera_file, photos, order, scale, depths)
+    try:
+        grid = photo_grid(camera_file, source.size)
+    except SceneError:
+        found = _find_pixels(source, None)
+        cropped = _cropped_grid(source) if found is None else found[0].grid
+        if cropped is None:
+            raise
+        grid = cropped
+    else:
+        found = _read_in_order(source, grid) or _find_pixels(source, grid)
+    return _choose_cameras(source, grid, frames) if found is None else _make_result(source, *found)
+
+
+def _read_in_order(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+    """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
+
+    Or read them by the pixels that they showed when their cameras were estimated.
+    """
+    inputs, count, pixel_ids = source.inputs(grid), len(source.ply.gaussians), source.camera_file.pixel_ids
+    if pixel_ids is not None:
+        estimated = score_layout(inputs, dropped_layout(pixel_ids, len(grid.cameras), *grid.size), IDENTITY)
+        return judge([Fit(grid, estimated)], source.inputs, lambda fit: fit) if estimated.ok else None
+    expected = len(grid.cameras) * math.prod(grid.size)
+    if source.order not in ("auto", "view-major") or source.scale is not None or count != expected:
+        return None
+    if not _has_enough(source):
+        return None
+    layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
+    best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+    far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+    if not (best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others)):
+        return None
+    return judge([Fit(grid, best)], lambda _: inputs, lambda fit: fit) if best.ok else None
+
+
+def _has_enough(source: _Source) -> bool:
+    """Return whether enough rows are finite to find their pixels."""
+    finite = int(source.ply.valid.sum())
+    return finite >= _ENOUGH or finite >= _FEW * len(source.ply.gaussians)
+
+
+# Rows show their grid
+
+
+def _find_pixels(source: _Source, grid: Grid | None) -> tuple[Fit, Recovery] | None:
+    """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
+
+    ``grid``: of the photos' size; None where photos and cameras have different ones.
+    """
+    if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
+        return None
+    named = [[] if grid is None else [grid], file_grids(source.camera_file, source.size)]
+    counted = (_choose(source, [(g, layout) for g in grids for layout in _layouts(source, g)]) for grids in named)
+    followed = (_choose(source, _followed(source, grids)) for grids in named)
+    moved = (_move_cameras(source, g) for g in named[0])
+    found = next(filter(None, chain(counted, followed, moved)), None)
+    if found is not None and not found[0].is_doubtful:
+        return found
+    from gsmerge.alignment.row_grid import find_shapes  # few files come here
+
+    shapes = find_shapes(source.ply.gaussians, source.ply.valid)
+    for shape in shapes:
+        grids = grids_of(source.camera_file, source.size, partial(shown_sizes, shape=shape))
+        shown = [(g, layout) for g in grids for layout in _layouts(source, g) if _has_shape(layout, shape)]
+        found = min(filter(None, (found, _choose(source, shown))), key=lambda each: each[0].px, default=None)
+    return found if found is not None or shapes else _find_lacking(source, [*chain(*named)])
+
+
+def _find_lacking(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+    """Find the pixels of rows that lack some at random, in grids that files name or networks have; None for others."""
+    from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
+
+    if not _may_lack_pixels(source, named):
+        return None
+    shown = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
+    usual = grids_of(source.camera_file, source.size, network_sizes)
+    if shown is None:
+        return _choose(source, _followed(source, usual))
+    layout, own = shown[0], shown[1].cameras
+    rounds = ([(g, place) for g in grids for place in _places(source, g, layout, own)] for grids in (named, usual))
+    return next(filter(None, (_choose(source, places) for places in rounds)), None)
+
+
+def _layouts(source: _Source, grid: Grid) -> list[Layout]:
+    """List the layouts in a grid that the number of rows allows, or the depth maps next to the cameras."""
+    views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
+    layouts = list(exact_layouts(count, views, width, height))
+    if count < views * width * height and source.order in ("auto", "view-major"):
+        depths = source.depths()
+        if depths is not None and depths.shape == (views, height, width):
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if source.order in ("auto", layout.order)]
+
+
+def _has_shape(layout: Layout, shape: Size) -> bool:
+    """Return whether the pixels of a layout without its borders have a shape."""
+    y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
+    return (int(np.ptp(x)) + 1, int(np.ptp(y)) + 1) == shape
+
+
+def _may_lack_pixels(source: _Source, grids: Sequence[Grid]) -> bool:
+    """Return whether rows may be pixels of some of the grids, of which many are missing."""
+    most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
+    enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
+    return enough and len(source.ply.gaussians) < most
+
+
+def _followed(source: _Source, grids: Sequence[Grid]) -> list[_Place]:
+    """List the places of rows that lack pixels and follow the cameras, as exporters move or misread them.
+
+    Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
+    """
+    from gsmerge.alignment.dropped_rows import follow_rows  # few files come here
+
+    places = []
+    others = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
+    for grid in grids:
+        if not _may_lack_pixels(source, [grid]):
+            continue
+        moved = chain(
+            (frame.move(grid.cameras) for frame in usual_frames(grid.cameras, source.scale)),
+            (replace(grid.cameras, viewmats=poses.viewmats) for poses in others),
+        )
+        for cameras in moved:
+            layout = follow_rows(source.ply.gaussians.means, source.ply.valid, cameras)
+            if layout is not None and source.order in ("auto", layout.order):
+                places.append((grid, layout))
+                break
+    return places
+
+
+def _places(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
+    """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
+    cameras = grid.cameras
+    margins = cameras.width - layout.width, cameras.height - layout.height
+    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
+    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
+        return []
+    if source.order not in ("auto", layout.order):
+        return []
+    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
+    layout = replace(layout, views=chosen)
+    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
+    lefts, tops = (
+        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
+        for margin, shift in zip(margins, shifts.tolist(), strict=True)
+    )
+    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
+
+
+# Views are some of the file's cameras
+
+
+def _choose(source: _Source, places: Sequence[_Place]) -> tuple[Fit, Recovery] | None:
+    """Choose the place of the rows whose views are the file's cameras, in another convention where none is as stored.
+
+    None if there is none, or several that nothing tells apart.
+    """
+    errors = [_projective_error(source, *place) for place in places]
+    far = _AS_SHOWN * max(min(errors, default=0.0), SMALLEST_PX)
+    shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
+    usual, convention = source.camera_file.viewmats, source.camera_file.convention
+    fits = [fit for place in shown for fit in _fit_views(source, *place)]
+    for poses in other_conventions(usual, convention) if shown and not fits else ():
+        for grid, layout in shown:
+            file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
+            fits += _fit_views(source, grid.with_poses(file), layout)
+    return judge(fits, source.inputs, partial(_refine, source)) if fits else None
+
+
+def _projective_error(source: _Source, grid: Grid, layout: Layout) -> float:
+    """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
+
+    Of the first, the middle and the last part, one that a camera shows counts.
+    """
+    limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
+    inputs, count = source.inputs(grid, photos=False), len(layout.views)
+    for i in sorted({0, count // 2, count - 1}):
+        part = replace(layout, views=(0,), rows=layout.rows[i : i + 1], pixels=layout.pixels[i : i + 1])
+        pairs = inputs.pairs(subsample(part, _SHOWN_SAMPLES))
+        error = projective_error(pairs.points, pairs.pixels)
+        if error <= limit:
+            return error
+    return math.inf
+
+
+def _fit_views(source: _Source, grid: Grid, layout: Layout) -> list[Fit]:
+    """Fit the views of a layout to the file's cameras, in each likely order and that of the nearest poses."""
+    inputs = source.inputs(grid, photos=False)
+    pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
+    number = np.unique(layout.views, return_inverse=True)[1].reshape(-1)  # of the view of each part, from 0
+    own: dict[bytes, dict[int, np.ndarray]] = {}
+
+    def fit(views: Sequence[int]) -> Fit:
+        cameras = np.unique(number, return_index=True)[1]
+        cameras = np.array(views)[cameras]  # of each view
+        Ks = grid.cameras.Ks[cameras]
+        poses = own.setdefault(Ks.tobytes(), {}) or own_poses(replace(pairs, views=number[pairs.parts]), Ks)
+        own[Ks.tobytes()] = poses
+        labelled = {int(cameras[view]): pose for view, pose in poses.items()}
+        views = tuple(int(cameras[view]) for view in number)
+        relabelled = replace(pairs, views=np.array(views)[pairs.parts])
+        return Fit(grid, read_views(inputs, replace(layout, views=views), relabelled, labelled))
+
+    fits = {each.views: fit(each.views) for each in layout.with_views_in(source.orders(grid))}
+    nearest = _nearest_cameras(next(iter(own.values())), number, grid.cameras)
+    if nearest is not None and nearest not in fits and source.scale is None:
+        other = fit(nearest)
+        same_axes = ("same", "scaled", "shifted") if number.any() else ("same",)  # one view fits any camera
+        fits |= {nearest: other} if other.reading.frame.kind in same_axes else {}
+    return [each for each in fits.values() if each.reading.ok]
+
+
+def _nearest_cameras(own: Mapping[int, np.ndarray], number: np.ndarray, cameras: Cameras) -> tuple[int, ...] | None:
+    """Find the camera whose pose is nearest to that of each view; None where two views have the same, or have no pose.
+
+    ``number``: the view of each part. Distances are in units of the cameras' spread.
+    """
+    views = int(number.max()) + 1
+    if len(own) < views:
+        return None
+    viewmats = np.stack([own[view] for view in range(views)])
+    centres = cameras.centres
+    unit = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
+    turned = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
+    away = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
+    nearest = (turned + away).argmin(1)
+    return tuple(nearest[number].tolist()) if len(set(nearest.tolist())) == views else None
+
+
+def read_views(
+    inputs: AlignmentInput, layout: Layout, pairs: Correspondences, own: Mapping[int, np.ndarray]
+) -> Reading:
+    """Score a layout in the simplest frame in which the cameras are about as near as the views' ``own`` poses.
+
+    ``pairs`` are a sample of the rows, and ``own`` poses ``[4,4]`` by view.
+    """
+    cameras, viewmats = inputs.cameras, inputs.cameras.viewmats.astype(np.float64)
+    for view, pose in own.items():
+        viewmats[view] = pose
+    bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
+    if not bound.ok and set(own) >= set(layout.views):
+        return bound  # nothing is nearer than poses of their own
+    frames = chain(
+        ((0, frame) for frame in usual_frames(cameras, inputs.scale)),
+        solved_frames(pairs, cameras, own, inputs.scale),
+    )
+    as_good = max(_AS_GOOD * bound.median_px, bound.median_px + _AS_GOOD_PX)
+    readings: list[Reading] = []
+    for effort, frame in frames:
+        reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
+        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
+            return reading
+        if effort == 2 and readings:
+            break
+        if reading.ok and (effort == 0 or inputs.scale is not None or reading.median_px <= as_good):
+            readings.append(reading)  # otherwise cameras are wrong
+    lowest = min((reading.worst_px for reading in readings), default=math.inf)
+    return next((reading for reading in readings if _is_near(reading.worst_px, lowest)), replace(bound, ok=False))
+
+
+def _is_near(px: float, lowest: float) -> bool:
+    """Return whether a simpler frame is near enough to the nearest one."""
+    return px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX)
+
+
+def _refine(source: _Source, fit: Fit) -> Fit:
+    """Score a fit again, with its frame solved again, on more Gaussians."""
+    inputs = source.inputs(fit.grid, photos=False)
+    pairs = inputs.pairs(sample_layout(fit.reading.layout, SAMPLES))
+    return replace(fit, reading=read_views(inputs, fit.reading.layout, pairs, own_poses(pairs, fit.grid.cameras.Ks)))
+
+
+def _move_cameras(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+    """Fit rows of every pixel by slightly moved cameras; None if that does not fit.
+
+    Also None if the colours of the photos disagree: views in the wrong order look the same.
+    """
+    if source.scale is not None:
+        return None
+    inputs = source.inputs(grid)
+    layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
+    readings = [score_layout(inputs, layout, IDENTITY) for layout in layouts]
+    best = min(readings, key=lambda reading: reading.worst_px, default=None)
+    if best is None or not best.worst_px <= max_pixels(*grid.size):
+        return None
+    pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
+    path = str(source.camera_file.path)
+    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, path, inputs.images)
+    if moved is None:
+        return None
+    given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
+    fit = Fit(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
+    found = judge([fit], source.inputs, lambda each: each) if fit.reading.ok else None
+    return None if found is None or found[1].confirmed is False else found
+
+
+# Rows without pixels, and results
+
+
+def _cropped_grid(source: _Source) -> Grid | None:
+    """Return photos resized or cropped to the cameras' size that show the colours of rows; None if none do."""
+    from gsmerge.alignment.unaligned import check_cameras
+
+    best, least = None, 0.0
+    for grid in file_grids(source.camera_file, source.size):
+        inputs = source.inputs(grid)
+        check = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, inputs.images)
+        if check.ok and not math.isnan(check.color_ratio) and check.score > least:
+            best, least = grid, check.score
+    return best
+
+
+def _choose_cameras(source: _Source, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+    """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
+    from gsmerge.alignment.explain import explain_count
+    from gsmerge.alignment.unaligned import choose_cameras
+    from gsmerge.alignment.upright import place_upright
+
+    info, camera_file, inputs = source.ply.info, source.camera_file, source.inputs(grid)
+    if source.order not in MAY_BE_UNALIGNED:
+        check_photo_size(info, camera_file, source.size)
+    upright = place_upright(inputs, info)
+    if upright is None:
+        why = explain_count(info, inputs, camera_file)
+        if source.scale is not None:
+            inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
+        cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
+        problem = why.problem
+    else:
+        cameras = upright.move(inputs.cameras)
+        camera_file = replace(camera_file, viewmats=cameras.viewmats)
+        notes = [f"the cameras are {upright.description}, as the photos' colours show"]
+        problem = "expected one Gaussian per pixel, found Gaussians that were merged"
+    return AlignmentResult(
+        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=problem
+    )
+
+
+def _make_result(source: _Source, fit: Fit, recovery: Recovery) -> AlignmentResult:
+    """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
+    inputs, grid, best = source.inputs(fit.grid), fit.grid, recovery.best
+    free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
+    frame, layout, count = best.frame, best.layout, len(grid.cameras)
+    notes, usual = [*grid.notes], source.camera_file
+    if grid.camera_file.convention != usual.convention:
+        notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
+    if usual.source == ESTIMATED:
+        from_what = "own grid" if usual.pixel_ids is None else "own order"
+        separate = len(set(map(bytes, usual.Ks))) > 1
+        what = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
+        notes.append(f"no cameras were given: {what} are estimated from the Gaussians' {from_what}")
+    in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
+    orders = view_orders(usual.names)
+    if in_order and layout.views == orders[1] != orders[0]:
+        notes.append("views are in the order of the image names, not of the camera file")
+    elif not (in_order and layout.views in orders):
+        used = len(set(layout.views))
+        notes.append(f"read as: {recovery.description}")
+        notes += [f"{used} of {count} views are in the file"] * (used < count)
+    return AlignmentResult(
+        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
+        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
+        images=inputs.images,
+        camera_file=grid.camera_file,
+        notes=tuple(notes),
+        transform=grid.transform,
+        recovery=recovery,
+        moves=grid.moves,
+        given=None if grid.given is None else frame.move_viewmats(grid.given),
+    )
