@@ -9,7 +9,7 @@ Gaussians: one similarity, for every convention of the poses and every likely or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
@@ -233,7 +233,7 @@ def _find_pixels(source: _Source, grid: Grid | None) -> tuple[Fit, Recovery] | N
         return None
     named = [[] if grid is None else [grid], file_grids(source.camera_file, source.size)]
     counted = (_choose(source, [(g, layout) for g in grids for layout in _layouts(source, g)]) for grids in named)
-    followed = (_choose(source, _followed(source, grids)) for grids in named)
+    followed = (_choose(source, places) for grids in named for places in _follow_cameras(source, grids))
     moved = (_move_cameras(source, g) for g in named[0])
     found = next(filter(None, chain(counted, followed, moved)), None)
     if found is not None and not found[0].is_doubtful:
@@ -257,7 +257,7 @@ def _find_lacking(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery
     shown = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
     usual = grids_of(source.camera_file, source.size, network_sizes)
     if shown is None:
-        return _choose(source, _followed(source, usual))
+        return next(filter(None, (_choose(source, places) for places in _follow_cameras(source, usual))), None)
     layout, own = shown[0], shown[1].cameras
     rounds = ([(g, place) for g in grids for place in _places(source, g, layout, own)] for grids in (named, usual))
     return next(filter(None, (_choose(source, places) for places in rounds)), None)
@@ -287,14 +287,13 @@ def _may_lack_pixels(source: _Source, grids: Sequence[Grid]) -> bool:
     return enough and len(source.ply.gaussians) < most
 
 
-def _followed(source: _Source, grids: Sequence[Grid]) -> list[_Place]:
-    """List the places of rows that lack pixels and follow the cameras, as exporters move or misread them.
+def _follow_cameras(source: _Source, grids: Sequence[Grid]) -> Iterator[list[_Place]]:
+    """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
 
     Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
     """
     from gsmerge.alignment.dropped_rows import follow_rows  # few files come here
 
-    places = []
     others = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
     for grid in grids:
         if not _may_lack_pixels(source, [grid]):
@@ -306,9 +305,7 @@ def _followed(source: _Source, grids: Sequence[Grid]) -> list[_Place]:
         for cameras in moved:
             layout = follow_rows(source.ply.gaussians.means, source.ply.valid, cameras)
             if layout is not None and source.order in ("auto", layout.order):
-                places.append((grid, layout))
-                break
-    return places
+                yield [(grid, layout)]
 
 
 def _places(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
@@ -431,10 +428,10 @@ def read_views(
     readings: list[Reading] = []
     for effort, frame in frames:
         reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
-        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
-            return reading
         if effort == 2 and readings:
             break
+        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
+            return reading
         if reading.ok and (effort == 0 or inputs.scale is not None or reading.median_px <= as_good):
             readings.append(reading)  # otherwise cameras are wrong
     lowest = min((reading.worst_px for reading in readings), default=math.inf)
