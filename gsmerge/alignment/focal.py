@@ -20,7 +20,7 @@ from gsmerge.alignment.cameras import fit_lines, other_conventions
 from gsmerge.alignment.estimate import estimate_cameras
 from gsmerge.alignment.grids import shown_sizes
 from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
-from gsmerge.alignment.row_grid import find_shapes
+from gsmerge.alignment.row_grid import find_layouts
 from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
@@ -127,7 +127,8 @@ def _intrinsics_of_rays(
 def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
     """Yield the transforms of photos to the sizes that the grid may have: theirs, then those that rows show."""
     yield resize_to(size, size)
-    for shape in find_shapes(ply.gaussians, ply.valid):
+    shapes = ((layout.width, layout.height) for layout in find_layouts(ply.gaussians, ply.valid))
+    for shape in dict.fromkeys(shapes):
         yield from shown_sizes(size, shape)
 
 

@@ -104,7 +104,7 @@ def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
     ``size``: size of the photos. Empty without photos, and where both have one size.
     """
     sizes = sizes_of(camera_file)
-    if size is None or len(sizes) != 1 or sizes[0] == size:
+    if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:
         return []
     (camera_size,), grids = sizes, []
     cameras = to_cameras(camera_file, camera_size)

@@ -36,7 +36,7 @@ class Recovery:
     best: Reading
     # how many times nearer the Gaussians are to their pixels than to shuffled pixels
     margin: float
-    rival: Reading | None = None  # another one that fits the pixels as well, against which the photos' colours decided
+    other: Reading | None = None  # another one that fits the pixels as well, against which the photos' colours decided
     color_margin: float | None = None  # how many times farther its colours are from the photos
     # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
     confirmed: bool | None = None
@@ -45,11 +45,11 @@ class Recovery:
     def description(self) -> str:
         """Description of the reading and its margin in words."""
         text = f"{self.best.description}: median {self.best.median_px:.2f} px from the pixels, "
-        if self.rival is None or self.color_margin is None:
+        if self.other is None or self.color_margin is None:
             text += f"{min(self.margin, 9999):.0f} times nearer than shuffled pixels"
         else:
             text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
-            text += f" reading ({self.rival.description}), which fits the pixels as well"
+            text += f" reading ({self.other.description}), which fits the pixels as well"
         return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
 
 
@@ -92,23 +92,23 @@ def judge(
         near = [fit for fit in near if fit.grid.size == first.grid.size]
     colors = [color_error(read(fit.grid), fit.reading.layout) for fit in near] if len(near) > 1 else [math.nan]
     order = sorted(range(len(near)), key=lambda i: (colors[i], i))
-    rivals = [i for i in order if _differs(near[i].reading.layout, near[order[0]].reading.layout)]
-    if not rivals:  # of photos that were resized in several ways
+    others = [i for i in order if _differs(near[i].reading.layout, near[order[0]].reading.layout)]
+    if not others:  # of photos that were resized in several ways
         same = [i for i in order if near[i].px <= max(_SAME * first.px, first.px + _SAME_PX)]
         return _accept(refine(near[same[0]]), read)
-    best, rival = refine(near[order[0]]), near[rivals[0]].reading
+    best, other = refine(near[order[0]]), near[others[0]].reading
     inputs = read(best.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, best.reading)
-    color, next_color = colors[order[0]], min(colors[rivals[0]], shuffled_color)
+    color, next_color = colors[order[0]], min(colors[others[0]], shuffled_color)
     decided = next_color > _MIN_SHUFFLED_COLOR and next_color >= COLOR_MARGIN * color  # not without photos: NaN
     if not (decided and beats_shuffled(best.reading, shuffled_px)):
         return None
     margin = shuffled_px / max(best.px, SMALLEST_PX)
-    return best, Recovery(best.reading, margin, rival, next_color / max(color, 1e-3), True)
+    return best, Recovery(best.reading, margin, other, next_color / max(color, 1e-3), True)
 
 
 def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> tuple[Fit, Recovery] | None:
-    """Accept a fit that has no rivals if its pixels beat shuffled ones; None if they do not."""
+    """Accept a fit that has no others if its pixels beat shuffled ones; None if they do not."""
     inputs = read(fit.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, fit.reading)
     if not beats_shuffled(fit.reading, shuffled_px):

@@ -39,22 +39,26 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
 
     ``valid [n]`` bool. Pixels that an exporter trimmed are not part of the grid.
     """
-    size = _find_size(gaussians, valid)
-    if size is None:
-        return None
-    rows = gaussians.means, valid
-    _, width, height = size
-    by_row, by_column = (_layouts(len(valid), *lines) for lines in ((width, height, False), (height, width, True)))
-    fits = _calibrate_layouts(*rows, by_row) or _calibrate_layouts(*rows, by_column)
+    rounds = (_calibrate_layouts(gaussians.means, valid, layouts) for layouts in _shown_layouts(gaussians, valid))
+    fits = next(filter(None, rounds), [])
     nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
     near = [fit for fit in fits if fit[1].worst_px <= max(_SAME * nearest, nearest + _SAME_PX)]
     return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
 
 
-def find_shapes(gaussians: Gaussians, valid: np.ndarray) -> list[tuple[int, int]]:
-    """List the shapes (columns, lines) that the grid of the rows may have: lines are rows of pixels, or columns."""
+def find_layouts(gaussians: Gaussians, valid: np.ndarray) -> list[Layout]:
+    """Find the layouts of the grid whose pixels are the rows, some of which may be the same under other names."""
+    return next(filter(None, map(list, _shown_layouts(gaussians, valid))), [])
+
+
+def _shown_layouts(gaussians: Gaussians, valid: np.ndarray) -> Iterator[Iterator[Layout]]:
+    """Yield the layouts in which projective cameras show the rows in their pixels, line by line, then by columns."""
     size = _find_size(gaussians, valid)
-    return [] if size is None else [size[1:], size[:0:-1]]
+    if size is None:
+        return
+    _, width, height = size
+    for layouts in (_layouts(len(valid), width, height, False), _layouts(len(valid), height, width, True)):
+        yield (layout for layout in layouts if _shows_pixels(gaussians.means, valid, layout))
 
 
 def _calibrate_layouts(
@@ -63,13 +67,17 @@ def _calibrate_layouts(
     """Calibrate the cameras of layouts; leave out layouts whose pixels do not match the rows."""
     fits = []
     for layout in layouts:
-        count = len(layout.views)
-        if all(_shows_part(means, valid, layout, i) for i in {0, count // 2, count - 1}):
-            samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // count, _MAX_SAMPLES // 10))
-            pairs = find_correspondences(means, valid, _thin(layout, samples))
-            calibration = calibrate(pairs, layout.width, layout.height)
-            fits += [] if calibration is None else [(layout, calibration)]
+        samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // len(layout.views), _MAX_SAMPLES // 10))
+        pairs = find_correspondences(means, valid, _thin(layout, samples))
+        calibration = calibrate(pairs, layout.width, layout.height)
+        fits += [] if calibration is None else [(layout, calibration)]
     return fits
+
+
+def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
+    """Return whether projective cameras show the rows of the first, the middle and the last part in their pixels."""
+    count = len(layout.views)
+    return all(_shows_part(means, valid, layout, i) for i in {0, count // 2, count - 1})
 
 
 def _shows_part(means: np.ndarray, valid: np.ndarray, layout: Layout, index: int) -> bool:

@@ -9,7 +9,7 @@ Gaussians: one similarity, for every convention of the poses and every likely or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.cameras import describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras, other_conventions
 from gsmerge.alignment.frames import own_poses, scale_by, solved_frames, usual_frames
 from gsmerge.alignment.grids import (
     Grid,
@@ -66,6 +66,7 @@ from gsmerge.types import Cameras
 
 _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
 _ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
 _SIMPLER, _SIMPLER_PX = 1.15, 0.02  # a simpler frame wins unless it is worse than this factor and these pixels
 _AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
@@ -134,6 +135,10 @@ class _Source:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
         return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
 
+    def may_be(self, order: str) -> bool:
+        """Return whether rows may be in an order."""
+        return self.order in ("auto", order)
+
     def orders(self, grid: Grid) -> list[tuple[int, ...]]:
         """List the orders that the views may be in: the file's, and that of the names.
 
@@ -180,39 +185,40 @@ def align(
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
     source = _Source(ply, camera_file, photos, order, scale, depths)
+    grids, problem = file_grids(camera_file, source.size), None
     try:
-        grid = photo_grid(camera_file, source.size)
-    except SceneError:
-        found = _find_pixels(source, None)
-        cropped = _cropped_grid(source) if found is None else found[0].grid
-        if cropped is None:
-            raise
-        grid = cropped
-    else:
-        found = _read_in_order(source, grid) or _find_pixels(source, grid)
-    return _choose_cameras(source, grid, frames) if found is None else _make_result(source, *found)
+        grids.insert(0, photo_grid(camera_file, source.size))
+    except SceneError as error:
+        problem = error
+    found = _read_in_order(source, grids) or _find_pixels(source, grids)
+    if found is not None:
+        return _make_result(source, *found)
+    grid = grids[0] if problem is None else _cropped_grid(source, grids)
+    if grid is None:
+        assert problem is not None, "there is a grid of the photos' size"
+        raise problem
+    return _choose_cameras(source, grid, frames)
 
 
-def _read_in_order(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+def _read_in_order(source: _Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
     """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
 
     Or read them by the pixels that they showed when their cameras were estimated.
     """
-    inputs, count, pixel_ids = source.inputs(grid), len(source.ply.gaussians), source.camera_file.pixel_ids
-    if pixel_ids is not None:
-        estimated = score_layout(inputs, dropped_layout(pixel_ids, len(grid.cameras), *grid.size), IDENTITY)
-        return judge([Fit(grid, estimated)], source.inputs, lambda fit: fit) if estimated.ok else None
-    expected = len(grid.cameras) * math.prod(grid.size)
-    if source.order not in ("auto", "view-major") or source.scale is not None or count != expected:
-        return None
-    if not _has_enough(source):
-        return None
-    layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
-    best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
-    far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
-    if not (best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others)):
-        return None
-    return judge([Fit(grid, best)], lambda _: inputs, lambda fit: fit) if best.ok else None
+    count, pixel_ids, fits = len(source.ply.gaussians), source.camera_file.pixel_ids, []
+    for grid in grids:
+        inputs = source.inputs(grid, photos=False)
+        if pixel_ids is not None:
+            layout = dropped_layout(pixel_ids, len(grid.cameras), *grid.size)
+            fits.append(Fit(grid, score_layout(inputs, layout, IDENTITY)))
+        elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_enough(source):
+            layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
+            best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+            far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+            if source.scale is None and best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others):
+                fits.append(Fit(grid, best))
+    fits = [fit for fit in fits if fit.reading.ok]
+    return judge(fits, source.inputs, lambda fit: fit) if fits else None
 
 
 def _has_enough(source: _Source) -> bool:
@@ -224,60 +230,64 @@ def _has_enough(source: _Source) -> bool:
 # Rows show their grid
 
 
-def _find_pixels(source: _Source, grid: Grid | None) -> tuple[Fit, Recovery] | None:
+def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
     """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
 
-    ``grid``: of the photos' size; None where photos and cameras have different ones.
+    ``named``: the grids of sizes that files name.
     """
     if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
         return None
-    named = [[] if grid is None else [grid], file_grids(source.camera_file, source.size)]
-    counted = (_choose(source, [(g, layout) for g in grids for layout in _layouts(source, g)]) for grids in named)
-    followed = (_choose(source, places) for grids in named for places in _follow_cameras(source, grids))
-    moved = (_move_cameras(source, g) for g in named[0])
-    found = next(filter(None, chain(counted, followed, moved)), None)
+    found = _choose(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
+    found = found or next(filter(None, (_move_cameras(source, grid) for grid in named[:1])), None)
+    pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
+    is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
+    found = found or (None if is_small else _choose_first(source, _follow_cameras(source, named)))
     if found is not None and not found[0].is_doubtful:
         return found
-    from gsmerge.alignment.row_grid import find_shapes  # few files come here
+    from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
-    shapes = find_shapes(source.ply.gaussians, source.ply.valid)
-    for shape in shapes:
-        grids = grids_of(source.camera_file, source.size, partial(shown_sizes, shape=shape))
-        shown = [(g, layout) for g in grids for layout in _layouts(source, g) if _has_shape(layout, shape)]
-        found = min(filter(None, (found, _choose(source, shown))), key=lambda each: each[0].px, default=None)
-    return found if found is not None or shapes else _find_lacking(source, [*chain(*named)])
+    layouts = find_layouts(source.ply.gaussians, source.ply.valid)
+    if layouts:
+        shown = partial(shown_sizes, shape=(layouts[0].width, layouts[0].height))
+        grids = grids_of(source.camera_file, source.size, shown)
+        other = _choose(source, [(g, each) for g in grids for each in _layouts(source, g) if _are_same(each, layouts)])
+        return min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
+    found = found or (_choose_first(source, _follow_cameras(source, named)) if is_small else None)
+    return found or _choose_first(source, _lacking_places(source, named))
 
 
-def _find_lacking(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
-    """Find the pixels of rows that lack some at random, in grids that files name or networks have; None for others."""
+def _lacking_places(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
+    """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
     from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
 
     if not _may_lack_pixels(source, named):
-        return None
+        return
     shown = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
     usual = grids_of(source.camera_file, source.size, network_sizes)
     if shown is None:
-        return next(filter(None, (_choose(source, places) for places in _follow_cameras(source, usual))), None)
+        yield from _follow_cameras(source, usual)
+        return
     layout, own = shown[0], shown[1].cameras
-    rounds = ([(g, place) for g in grids for place in _places(source, g, layout, own)] for grids in (named, usual))
-    return next(filter(None, (_choose(source, places) for places in rounds)), None)
+    for grids in (named, usual):
+        yield [(g, place) for g in grids for place in _moved_layouts(source, g, layout, own)]
 
 
 def _layouts(source: _Source, grid: Grid) -> list[Layout]:
     """List the layouts in a grid that the number of rows allows, or the depth maps next to the cameras."""
     views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
     layouts = list(exact_layouts(count, views, width, height))
-    if count < views * width * height and source.order in ("auto", "view-major"):
+    if count < views * width * height and source.may_be("view-major"):
         depths = source.depths()
         if depths is not None and depths.shape == (views, height, width):
             layouts += depth_layouts(count, depths)
-    return [layout for layout in layouts if source.order in ("auto", layout.order)]
+    return [layout for layout in layouts if source.may_be(layout.order)]
 
 
-def _has_shape(layout: Layout, shape: Size) -> bool:
-    """Return whether the pixels of a layout without its borders have a shape."""
+def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
+    """Return whether a layout without its borders is one of those that rows have shown."""
     y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
-    return (int(np.ptp(x)) + 1, int(np.ptp(y)) + 1) == shape
+    what = int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, layout.order, layout.per_pixel
+    return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
 
 
 def _may_lack_pixels(source: _Source, grids: Sequence[Grid]) -> bool:
@@ -304,18 +314,18 @@ def _follow_cameras(source: _Source, grids: Sequence[Grid]) -> Iterator[list[_Pl
         )
         for cameras in moved:
             layout = follow_rows(source.ply.gaussians.means, source.ply.valid, cameras)
-            if layout is not None and source.order in ("auto", layout.order):
+            if layout is not None and source.may_be(layout.order):
                 yield [(grid, layout)]
 
 
-def _places(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
+def _moved_layouts(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
     """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
     cameras = grid.cameras
     margins = cameras.width - layout.width, cameras.height - layout.height
     focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
     if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
         return []
-    if source.order not in ("auto", layout.order):
+    if not source.may_be(layout.order):
         return []
     chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
     layout = replace(layout, views=chosen)
@@ -328,6 +338,11 @@ def _places(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[L
 
 
 # Views are some of the file's cameras
+
+
+def _choose_first(source: _Source, rounds: Iterable[Sequence[_Place]]) -> tuple[Fit, Recovery] | None:
+    """Choose a place from the first round that has one; None if no round has."""
+    return next(filter(None, (_choose(source, places) for places in rounds)), None)
 
 
 def _choose(source: _Source, places: Sequence[_Place]) -> tuple[Fit, Recovery] | None:
@@ -461,7 +476,7 @@ def _move_cameras(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
     layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
     readings = [score_layout(inputs, layout, IDENTITY) for layout in layouts]
     best = min(readings, key=lambda reading: reading.worst_px, default=None)
-    if best is None or not best.worst_px <= max_pixels(*grid.size):
+    if best is None or not NEAR_PX < best.worst_px <= max_pixels(*grid.size):
         return None
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
     path = str(source.camera_file.path)
@@ -478,12 +493,12 @@ def _move_cameras(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
 # Rows without pixels, and results
 
 
-def _cropped_grid(source: _Source) -> Grid | None:
-    """Return photos resized or cropped to the cameras' size that show the colours of rows; None if none do."""
+def _cropped_grid(source: _Source, grids: Sequence[Grid]) -> Grid | None:
+    """Return the one of the grids whose photos show the colours of rows best; None if none do."""
     from gsmerge.alignment.unaligned import check_cameras
 
     best, least = None, 0.0
-    for grid in file_grids(source.camera_file, source.size):
+    for grid in grids:
         inputs = source.inputs(grid)
         check = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, inputs.images)
         if check.ok and not math.isnan(check.color_ratio) and check.score > least:
