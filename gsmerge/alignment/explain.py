@@ -7,29 +7,26 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.cameras import describe_reading, other_conventions
-from gsmerge.alignment.frames import ray_directions, scale_by, solve_frame, solve_pose, usual_frames
+from gsmerge.alignment.frames import ray_directions, scale_by, solve_frame, usual_frames
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, exact_layouts, plain_layout, subsample
+from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     MAX_CHECKED,
     Alignment,
     AlignmentInput,
-    beats_shuffled,
     check_alignment,
     check_pairs,
     find_correspondences,
-    pixel_errors,
     sample_pixels,
-    score_layout,
-    score_shuffled,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import median
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
+_SOME_CAMERA = 4.0  # times the limit, within which rows are pixels of some camera
 _ORDERS = {  # in which rows may be instead, by the order of their layout
     "view-fastest": "in the order row, column, view (view fastest)",
     "column-major": "in the order view, column, row (column-major)",
@@ -43,29 +40,19 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     problem = f"expected one Gaussian per pixel, {expected}, found {ply.count}"
-    if inputs.order not in MAY_BE_UNALIGNED:
-        if count == views * width * height:
-            rows = inputs.gaussians, cameras, inputs.valid
-            alignment = check_alignment(*rows)
-            reason = explain_misalignment(*rows, camera_file.convention)
-            pairs = sample_pixels(*rows)
-            pairs = pairs.select(pairs.views == 0)
-            pose = None if reason else solve_pose(pairs, 0, cameras.Ks[0])
-            # a pose that takes up most of wrong intrinsics, too, shows that the rows are pixels of some camera
-            own_camera = None if pose is None else replace(cameras[:1], viewmats=pose[None])
-            is_grid = own_camera is not None and median(pixel_errors(pairs, own_camera)) < 4 * alignment.limit_px
-            if reason or is_grid:
-                raise misalignment_error(camera_file.path, alignment, reason)
-            problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
-        elif count > views * width * height and count % (width * height) == 0:
-            size, plain = views * width * height, plain_layout(views, width, height)
-            first = replace(inputs, gaussians=inputs.gaussians[:size], valid=inputs.valid[:size], order="view-major")
-            # more views than cameras, the first of them in order
-            readings = (score_layout(first, plain, frame) for frame in usual_frames(cameras, first.scale))
-            if any(
-                beats_shuffled(each, score_shuffled(first, each)[0]) for each in readings
-            ):  # more views than cameras
-                raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
+    size = views * width * height
+    if inputs.order not in MAY_BE_UNALIGNED and count == size:
+        rows = inputs.gaussians, cameras, inputs.valid
+        alignment, pairs = check_alignment(*rows), sample_pixels(*rows)
+        reason = explain_misalignment(*rows, camera_file.convention)
+        first = pairs.select(pairs.views == 0)
+        if reason or projective_error(first.points, first.pixels) < _SOME_CAMERA * alignment.limit_px:
+            raise misalignment_error(camera_file.path, alignment, reason)
+        problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
+    elif inputs.order not in MAY_BE_UNALIGNED and count > size and count % (width * height) == 0:
+        moved = (frame.move(cameras) for frame in usual_frames(cameras, inputs.scale))
+        if any(check_alignment(inputs.gaussians[:size], each, inputs.valid[:size]).ok for each in moved):
+            raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))  # more views than cameras
     return SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
 
 

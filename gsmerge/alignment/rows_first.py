@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from itertools import chain
 from typing import Any
 
@@ -193,11 +193,10 @@ def align(
     found = _read_in_order(source, grids) or _find_pixels(source, grids)
     if found is not None:
         return _make_result(source, *found)
-    grid = grids[0] if problem is None else _cropped_grid(source, grids)
-    if grid is None:
-        assert problem is not None, "there is a grid of the photos' size"
+    cropped = None if problem is None else _cropped_grid(source, grids)
+    if problem is not None and cropped is None:
         raise problem
-    return _choose_cameras(source, grid, frames)
+    return _choose_cameras(source, cropped or grids[0], frames)
 
 
 def _read_in_order(source: _Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
@@ -238,10 +237,11 @@ def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery]
     if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
         return None
     found = _choose(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
-    found = found or next(filter(None, (_move_cameras(source, grid) for grid in named[:1])), None)
+    found = found or (_move_cameras(source, named[0]) if named else None)
+    followed = _follow_cameras(source, named)
     pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
     is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
-    found = found or (None if is_small else _choose_first(source, _follow_cameras(source, named)))
+    found = found or (None if is_small else _choose_first(source, followed))
     if found is not None and not found[0].is_doubtful:
         return found
     from gsmerge.alignment.row_grid import find_layouts  # few files come here
@@ -252,8 +252,7 @@ def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery]
         grids = grids_of(source.camera_file, source.size, shown)
         other = _choose(source, [(g, each) for g in grids for each in _layouts(source, g) if _are_same(each, layouts)])
         return min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
-    found = found or (_choose_first(source, _follow_cameras(source, named)) if is_small else None)
-    return found or _choose_first(source, _lacking_places(source, named))
+    return found or _choose_first(source, chain(followed, _lacking_places(source, named)))
 
 
 def _lacking_places(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
@@ -379,47 +378,48 @@ def _projective_error(source: _Source, grid: Grid, layout: Layout) -> float:
 
 
 def _fit_views(source: _Source, grid: Grid, layout: Layout) -> list[Fit]:
-    """Fit the views of a layout to the file's cameras, in each likely order and that of the nearest poses."""
+    """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
-    number = np.unique(layout.views, return_inverse=True)[1].reshape(-1)  # of the view of each part, from 0
-    own: dict[bytes, dict[int, np.ndarray]] = {}
+    likely, parts = np.unique(layout.views, return_inverse=True)  # cameras of the views; the view of each part
+    pairs = replace(pairs, views=parts[pairs.parts])
 
-    def fit(views: Sequence[int]) -> Fit:
-        cameras = np.unique(number, return_index=True)[1]
-        cameras = np.array(views)[cameras]  # of each view
-        Ks = grid.cameras.Ks[cameras]
-        poses = own.setdefault(Ks.tobytes(), {}) or own_poses(replace(pairs, views=number[pairs.parts]), Ks)
-        own[Ks.tobytes()] = poses
-        labelled = {int(cameras[view]): pose for view, pose in poses.items()}
-        views = tuple(int(cameras[view]) for view in number)
-        relabelled = replace(pairs, views=np.array(views)[pairs.parts])
-        return Fit(grid, read_views(inputs, replace(layout, views=views), relabelled, labelled))
+    @cache
+    def solve(Ks: bytes) -> dict[int, np.ndarray]:
+        return own_poses(pairs, np.frombuffer(Ks).reshape(-1, 3, 3))
 
-    fits = {each.views: fit(each.views) for each in layout.with_views_in(source.orders(grid))}
-    nearest = _nearest_cameras(next(iter(own.values())), number, grid.cameras)
-    if nearest is not None and nearest not in fits and source.scale is None:
+    def find_own(cameras: Sequence[int]) -> dict[int, np.ndarray]:
+        return solve(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
+
+    def fit(cameras: Sequence[int]) -> Fit:
+        own = {cameras[view]: pose for view, pose in find_own(cameras).items()}
+        views = np.array(cameras)
+        labelled = replace(layout, views=tuple(views[parts].tolist()))
+        return Fit(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
+
+    orders = dict.fromkeys(tuple(order[view] for view in likely) for order in source.orders(grid))
+    fits = [fit(order) for order in orders]
+    nearest = _nearest_cameras(find_own(next(iter(orders))), len(likely), grid.cameras)
+    if nearest is not None and nearest not in orders and source.scale is None:
         other = fit(nearest)
-        same_axes = ("same", "scaled", "shifted") if number.any() else ("same",)  # one view fits any camera
-        fits |= {nearest: other} if other.reading.frame.kind in same_axes else {}
-    return [each for each in fits.values() if each.reading.ok]
+        same_axes = ("same", "scaled", "shifted") if len(likely) > 1 else ("same",)  # one view fits any camera
+        fits += [other] if other.reading.frame.kind in same_axes else []
+    return [each for each in fits if each.reading.ok]
 
 
-def _nearest_cameras(own: Mapping[int, np.ndarray], number: np.ndarray, cameras: Cameras) -> tuple[int, ...] | None:
-    """Find the camera whose pose is nearest to that of each view; None where two views have the same, or have no pose.
+def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
+    """Find the cameras whose poses are nearest to those of ``count`` views; None where two have one, or no pose.
 
-    ``number``: the view of each part. Distances are in units of the cameras' spread.
+    Distances are in units of the cameras' spread.
     """
-    views = int(number.max()) + 1
-    if len(own) < views:
+    if len(own) < count:
         return None
-    viewmats = np.stack([own[view] for view in range(views)])
-    centres = cameras.centres
+    viewmats, centres = np.stack([own[view] for view in range(count)]), cameras.centres
     unit = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
     turned = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
     away = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
-    nearest = (turned + away).argmin(1)
-    return tuple(nearest[number].tolist()) if len(set(nearest.tolist())) == views else None
+    nearest = (turned + away).argmin(1).tolist()
+    return tuple(nearest) if len(set(nearest)) == count else None
 
 
 def read_views(
