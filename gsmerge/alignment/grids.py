@@ -165,10 +165,13 @@ def shown_sizes(size: Size, shape: Size) -> list[PhotoTransform]:
 
 def network_sizes(size: Size) -> list[PhotoTransform]:
     """List the transforms of networks to grids that rows may be of which lack pixels."""
-    transforms = [*patch_grids(size), *(resize_to(size, half) for half in _half_sizes(size))]
-    if min(size) >= SQUARE and size != (SQUARE, SQUARE):
-        transforms.append(resize_and_crop(size, (SQUARE, SQUARE)))
-    return transforms
+    return [*patch_grids(size), *(resize_to(size, half) for half in _half_sizes(size)), *square_sizes(size)]
+
+
+def square_sizes(size: Size) -> list[PhotoTransform]:
+    """List the transform to the square to which pixelSplat and similar models crop photos, where that is smaller."""
+    square = SQUARE, SQUARE
+    return [resize_and_crop(size, square)] if min(size) >= SQUARE and size != square else []
 
 
 def _half_sizes(size: Size) -> Iterator[Size]:

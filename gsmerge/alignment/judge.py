@@ -67,9 +67,8 @@ class Fit:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether a grid of another size may fit as well: rows lack pixels, and lie far from theirs."""
-        loose = self.reading.layout.kind == "pruned" or self.reading.frame.scale != 1
-        return self.reading.layout.kind in ("trim", "pruned") and loose and self.px > _WRONG_SIZE_PX
+        """Whether a grid of another size may fit as well, since borders are cut off and the scale is solved for."""
+        return self.reading.layout.kind == "trim" and self.reading.frame.scale != 1 and self.px > _WRONG_SIZE_PX
 
 
 def judge(

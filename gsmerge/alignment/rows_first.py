@@ -9,7 +9,7 @@ Gaussians: one similarity, for every convention of the poses and every likely or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from itertools import chain
@@ -27,6 +27,7 @@ from gsmerge.alignment.grids import (
     network_sizes,
     photo_grid,
     shown_sizes,
+    square_sizes,
     with_photo_size,
 )
 from gsmerge.alignment.judge import Fit, Recovery, judge
@@ -236,23 +237,36 @@ def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery]
     """
     if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
         return None
-    found = _choose(source, [(grid, layout) for grid in named for layout in _layouts(source, grid)])
-    found = found or (_move_cameras(source, named[0]) if named else None)
-    followed = _follow_cameras(source, named)
-    pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
-    is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
-    found = found or (None if is_small else _choose_first(source, followed))
-    if found is not None and not found[0].is_doubtful:
-        return found
+    found, refine = None, partial(_refine, source)
+    for turn, places in enumerate(_rounds(source, named)):
+        fits = _match_views(source, places)
+        other = judge(fits, source.inputs, refine) if fits else None
+        if other is None and turn == 0 and named:
+            other = _move_cameras(source, named[0])
+        found = min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
+        if found is not None and not found[0].is_doubtful:
+            return found
+    return found
+
+
+def _rounds(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
+    """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
     from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
+    yield [(grid, layout) for grid in named for layout in _layouts(source, grid)]
+    pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
+    is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
+    if not is_small:
+        yield from _follow_cameras(source, named)
     layouts = find_layouts(source.ply.gaussians, source.ply.valid)
     if layouts:
         shown = partial(shown_sizes, shape=(layouts[0].width, layouts[0].height))
         grids = grids_of(source.camera_file, source.size, shown)
-        other = _choose(source, [(g, each) for g in grids for each in _layouts(source, g) if _are_same(each, layouts)])
-        return min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
-    return found or _choose_first(source, chain(followed, _lacking_places(source, named)))
+        yield [(grid, each) for grid in grids for each in _layouts(source, grid) if _are_same(each, layouts)]
+        return
+    if is_small:
+        yield from _follow_cameras(source, named)
+    yield from _lacking_places(source, named)
 
 
 def _lacking_places(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
@@ -339,26 +353,18 @@ def _moved_layouts(source: _Source, grid: Grid, layout: Layout, own: Cameras) ->
 # Views are some of the file's cameras
 
 
-def _choose_first(source: _Source, rounds: Iterable[Sequence[_Place]]) -> tuple[Fit, Recovery] | None:
-    """Choose a place from the first round that has one; None if no round has."""
-    return next(filter(None, (_choose(source, places) for places in rounds)), None)
-
-
-def _choose(source: _Source, places: Sequence[_Place]) -> tuple[Fit, Recovery] | None:
-    """Choose the place of the rows whose views are the file's cameras, in another convention where none is as stored.
-
-    None if there is none, or several that nothing tells apart.
-    """
+def _match_views(source: _Source, places: Sequence[_Place]) -> list[Fit]:
+    """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
     errors = [_projective_error(source, *place) for place in places]
     far = _AS_SHOWN * max(min(errors, default=0.0), SMALLEST_PX)
     shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
-    usual, convention = source.camera_file.viewmats, source.camera_file.convention
     fits = [fit for place in shown for fit in _fit_views(source, *place)]
+    usual, convention = source.camera_file.viewmats, source.camera_file.convention
     for poses in other_conventions(usual, convention) if shown and not fits else ():
         for grid, layout in shown:
             file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
             fits += _fit_views(source, grid.with_poses(file), layout)
-    return judge(fits, source.inputs, partial(_refine, source)) if fits else None
+    return fits
 
 
 def _projective_error(source: _Source, grid: Grid, layout: Layout) -> float:
@@ -510,25 +516,46 @@ def _choose_cameras(source: _Source, grid: Grid, frames: Callable[[], Sequence[S
     """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
     from gsmerge.alignment.explain import explain_count
     from gsmerge.alignment.unaligned import choose_cameras
-    from gsmerge.alignment.upright import place_upright
+    from gsmerge.alignment.upright import upright_rotation
 
     info, camera_file, inputs = source.ply.info, source.camera_file, source.inputs(grid)
     if source.order not in MAY_BE_UNALIGNED:
         check_photo_size(info, camera_file, source.size)
-    upright = place_upright(inputs, info)
-    if upright is None:
-        why = explain_count(info, inputs, camera_file)
-        if source.scale is not None:
-            inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
-        cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
-        problem = why.problem
-    else:
-        cameras = upright.move(inputs.cameras)
-        camera_file = replace(camera_file, viewmats=cameras.viewmats)
-        notes = [f"the cameras are {upright.description}, as the photos' colours show"]
-        problem = "expected one Gaussian per pixel, found Gaussians that were merged"
+    rotation = upright_rotation(inputs)
+    if rotation is not None:
+        return _place_upright(source, grid, rotation)
+    why = explain_count(info, inputs, camera_file)
+    if source.scale is not None:
+        inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
+    cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
     return AlignmentResult(
-        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=problem
+        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
+    )
+
+
+def _place_upright(source: _Source, grid: Grid, rotation: Similarity) -> AlignmentResult:
+    """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
+    from gsmerge.alignment.upright import solve_upright, upright_error
+
+    grids = [grid, *grids_of(source.camera_file, source.size, square_sizes)] if len(source.photos) else []
+    solved = ((each, solve_upright(source.inputs(each), rotation)) for each in grids)
+    placed = next(((each, frame) for each, frame in solved if frame is not None), None)
+    if placed is None:
+        raise upright_error(source.ply.info, len(source.photos))
+    grid, frame = placed
+    inputs, moved = source.inputs(grid), replace(grid, cameras=frame.move(grid.cameras))
+    for ((_, layout),) in _follow_cameras(source, [moved]):
+        found = judge([Fit(grid, score_layout(inputs, layout, frame))], source.inputs, lambda fit: fit)
+        if found is not None:
+            return _make_result(source, *found)
+    return AlignmentResult(
+        None,
+        moved.cameras,
+        inputs.images,
+        replace(source.camera_file, viewmats=moved.cameras.viewmats),
+        (*grid.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        grid.transform,
+        problem="expected one Gaussian per pixel, found Gaussians that were merged",
     )
 
 

@@ -1,10 +1,10 @@
-"""Solve for the frame of fused rows that FreeSplat, as the pixelSplat family, centres, rescales and turns upright.
+"""Solve for the frame of rows that the pixelSplat family centres, rescales and turns upright.
 
-The exporter subtracts the median, divides by the 95 % quantile of the widest axis and turns the world from the first
-camera, and saves neither. Rows show no grid, since those of a view were fused with others or have several layers with
-gaps, and no camera of theirs; but such a file shows itself, and the rotation is known; scale and shift follow from some
-rows' pixels. Stretches of rows without a gap show the colours of a stretch of a photo; those that agree on a frame give
-it, the others are wrong.
+Its exporter subtracts the median, divides by the 95 % quantile of the widest axis and turns the world from the first
+camera, and saves neither. Rows cannot show their cameras where views were fused (FreeSplat), where layers of a pixel
+have gaps, or where so many far pixels were cut that no lines repeat; but such a file shows itself, and the rotation is
+known; scale and shift follow from some rows' pixels. Stretches of rows without a gap show the colours of a stretch of a
+photo; those that agree on a frame give it, the others are wrong.
 """
 
 from __future__ import annotations
@@ -53,26 +53,7 @@ class _Try:
     high: int
 
 
-def place_upright(inputs: AlignmentInput, ply: FileInfo) -> Similarity | None:
-    """Find the frame of rows that are centred, rescaled and turned upright by the photos' colours; None: other rows.
-
-    SceneError without photos that show where they lie.
-    """
-    rotation = _upright_rotation(inputs)
-    frame = None if rotation is None or not len(inputs.images) else _solve_upright(inputs, rotation)
-    if rotation is not None and frame is None:
-        photos = "photos that do not show" if len(inputs.images) else "no photos that show"
-        raise SceneError(
-            ply.path,
-            "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned"
-            f" upright (by how much, no file says), and {photos} where they lie",
-            "give the photos that the model saw, or cameras in the file's frame; or export all pixels, without a far"
-            " cut",
-        )
-    return frame
-
-
-def _upright_rotation(inputs: AlignmentInput) -> Similarity | None:
+def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation of rows that are centred, rescaled and turned upright; None for other rows.
 
     It may be computed from any camera.
@@ -95,7 +76,7 @@ def _uneven(points: np.ndarray) -> float:
     return max(float(np.abs(np.median(points, 0)).max()), abs(quantile - 1))
 
 
-def _solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | None:
+def solve_upright(inputs: AlignmentInput, rotation: Similarity) -> Similarity | None:
     """Solve for the frame of upright rows from their colours in the photos; None if too few stretches agree."""
     for pixels, tries in _possible_orders(len(inputs.gaussians), inputs.cameras):
         frame = _agreed_frame(inputs, _match(inputs, tries, pixels), rotation)
@@ -208,3 +189,14 @@ def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Simi
         return None
     text = f"{rotation.description}, positions scaled by {frame.scale:.4g} and shifted"
     return replace(frame, description=text, kind=rotation.kind)
+
+
+def upright_error(ply: FileInfo, num_photos: int) -> SceneError:
+    """Make the SceneError for upright rows that no photo locates."""
+    photos = "photos that do not show" if num_photos else "no photos that show"
+    return SceneError(
+        ply.path,
+        "expected cameras in the frame of the Gaussians, found Gaussians that were centred, rescaled and turned upright"
+        f" (by how much, no file says), and {photos} where they lie",
+        "give the photos that the model saw, or cameras in the file's frame; or export all pixels, without a far cut",
+    )
