@@ -387,8 +387,8 @@ def _fit_views(source: _Source, grid: Grid, layout: Layout) -> list[Fit]:
     """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
-    likely, parts = np.unique(layout.views, return_inverse=True)  # cameras of the views; the view of each part
-    pairs = replace(pairs, views=parts[pairs.parts])
+    numbers, parts = np.unique(layout.views, return_inverse=True)  # of the views; the view of each part
+    count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
 
     @cache
     def solve(Ks: bytes) -> dict[int, np.ndarray]:
@@ -403,12 +403,13 @@ def _fit_views(source: _Source, grid: Grid, layout: Layout) -> list[Fit]:
         labelled = replace(layout, views=tuple(views[parts].tolist()))
         return Fit(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
 
-    orders = dict.fromkeys(tuple(order[view] for view in likely) for order in source.orders(grid))
+    some = [ids for ids in (*every_nth(len(grid.cameras)), tuple(range(count))) if len(ids) == count]
+    orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
     fits = [fit(order) for order in orders]
-    nearest = _nearest_cameras(find_own(next(iter(orders))), len(likely), grid.cameras)
+    nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)
     if nearest is not None and nearest not in orders and source.scale is None:
         other = fit(nearest)
-        same_axes = ("same", "scaled", "shifted") if len(likely) > 1 else ("same",)  # one view fits any camera
+        same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
         fits += [other] if other.reading.frame.kind in same_axes else []
     return [each for each in fits if each.reading.ok]
 
