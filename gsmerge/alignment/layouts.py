@@ -38,6 +38,12 @@ class Layout:
         labellings = dict.fromkeys(tuple(order[view] for view in self.views) for order in orders)
         return (replace(self, views=labelling) for labelling in labellings)
 
+    def select(self, view: int) -> Layout:
+        """Return the layout of one view, with all its layers."""
+        ids = [i for i, other in enumerate(self.views) if other == view]
+        rows, pixels = (tuple(arrays[i] for i in ids) for arrays in (self.rows, self.pixels))
+        return replace(self, views=(view,) * len(ids), rows=rows, pixels=pixels)
+
     @property
     def is_plain(self) -> bool:
         """Whether the rows are the full grid in order: nothing moves, nothing is missing."""
@@ -103,6 +109,12 @@ def da3_trim(side: int) -> int:
 def da3_borders(side: int) -> list[int]:
     """List the pixels that Depth Anything 3 may have cut off at both ends of what is left of a side."""
     return [border for border in range(side) if da3_trim(side + 2 * border) == border]
+
+
+def some_views(layout: Layout) -> list[int]:
+    """List the first, the middle and the last view of a layout."""
+    views = list(dict.fromkeys(layout.views))
+    return list(dict.fromkeys((views[0], views[len(views) // 2], views[-1])))
 
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:

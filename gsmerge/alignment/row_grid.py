@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.calibration import Calibration, calibrate
-from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts
+from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts, some_views
 from gsmerge.alignment.resection import MIN_POINTS, projective_error
 from gsmerge.alignment.score import find_correspondences, pixel_limit
 from gsmerge.types import Gaussians
@@ -75,17 +75,12 @@ def _calibrate_layouts(
 
 
 def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
-    """Return whether projective cameras show the rows of the first, the middle and the last part in their pixels."""
-    count = len(layout.views)
-    return all(_shows_part(means, valid, layout, i) for i in {0, count // 2, count - 1})
-
-
-def _shows_part(means: np.ndarray, valid: np.ndarray, layout: Layout, index: int) -> bool:
-    """Return whether a projective camera shows the rows of a part in their pixels."""
-    rows, pixels = (arrays[index : index + 1] for arrays in (layout.rows, layout.pixels))
-    part = _thin(replace(layout, views=(0,), rows=rows, pixels=pixels), _SAMPLES)
-    pairs = find_correspondences(means, valid, part)
-    return projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height)
+    """Return whether projective cameras show the rows of the first, the middle and the last view in their pixels."""
+    for view in some_views(layout):
+        pairs = find_correspondences(means, valid, _thin(layout.select(view), _SAMPLES))
+        if not projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height):
+            return False
+    return True
 
 
 def _thin(layout: Layout, samples: int) -> Layout:
@@ -164,7 +159,8 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
         return 1, []
     starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
     starts = starts[valid[starts]]
-    lengths = np.array([_median(np.abs(means[starts + lag] - means[starts]).sum(1)) for lag in lags])
+    steps = np.abs(means[starts + lags[:, None]] - means[starts]).sum(2)
+    lengths = np.median(steps, 1) if np.isfinite(steps).all() else np.array(list(map(_median, steps)))
     fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
     segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1
     places = np.linspace(0, count - fastest - segment, min(_SEGMENTS, -(-count // segment))).astype(int)

@@ -41,6 +41,7 @@ from gsmerge.alignment.layouts import (
     exact_layouts,
     move_layout,
     plain_layout,
+    some_views,
     subsample,
     view_orders,
 )
@@ -370,13 +371,12 @@ def _match_views(source: _Source, places: Sequence[_Place]) -> list[Fit]:
 def _projective_error(source: _Source, grid: Grid, layout: Layout) -> float:
     """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
 
-    Of the first, the middle and the last part, one that a camera shows counts.
+    Of the first, the middle and the last view, one that a camera shows counts.
     """
     limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
-    inputs, count = source.inputs(grid, photos=False), len(layout.views)
-    for i in sorted({0, count // 2, count - 1}):
-        part = replace(layout, views=(0,), rows=layout.rows[i : i + 1], pixels=layout.pixels[i : i + 1])
-        pairs = inputs.pairs(subsample(part, _SHOWN_SAMPLES))
+    inputs = source.inputs(grid, photos=False)
+    for view in some_views(layout):
+        pairs = inputs.pairs(subsample(layout.select(view), _SHOWN_SAMPLES))
         error = projective_error(pairs.points, pairs.pixels)
         if error <= limit:
             return error
