@@ -1,8 +1,8 @@
 """Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private.
 
 ``rows_first`` takes files that are plain, or finds the grid that rows show (``layouts``, ``row_grid`` and
-``dropped_rows``) at a size that cameras and photos can have (``grids``), and in ``frames`` the similarity between the
-poses of its views and those of the file. ``score`` measures readings, ``judge`` takes one, and ``explain`` says why
+``dropped_rows``) at a size that cameras and photos can have (``grids``), and with ``match`` which cameras of the file
+its views are, in which of the ``frames``. ``score`` measures readings, ``judge`` takes one, and ``explain`` says why
 none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``upright`` those of
 fused rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras. What few files need loads at first
 use.

@@ -9,16 +9,16 @@ Gaussians: one similarity, for every convention of the poses and every likely or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from functools import partial
 from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras, other_conventions
-from gsmerge.alignment.frames import own_poses, scale_by, solved_frames, usual_frames
+from gsmerge.alignment.frames import scale_by, usual_frames
 from gsmerge.alignment.grids import (
     Grid,
     check_photo_size,
@@ -41,28 +41,20 @@ from gsmerge.alignment.layouts import (
     exact_layouts,
     move_layout,
     plain_layout,
-    some_views,
     subsample,
     view_orders,
 )
-from gsmerge.alignment.resection import projective_error
+from gsmerge.alignment.match import Place, Source, match_views, refine
 from gsmerge.alignment.score import (
-    QUICK_SAMPLES,
-    SAMPLES,
     SHUFFLED_MARGIN,
     SMALLEST_PX,
-    AlignmentInput,
-    Correspondences,
-    Reading,
-    pixel_limit,
-    sample_layout,
     score_layout,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres
+from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import NO_IMAGES, Photos, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.io.photo_files import Photos, PhotoTransform, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
@@ -70,15 +62,8 @@ _PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if
 _ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
 _MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
-_SIMPLER, _SIMPLER_PX = 1.15, 0.02  # a simpler frame wins unless it is worse than this factor and these pixels
-_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
-# pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
-_SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
-_SHOWN_SAMPLES = 200  # Gaussians of a view that it is judged by
 _SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
 _MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
-
-_Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
 
 
 @dataclass(frozen=True)
@@ -109,55 +94,6 @@ class AlignmentResult:
         return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The Gaussians, the cameras, the photos and the known facts about the rows."""
-
-    ply: GaussianFile
-    camera_file: CameraFile
-    photos: Photos
-    order: str
-    scale: float | None
-    depths: Callable[[], np.ndarray | None]
-
-    @property
-    def size(self) -> Size | None:
-        """(width, height) of the photos; None without any."""
-        return photo_size(self.photos)
-
-    @cached_property
-    def images(self) -> np.ndarray:
-        """Photos at their own size, ``[c,h,w,3]`` float32."""
-        return as_floats(self.photos)
-
-    def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
-        """Bring rows, cameras and photos to the size of a grid; without photos if only positions matter."""
-        images = NO_IMAGES
-        if photos:
-            images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
-        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
-
-    def may_be(self, order: str) -> bool:
-        """Return whether rows may be in an order."""
-        return self.order in ("auto", order)
-
-    def orders(self, grid: Grid) -> list[tuple[int, ...]]:
-        """List the orders that the views may be in: the file's, and that of the names.
-
-        Orders that only exchange views of equal poses and photos are all right, and left out.
-        """
-        first, *others = view_orders(self.camera_file.names)
-        cameras, photos = grid.cameras, self.photos
-
-        def same(a: int, b: int) -> bool:
-            pairs = [(cameras.viewmats[a, :3], cameras.viewmats[b, :3]), (cameras.Ks[a], cameras.Ks[b])]
-            pairs += [(photos[a], photos[b])] if len(photos) else []
-            return all(np.array_equal(one, other) for one, other in pairs)
-
-        alike = (all(a == b or same(a, b) for a, b in zip(first, other, strict=True)) for other in others)
-        return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
-
-
 def align(
     ply: GaussianFile,
     camera_file: CameraFile,
@@ -186,7 +122,7 @@ def align(
             or other cameras would make pixels of the rows.
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
-    source = _Source(ply, camera_file, photos, order, scale, depths)
+    source = Source(ply, camera_file, photos, order, scale, depths)
     grids, problem = file_grids(camera_file, source.size), None
     try:
         grids.insert(0, photo_grid(camera_file, source.size))
@@ -201,7 +137,7 @@ def align(
     return _choose_cameras(source, cropped or grids[0], frames)
 
 
-def _read_in_order(source: _Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+def _read_in_order(source: Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
     """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
 
     Or read them by the pixels that they showed when their cameras were estimated.
@@ -222,7 +158,7 @@ def _read_in_order(source: _Source, grids: Sequence[Grid]) -> tuple[Fit, Recover
     return judge(fits, source.inputs, lambda fit: fit) if fits else None
 
 
-def _has_enough(source: _Source) -> bool:
+def _has_enough(source: Source) -> bool:
     """Return whether enough rows are finite to find their pixels."""
     finite = int(source.ply.valid.sum())
     return finite >= _ENOUGH or finite >= _FEW * len(source.ply.gaussians)
@@ -231,17 +167,17 @@ def _has_enough(source: _Source) -> bool:
 # Rows show their grid
 
 
-def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+def _find_pixels(source: Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
     """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
 
     ``named``: the grids of sizes that files name.
     """
     if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
         return None
-    found, refine = None, partial(_refine, source)
+    found = None
     for turn, places in enumerate(_rounds(source, named)):
-        fits = _match_views(source, places)
-        other = judge(fits, source.inputs, refine) if fits else None
+        fits = match_views(source, places)
+        other = judge(fits, source.inputs, partial(refine, source)) if fits else None
         if other is None and turn == 0 and named:
             other = _move_cameras(source, named[0])
         found = min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
@@ -250,7 +186,7 @@ def _find_pixels(source: _Source, named: Sequence[Grid]) -> tuple[Fit, Recovery]
     return found
 
 
-def _rounds(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
+def _rounds(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
     from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
@@ -270,7 +206,7 @@ def _rounds(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
     yield from _lacking_places(source, named)
 
 
-def _lacking_places(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Place]]:
+def _lacking_places(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
     from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
 
@@ -286,7 +222,7 @@ def _lacking_places(source: _Source, named: Sequence[Grid]) -> Iterator[list[_Pl
         yield [(g, place) for g in grids for place in _moved_layouts(source, g, layout, own)]
 
 
-def _layouts(source: _Source, grid: Grid) -> list[Layout]:
+def _layouts(source: Source, grid: Grid) -> list[Layout]:
     """List the layouts in a grid that the number of rows allows, or the depth maps next to the cameras."""
     views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
     layouts = list(exact_layouts(count, views, width, height))
@@ -304,14 +240,14 @@ def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
     return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
 
 
-def _may_lack_pixels(source: _Source, grids: Sequence[Grid]) -> bool:
+def _may_lack_pixels(source: Source, grids: Sequence[Grid]) -> bool:
     """Return whether rows may be pixels of some of the grids, of which many are missing."""
     most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
     enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
     return enough and len(source.ply.gaussians) < most
 
 
-def _follow_cameras(source: _Source, grids: Sequence[Grid]) -> Iterator[list[_Place]]:
+def _follow_cameras(source: Source, grids: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
 
     Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
@@ -332,7 +268,7 @@ def _follow_cameras(source: _Source, grids: Sequence[Grid]) -> Iterator[list[_Pl
                 yield [(grid, layout)]
 
 
-def _moved_layouts(source: _Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
+def _moved_layouts(source: Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
     """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
     cameras = grid.cameras
     margins = cameras.width - layout.width, cameras.height - layout.height
@@ -351,128 +287,10 @@ def _moved_layouts(source: _Source, grid: Grid, layout: Layout, own: Cameras) ->
     return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
 
 
-# Views are some of the file's cameras
+# Cameras that are off
 
 
-def _match_views(source: _Source, places: Sequence[_Place]) -> list[Fit]:
-    """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
-    errors = [_projective_error(source, *place) for place in places]
-    far = _AS_SHOWN * max(min(errors, default=0.0), SMALLEST_PX)
-    shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
-    fits = [fit for place in shown for fit in _fit_views(source, *place)]
-    usual, convention = source.camera_file.viewmats, source.camera_file.convention
-    for poses in other_conventions(usual, convention) if shown and not fits else ():
-        for grid, layout in shown:
-            file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
-            fits += _fit_views(source, grid.with_poses(file), layout)
-    return fits
-
-
-def _projective_error(source: _Source, grid: Grid, layout: Layout) -> float:
-    """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
-
-    Of the first, the middle and the last view, one that a camera shows counts.
-    """
-    limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
-    inputs = source.inputs(grid, photos=False)
-    for view in some_views(layout):
-        pairs = inputs.pairs(subsample(layout.select(view), _SHOWN_SAMPLES))
-        error = projective_error(pairs.points, pairs.pixels)
-        if error <= limit:
-            return error
-    return math.inf
-
-
-def _fit_views(source: _Source, grid: Grid, layout: Layout) -> list[Fit]:
-    """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
-    inputs = source.inputs(grid, photos=False)
-    pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
-    numbers, parts = np.unique(layout.views, return_inverse=True)  # of the views; the view of each part
-    count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
-
-    @cache
-    def solve(Ks: bytes) -> dict[int, np.ndarray]:
-        return own_poses(pairs, np.frombuffer(Ks).reshape(-1, 3, 3))
-
-    def find_own(cameras: Sequence[int]) -> dict[int, np.ndarray]:
-        return solve(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
-
-    def fit(cameras: Sequence[int]) -> Fit:
-        own = {cameras[view]: pose for view, pose in find_own(cameras).items()}
-        views = np.array(cameras)
-        labelled = replace(layout, views=tuple(views[parts].tolist()))
-        return Fit(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
-
-    some = [ids for ids in (*every_nth(len(grid.cameras)), tuple(range(count))) if len(ids) == count]
-    orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
-    fits = [fit(order) for order in orders]
-    nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)
-    if nearest is not None and nearest not in orders and source.scale is None:
-        other = fit(nearest)
-        same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
-        fits += [other] if other.reading.frame.kind in same_axes else []
-    return [each for each in fits if each.reading.ok]
-
-
-def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
-    """Find the cameras whose poses are nearest to those of ``count`` views; None where two have one, or no pose.
-
-    Distances are in units of the cameras' spread.
-    """
-    if len(own) < count:
-        return None
-    viewmats, centres = np.stack([own[view] for view in range(count)]), cameras.centres
-    unit = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
-    turned = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
-    away = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
-    nearest = (turned + away).argmin(1).tolist()
-    return tuple(nearest) if len(set(nearest)) == count else None
-
-
-def read_views(
-    inputs: AlignmentInput, layout: Layout, pairs: Correspondences, own: Mapping[int, np.ndarray]
-) -> Reading:
-    """Score a layout in the simplest frame in which the cameras are about as near as the views' ``own`` poses.
-
-    ``pairs`` are a sample of the rows, and ``own`` poses ``[4,4]`` by view.
-    """
-    cameras, viewmats = inputs.cameras, inputs.cameras.viewmats.astype(np.float64)
-    for view, pose in own.items():
-        viewmats[view] = pose
-    bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
-    if not bound.ok and set(own) >= set(layout.views):
-        return bound  # nothing is nearer than poses of their own
-    frames = chain(
-        ((0, frame) for frame in usual_frames(cameras, inputs.scale)),
-        solved_frames(pairs, cameras, own, inputs.scale),
-    )
-    as_good = max(_AS_GOOD * bound.median_px, bound.median_px + _AS_GOOD_PX)
-    readings: list[Reading] = []
-    for effort, frame in frames:
-        reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
-        if effort == 2 and readings:
-            break
-        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
-            return reading
-        if reading.ok and (effort == 0 or inputs.scale is not None or reading.median_px <= as_good):
-            readings.append(reading)  # otherwise cameras are wrong
-    lowest = min((reading.worst_px for reading in readings), default=math.inf)
-    return next((reading for reading in readings if _is_near(reading.worst_px, lowest)), replace(bound, ok=False))
-
-
-def _is_near(px: float, lowest: float) -> bool:
-    """Return whether a simpler frame is near enough to the nearest one."""
-    return px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX)
-
-
-def _refine(source: _Source, fit: Fit) -> Fit:
-    """Score a fit again, with its frame solved again, on more Gaussians."""
-    inputs = source.inputs(fit.grid, photos=False)
-    pairs = inputs.pairs(sample_layout(fit.reading.layout, SAMPLES))
-    return replace(fit, reading=read_views(inputs, fit.reading.layout, pairs, own_poses(pairs, fit.grid.cameras.Ks)))
-
-
-def _move_cameras(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+def _move_cameras(source: Source, grid: Grid) -> tuple[Fit, Recovery] | None:
     """Fit rows of every pixel by slightly moved cameras; None if that does not fit.
 
     Also None if the colours of the photos disagree: views in the wrong order look the same.
@@ -500,7 +318,7 @@ def _move_cameras(source: _Source, grid: Grid) -> tuple[Fit, Recovery] | None:
 # Rows without pixels, and results
 
 
-def _cropped_grid(source: _Source, grids: Sequence[Grid]) -> Grid | None:
+def _cropped_grid(source: Source, grids: Sequence[Grid]) -> Grid | None:
     """Return the one of the grids whose photos show the colours of rows best; None if none do."""
     from gsmerge.alignment.unaligned import check_cameras
 
@@ -513,7 +331,7 @@ def _cropped_grid(source: _Source, grids: Sequence[Grid]) -> Grid | None:
     return best
 
 
-def _choose_cameras(source: _Source, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+def _choose_cameras(source: Source, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
     """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
     from gsmerge.alignment.explain import explain_count
     from gsmerge.alignment.unaligned import choose_cameras
@@ -534,7 +352,7 @@ def _choose_cameras(source: _Source, grid: Grid, frames: Callable[[], Sequence[S
     )
 
 
-def _place_upright(source: _Source, grid: Grid, rotation: Similarity) -> AlignmentResult:
+def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
@@ -560,7 +378,7 @@ def _place_upright(source: _Source, grid: Grid, rotation: Similarity) -> Alignme
     )
 
 
-def _make_result(source: _Source, fit: Fit, recovery: Recovery) -> AlignmentResult:
+def _make_result(source: Source, fit: Fit, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
     inputs, grid, best = source.inputs(fit.grid), fit.grid, recovery.best
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
