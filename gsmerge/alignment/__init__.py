@@ -1,10 +1,11 @@
 """Find the pixel that each row of a file belongs to, and estimate cameras; the door: modules in here are private.
 
-``search`` yields grids of each size and convention of the poses, ``readings`` reads the rows of one grid: from
-``layouts``, or, with pixels missing, from ``dropped_rows``. ``score`` measures readings, ``judge``
-chooses one, and ``explain`` says why none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows
-without pixels, ``upright`` those of rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras.
-What few files need loads at its first use.
+``rows_first`` takes files that are plain, or finds the grid that rows show (``layouts``, ``row_grid`` and
+``dropped_rows``) at a size that cameras and photos can have (``grids``), and with ``match`` which cameras of the file
+its views are, in which of the ``frames``. ``score`` measures readings, ``judge`` takes one, and ``explain`` says why
+none fits. ``cameras`` reads or moves poses, ``unaligned`` chooses those of rows without pixels, ``upright`` those of
+fused rows in a frame that no file has, ``estimate`` and ``focal`` solve for cameras. What few files need loads at first
+use.
 """
 
 # ruff: noqa: F401  names for other packages
@@ -25,8 +26,8 @@ from gsmerge.alignment.layouts import (
     move_layout,
 )
 from gsmerge.alignment.rotations import choose_rotations, read_rotations, w_seems_last
+from gsmerge.alignment.rows_first import AlignmentResult, align
 from gsmerge.alignment.score import Alignment, check_alignment, check_pairs, sample_pixels
-from gsmerge.alignment.search import AlignmentResult, align
 
 if TYPE_CHECKING:
     from gsmerge.alignment.cameras import move_cameras, other_conventions

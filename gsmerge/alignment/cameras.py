@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.alignment.frames import solve_pose
 from gsmerge.alignment.score import (
     Correspondences,
     check_pairs,
     photo_colors,
     pixel_errors,
     pixel_limit,
-    solve_pose,
 )
 from gsmerge.errors import SceneError
 from gsmerge.geometry import camera_depths, project_points, robust_weights

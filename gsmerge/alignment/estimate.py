@@ -12,8 +12,7 @@ from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.dropped_rows import find_dropped_grid
 from gsmerge.alignment.layouts import ESTIMATED, exact_layouts, subsample
 from gsmerge.alignment.row_grid import find_grid
-from gsmerge.alignment.score import MARGIN, find_correspondences
-from gsmerge.alignment.stretches import base_colors
+from gsmerge.alignment.score import MARGIN, base_colors, find_correspondences
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
 from gsmerge.types import Cameras, Gaussians
 

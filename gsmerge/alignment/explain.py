@@ -7,29 +7,26 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.cameras import describe_reading, other_conventions
-from gsmerge.alignment.judge import accept_reading
+from gsmerge.alignment.frames import ray_directions, scale_by, solve_frame, usual_frames
 from gsmerge.alignment.layouts import MAY_BE_UNALIGNED, exact_layouts, plain_layout, subsample
-from gsmerge.alignment.readings import read_grid
+from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     MAX_CHECKED,
     Alignment,
     AlignmentInput,
-    candidate_similarities,
     check_alignment,
     check_pairs,
     find_correspondences,
-    pixel_errors,
     sample_pixels,
-    solve_pose,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import median
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
+_SOME_CAMERA = 4.0  # times the limit, within which rows are pixels of some camera
 _ORDERS = {  # in which rows may be instead, by the order of their layout
     "view-fastest": "in the order row, column, view (view fastest)",
     "column-major": "in the order view, column, row (column-major)",
@@ -43,25 +40,19 @@ def explain_count(ply: FileInfo, inputs: AlignmentInput, camera_file: CameraFile
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     problem = f"expected one Gaussian per pixel, {expected}, found {ply.count}"
-    if inputs.order not in MAY_BE_UNALIGNED:
-        if count == views * width * height:
-            rows = inputs.gaussians, cameras, inputs.valid
-            alignment = check_alignment(*rows)
-            reason = explain_misalignment(*rows, camera_file.convention)
-            pairs = sample_pixels(*rows)
-            pairs = pairs.select(pairs.views == 0)
-            pose = None if reason else solve_pose(pairs, 0, cameras.Ks[0])
-            # a pose that takes up most of wrong intrinsics, too, shows that the rows are pixels of some camera
-            own_camera = None if pose is None else replace(cameras[:1], viewmats=pose[None])
-            is_grid = own_camera is not None and median(pixel_errors(pairs, own_camera)) < 4 * alignment.limit_px
-            if reason or is_grid:
-                raise misalignment_error(camera_file.path, alignment, reason)
-            problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
-        elif count > views * width * height and count % (width * height) == 0:
-            size = views * width * height
-            first = replace(inputs, gaussians=inputs.gaussians[:size], valid=inputs.valid[:size], order="view-major")
-            if accept_reading(first, read_grid(first)) is not None:  # more views than cameras, the first in order
-                raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
+    size = views * width * height
+    if inputs.order not in MAY_BE_UNALIGNED and count == size:
+        rows = inputs.gaussians, cameras, inputs.valid
+        alignment, pairs = check_alignment(*rows), sample_pixels(*rows)
+        reason = explain_misalignment(*rows, camera_file.convention)
+        first = pairs.select(pairs.views == 0)
+        if reason or projective_error(first.points, first.pixels) < _SOME_CAMERA * alignment.limit_px:
+            raise misalignment_error(camera_file.path, alignment, reason)
+        problem = f"expected one Gaussian per pixel, found {ply.count} Gaussians in no known order"
+    elif inputs.order not in MAY_BE_UNALIGNED and count > size and count % (width * height) == 0:
+        moved = (frame.move(cameras) for frame in usual_frames(cameras, inputs.scale))
+        if any(check_alignment(inputs.gaussians[:size], each, inputs.valid[:size]).ok for each in moved):
+            raise SceneError(ply.path, problem, _count_remedy(ply.count, cameras))  # more views than cameras
     return SceneError(ply.path, problem, _count_remedy(ply.count, cameras))
 
 
@@ -107,7 +98,6 @@ def explain_misalignment(
     """Name another convention of the cameras, or order of the rows, that fits the scene; None if none does."""
     pairs = sample_pixels(gaussians, cameras, valid)
     input_viewmats = cameras.viewmats
-    frames = candidate_similarities(pairs, cameras, effort=1)
     readings = [
         (describe_reading(poses.convention, convention), poses.viewmats)
         for poses in other_conventions(input_viewmats, convention)
@@ -121,10 +111,10 @@ def explain_misalignment(
         mirrored = input_viewmats.copy()
         mirrored[:, axis] *= -1
         readings.append((f"the cameras fit with the {words}", mirrored))
-    scaled = [frame for frame in frames if frame.kind == "scaled"]
-    readings += [
-        (f"the cameras fit with their {frame.description}", frame.move_viewmats(input_viewmats)) for frame in scaled
-    ]
+    frame = solve_frame(pairs.points, ray_directions(pairs, cameras), np.eye(3), shifted=False)
+    if frame is not None:
+        text = f"the cameras fit with their {scale_by(frame.scale).description}"
+        readings.append((text, frame.move_viewmats(input_viewmats)))
     for reason, viewmats in readings:
         if check_pairs(pairs, replace(cameras, viewmats=viewmats)).ok:
             return reason

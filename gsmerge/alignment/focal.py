@@ -9,29 +9,30 @@ to places of their own colours.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.alignment.cameras import fit_lines, other_conventions
 from gsmerge.alignment.estimate import estimate_cameras
-from gsmerge.alignment.layouts import exact_layouts, grids_of_count, subsample, view_orders
+from gsmerge.alignment.grids import shown_sizes
+from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
+from gsmerge.alignment.row_grid import find_layouts
 from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import Photos, Size, as_floats, photo_size, resize_to
+from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size, resize_to
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_SAMPLES = 500  # Gaussians per view that intrinsics are solved from
 _MAX_UNEVEN = 1.5  # of one focal length to the other
-_MAX_GRIDS = 6  # smaller grids that the number of rows allows, which are tried
 _MAX_VIEWS = 12  # whose photos are compared with the Gaussians
 _SIDE = 256  # the longer one of these photos, pixels
 _SHORTEST = 0.25  # focal length that is tried, over the photo's longer side
@@ -102,8 +103,7 @@ def _intrinsics_of_rays(
 ) -> np.ndarray | None:
     """Solve for intrinsics ``[3,3]``, pixels, under which the rows of a grid lie on their rays."""
     count, views, names = len(ply.gaussians), len(camera_file), camera_file.names
-    smaller = islice(grids_of_count(count, views, size), _MAX_GRIDS)
-    for grid in (resize_to(size, size), *smaller):
+    for grid in _possible_sizes(ply, size):
         fits: list[tuple[float, tuple[float, ...], int]] = []
         for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
             if len(set(layout.views)) < views:
@@ -122,6 +122,14 @@ def _intrinsics_of_rays(
             return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)
     free = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, *size)
     return None if free is None else free.Ks[0]
+
+
+def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
+    """Yield the transforms of photos to the sizes that the grid may have: theirs, then those that rows show."""
+    yield resize_to(size, size)
+    shapes = ((layout.width, layout.height) for layout in find_layouts(ply.gaussians, ply.valid))
+    for shape in dict.fromkeys(shapes):
+        yield from shown_sizes(size, shape)
 
 
 def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.alignment.calibration import Calibration, calibrate
-from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts
+from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts, some_views
 from gsmerge.alignment.resection import MIN_POINTS, projective_error
 from gsmerge.alignment.score import find_correspondences, pixel_limit
 from gsmerge.types import Gaussians
@@ -39,16 +39,26 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
 
     ``valid [n]`` bool. Pixels that an exporter trimmed are not part of the grid.
     """
-    size = _find_size(gaussians, valid)
-    if size is None:
-        return None
-    rows = gaussians.means, valid
-    _, width, height = size
-    by_row, by_column = (_layouts(len(valid), *lines) for lines in ((width, height, False), (height, width, True)))
-    fits = _calibrate_layouts(*rows, by_row) or _calibrate_layouts(*rows, by_column)
+    rounds = (_calibrate_layouts(gaussians.means, valid, layouts) for layouts in _shown_layouts(gaussians, valid))
+    fits = next(filter(None, rounds), [])
     nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
     near = [fit for fit in fits if fit[1].worst_px <= max(_SAME * nearest, nearest + _SAME_PX)]
     return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
+
+
+def find_layouts(gaussians: Gaussians, valid: np.ndarray) -> list[Layout]:
+    """Find the layouts of the grid whose pixels are the rows, some of which may be the same under other names."""
+    return next(filter(None, map(list, _shown_layouts(gaussians, valid))), [])
+
+
+def _shown_layouts(gaussians: Gaussians, valid: np.ndarray) -> Iterator[Iterator[Layout]]:
+    """Yield the layouts in which projective cameras show the rows in their pixels, line by line, then by columns."""
+    size = _find_size(gaussians, valid)
+    if size is None:
+        return
+    _, width, height = size
+    for layouts in (_layouts(len(valid), width, height, False), _layouts(len(valid), height, width, True)):
+        yield (layout for layout in layouts if _shows_pixels(gaussians.means, valid, layout))
 
 
 def _calibrate_layouts(
@@ -57,21 +67,20 @@ def _calibrate_layouts(
     """Calibrate the cameras of layouts; leave out layouts whose pixels do not match the rows."""
     fits = []
     for layout in layouts:
-        count = len(layout.views)
-        if all(_shows_part(means, valid, layout, i) for i in {0, count // 2, count - 1}):
-            samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // count, _MAX_SAMPLES // 10))
-            pairs = find_correspondences(means, valid, _thin(layout, samples))
-            calibration = calibrate(pairs, layout.width, layout.height)
-            fits += [] if calibration is None else [(layout, calibration)]
+        samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // len(layout.views), _MAX_SAMPLES // 10))
+        pairs = find_correspondences(means, valid, _thin(layout, samples))
+        calibration = calibrate(pairs, layout.width, layout.height)
+        fits += [] if calibration is None else [(layout, calibration)]
     return fits
 
 
-def _shows_part(means: np.ndarray, valid: np.ndarray, layout: Layout, index: int) -> bool:
-    """Return whether a projective camera shows the rows of a part in their pixels."""
-    rows, pixels = (arrays[index : index + 1] for arrays in (layout.rows, layout.pixels))
-    part = _thin(replace(layout, views=(0,), rows=rows, pixels=pixels), _SAMPLES)
-    pairs = find_correspondences(means, valid, part)
-    return projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height)
+def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
+    """Return whether projective cameras show the rows of the first, the middle and the last view in their pixels."""
+    for view in some_views(layout):
+        pairs = find_correspondences(means, valid, _thin(layout.select(view), _SAMPLES))
+        if not projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height):
+            return False
+    return True
 
 
 def _thin(layout: Layout, samples: int) -> Layout:
@@ -150,7 +159,8 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
         return 1, []
     starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
     starts = starts[valid[starts]]
-    lengths = np.array([_median(np.abs(means[starts + lag] - means[starts]).sum(1)) for lag in lags])
+    steps = np.abs(means[starts + lags[:, None]] - means[starts]).sum(2)
+    lengths = np.median(steps, 1) if np.isfinite(steps).all() else np.array(list(map(_median, steps)))
     fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
     segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1
     places = np.linspace(0, count - fastest - segment, min(_SEGMENTS, -(-count // segment))).astype(int)

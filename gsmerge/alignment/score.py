@@ -1,23 +1,15 @@
-"""Score how near Gaussians project to their pixels, from cameras that may stand in another frame.
-
-A Gaussian lies on the ray of its pixel: ``(x - c) x d = 0`` with the camera's centre c and the ray's direction d.
-The Gaussians stay in place; the cameras are moved.
-"""
+"""Score how near Gaussians project to their pixels, and how near their colours are to the photos'."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, subsample
-from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
-from gsmerge.geometry import IDENTITY, Similarity, camera_centres, median, robust_weights, sh0_to_rgb
+from gsmerge.geometry import Similarity, median, sh0_to_rgb
 from gsmerge.kernels import reproject
-from gsmerge.kernels.elementary import arccos, log
-from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
 from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians
 
@@ -27,22 +19,6 @@ SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
-_ROUNDS = 4  # of reweighted least squares
-_MAX_POINTS = 2000  # that a camera's pose is solved from
-_SAME_TURN = 0.01  # of rotation matrices that differ by errors alone
-_SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
-_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
-
-
-_HALF = np.sqrt(0.5)
-# As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
-UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
-
-
-def scale_by(scale: float, note: str = "") -> Similarity:
-    """Return the similarity that only changes the unit."""
-    text = f"positions scaled by {scale:.4g}{note}"
-    return Similarity(np.eye(3), scale, np.zeros(3), text, "scaled")
 
 
 @dataclass(frozen=True)
@@ -73,143 +49,6 @@ def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
     return errors
 
 
-def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
-    """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
-    ones = np.ones((len(pairs.pixels), 1))
-    inverse = invert(cameras.Ks)[pairs.views]
-    local = _apply(inverse, np.concatenate([pairs.pixels, ones], 1))
-    rays = _apply(cameras.viewmats[pairs.views, :3, :3].swapaxes(1, 2), local)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True), camera_centres(cameras.viewmats)[pairs.views]
-
-
-def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Apply matrices ``[t,3,3]`` to vectors ``[t,3]``, one to one."""
-    return matmul(matrices, vectors[:, :, None])[..., 0]
-
-
-def candidate_similarities(
-    pairs: Correspondences | None, cameras: Cameras, *, scale: float | None = None, effort: int = 2
-) -> Iterator[Similarity]:
-    """Yield similarities that may map the frame of the cameras to that of the Gaussians, the plausible ones first.
-
-    They are: the same frame; a scale; the frame of the first or the middle camera, alone, scaled, or scaled and
-    shifted; any similarity, from poses solved from the pixels. ``scale``: size of the Gaussians' world in units of the
-    cameras', if known. ``effort`` 0 solves for nothing (``pairs`` may be None), 1 for scale and shift, 2 also for the
-    rotation.
-    """
-    yield IDENTITY if scale is None else scale_by(scale, ", as given")
-    rays = None if pairs is None or effort == 0 else ray_directions(pairs, cameras)
-    first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
-    rotations = (
-        (np.eye(3), "", ""),
-        (first, "rotated into the first camera", "first"),
-        (middle, "rotated into the middle camera", "middle"),
-        (matmul(UPRIGHT, first), "rotated upright from the first camera", "upright"),
-    )
-    for rotation, name, kind in rotations:
-        if name:
-            yield Similarity(rotation, scale or 1.0, np.zeros(3), name, kind)
-        if pairs is None or rays is None:
-            continue
-        for shifted in (False, True) if scale is None else (True,):
-            frame = solve_frame(pairs.points, rays, rotation, shifted=shifted)
-            if frame is not None:
-                text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
-                text = f"{name}, {text}" if name else text
-                yield replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
-    if pairs is None or rays is None or effort < 2:
-        return
-    free = _mean_rotation(_solve_poses(pairs, cameras.Ks), cameras.viewmats)
-    frame = None if free is None else solve_frame(pairs.points, rays, free, shifted=True)
-    if frame is not None:
-        angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
-        if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
-            return  # no exporter does so: the cameras are inexact, and a rotation hides it
-        turned = (matmul(UPRIGHT, viewmat[:3, :3]) for viewmat in cameras.viewmats)
-        upright = any(np.abs(rotation - free).max() < _SAME_TURN for rotation in turned)
-        name = "rotated upright" if upright else f"rotated by {angle:.1f} degrees"
-        text = f"{name}, positions scaled by {frame.scale:.4g} and shifted"
-        yield replace(frame, description=text, kind="upright" if upright else "other")
-
-
-def solve_frame(
-    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
-) -> Similarity | None:
-    """Solve robustly for scale and shift that bring rotated points nearest to their rays.
-
-    The scale is None if it is not positive.
-    """
-    rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    columns = [_apply(across, centres)[:, :, None]] + ([across] if shifted else [])
-    A, b = np.concatenate(columns, 2), _apply(across, points)
-    weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
-    for _ in range(_ROUNDS):
-        heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
-        left, right = matmul(heavy.T, A.reshape(-1, A.shape[2])), matmul(heavy.T, b.reshape(-1))
-        unit = np.sqrt(np.maximum(np.diag(left), 1e-300))
-        solution = solve_symmetric(left / np.outer(unit, unit), right / unit) / unit
-        if not np.isfinite(solution).all() or solution[0] <= 0:
-            return None
-        shift = solution[1:] if shifted else np.zeros(3)
-        away = points - solution[0] * centres - shift
-        depth = np.abs((away * rays).sum(1)) + 1e-12
-        angle = np.linalg.norm(_apply(across, away), axis=1) / depth
-        weights = robust_weights(angle, 3, 1e-12, depth)
-    return Similarity(rotation, float(solution[0]), shift)
-
-
-def _solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose of each view from only its own pixels."""
-    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
-    return {view: pose for view, pose in poses if pose is not None}
-
-
-def _mean_rotation(poses: dict[int, np.ndarray], viewmats: np.ndarray) -> np.ndarray | None:
-    """Average the rotations between the two frames; None where the views disagree."""
-    if not poses:
-        return None
-    mean = np.mean([matmul(pose[:3, :3].T, viewmats[view, :3, :3]) for view, pose in poses.items()], 0)
-    squares, _ = eigh(matmul(mean.T, mean))
-    if squares[0] < 0.9**2:  # rotations that agree have a mean that is nearly one
-        return None
-    return closest_rotation(mean)
-
-
-def fits_all_cameras(frame: Similarity, pairs: Correspondences, cameras: Cameras) -> bool:
-    """Return whether one similarity fits about as well as a separate pose per camera; otherwise cameras are wrong."""
-    viewmats = cameras.viewmats.copy()
-    for view, pose in _solve_poses(pairs, cameras.Ks).items():
-        viewmats[view] = pose
-    best = median(pixel_errors(pairs, replace(cameras, viewmats=viewmats)))
-    return median(pixel_errors(pairs, frame.move(cameras))) <= max(_AS_GOOD * best, best + _AS_GOOD_PX)
-
-
-def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
-    """Solve for one view's world-to-camera matrix ``[4,4]`` in the frame of the Gaussians from only its own pixels."""
-    rows = np.flatnonzero(pairs.views == view)
-    rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
-    if len(rows) < 6:
-        return None
-    points, pixels = pairs.points[rows], pairs.pixels[rows]
-    middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
-    near, K = (points - middle) / unit, K.astype(np.float64)
-    for _ in range(2):
-        start = start_pose(near, pixels, K)
-        if start is None:
-            return None
-        pose = start
-        error = projection_errors(near, pixels, K, pose)
-        good = error <= max(1.0, 3 * float(np.median(error)))
-        near, pixels = near[good], pixels[good]
-    try:
-        _, (pose,) = refine_poses([near], [pixels], K, pose[None])
-    except np.linalg.LinAlgError:  # points in one place
-        return None
-    pose[:3, 3] = unit * pose[:3, 3] - matmul(pose[:3, :3], middle)
-    return pose if np.isfinite(pose).all() else None
-
-
 @dataclass(frozen=True)
 class AlignmentInput:
     """Input of the search for pixels: rows, cameras, photos and hints."""
@@ -218,13 +57,8 @@ class AlignmentInput:
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
-    labellings: Sequence[tuple[int, ...]]  # orders that the views may be in: the file's, that of the names
-    # reads ``[c,h,w]`` depth maps next to the cameras; None where there are none
-    depths: Callable[[], np.ndarray | None]
     order: str = "auto"  # the order of the rows where it is given, otherwise "auto"
     scale: float | None = None  # size of the Gaussians' world in units of the cameras', where it is given
-    # finds the grid of rows that lack pixels, and cameras for it; None where there is none
-    dropped: Callable[[], tuple[Layout, Cameras] | None] = lambda: None
 
     def pairs(self, layout: Layout) -> Correspondences:
         """Return the valid rows of a layout with their pixels and views."""
@@ -251,7 +85,7 @@ class Reading:
     median_px: float  # median distance of the projected Gaussians from their pixels; inf where most are behind
     worst_px: float  # the same of the worst view
     ok: bool  # whether it is near enough to be true
-    quick: bool = False  # whether it was scored, and its frame solved, on few Gaussians
+    effort: int = 0  # 0: the frame is a usual one; 1: its scale or shift was solved for; 2: its rotation as well
 
     @property
     def description(self) -> str:
@@ -309,6 +143,12 @@ def _color_distance(inputs: AlignmentInput, pairs: Correspondences) -> float:
     x, y = pairs.pixels.astype(np.int64).T
     colors = photo_colors(inputs.images, pairs.views, y, x)
     return float(np.abs(base.clip(0, 1) - colors).mean(1).mean())
+
+
+def base_colors(gaussians: Gaussians) -> np.ndarray:
+    """Return the base colours ``[n,3]`` of Gaussians, 0 to 1; 0 for NaN."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(sh0_to_rgb(gaussians.sh0[:, 0])).clip(0, 1)
 
 
 def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
-from gsmerge.alignment.score import MARGIN, AlignmentInput, candidate_similarities, photo_colors
+from gsmerge.alignment.frames import usual_frames
+from gsmerge.alignment.score import MARGIN, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
-from gsmerge.geometry import IDENTITY, Similarity, lower_median, mean_pose_frame, project_points, sh0_to_rgb
+from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
@@ -195,8 +196,7 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
 
 def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
     """Yield the frames that exporters use for rows, at the scale of the cameras."""
-    yield from list(candidate_similarities(None, inputs.cameras, effort=0))[1:]
-    yield mean_pose_frame(inputs.cameras.viewmats)
+    yield from usual_frames(inputs.cameras)[1:]
     first = inputs.cameras.viewmats[0]
     yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
 

@@ -1,9 +1,10 @@
 """Solve for the frame of rows that the pixelSplat family centres, rescales and turns upright.
 
 Its exporter subtracts the median, divides by the 95 % quantile of the widest axis and turns the world from the first
-camera, and saves neither. So such a file shows itself, and the rotation is known; scale and shift follow from some
-rows' pixels. Stretches of rows without a gap show the colours of a stretch of a photo; those that agree on a frame give
-it, the others are wrong.
+camera, and saves neither. Rows cannot show their cameras where views were fused (FreeSplat), where layers of a pixel
+have gaps, or where so many far pixels were cut that no lines repeat; but such a file shows itself, and the rotation is
+known; scale and shift follow from some rows' pixels. Stretches of rows without a gap show the colours of a stretch of a
+photo; those that agree on a frame give it, the others are wrong.
 """
 
 from __future__ import annotations
@@ -13,27 +14,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.alignment.frames import UPRIGHT, ray_directions, solve_frame
 from gsmerge.alignment.layouts import TRIMS, trim_box
-from gsmerge.alignment.score import (
-    UPRIGHT,
-    AlignmentInput,
-    Correspondences,
-    pixel_errors,
-    pixel_limit,
-    ray_directions,
-    solve_frame,
-)
-from gsmerge.alignment.stretches import UNIQUE, byte_colors, place_stretch, shown_colors
+from gsmerge.alignment.score import AlignmentInput, Correspondences, base_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, Gaussians
 
 _QUANTILE = 0.95  # of the distances along the widest axis, which is 1 in such a file
 _SMALL = 1e-3  # how exactly
 _ROUGH_SAMPLES, _ROUGH = 2000, 1.0  # rows that are looked at first, and how far off before they are turned back
 _PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
+_OUTSIDE = 999  # a colour that no pixel has
+_UNIQUE = 1.1  # times as far as the nearest place is the next one, at least
+_STEP = 2  # every how many pixels of a stretch are compared
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch without gaps, and stretches that are searched
 _PER_STRETCH = 12  # rows of each that the frame is solved from
 _SHARE = 3  # part of the rows that fused views begin and end with
@@ -111,16 +107,16 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
 def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) -> Correspondences:
     """Find stretches in the photos; return rows of those that are alike and in one place, a part for each."""
-    colors, images = byte_colors(inputs.gaussians), inputs.images
-    shown = [shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
+    colors, images = _byte_colors(inputs.gaussians), inputs.images
+    shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
     rows = np.array([t.start + t.step * np.arange(_LENGTH) for t in tries])
     bounds = [(max(0, t.low), min(len(pixels), t.high)) for t in tries]
     places = np.array([
-        place_stretch(shown[t.view], colors[:, stretch], low, high) if low < high else (0, _FAR, 0)
+        _place_stretch(shown[t.view], colors[:, stretch], low, high) if low < high else (0, _FAR, 0)
         for t, stretch, (low, high) in zip(tries, rows, bounds, strict=True)
     ])  # fmt: skip
     near = places[:, 1] <= _MAX_COST * max(1.0, float(np.quantile(places[:, 1], 0.25)))
-    chosen = np.flatnonzero(near & (places[:, 2] > UNIQUE * places[:, 1]))
+    chosen = np.flatnonzero(near & (places[:, 2] > _UNIQUE * places[:, 1]))
     within = np.linspace(0, _LENGTH - 1, _PER_STRETCH).astype(int)
     ids = rows[chosen][:, within].reshape(-1)
     y, x = np.divmod(pixels[(places[chosen, :1] + within).clip(max=len(pixels) - 1).reshape(-1)], inputs.cameras.width)
@@ -130,6 +126,34 @@ def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) ->
         inputs.gaussians.means[ids].astype(np.float64), np.stack([x, y], 1) + 0.5, views, parts, ids
     )
     return pairs.select(inputs.valid[ids])
+
+
+def _byte_colors(gaussians: Gaussians) -> np.ndarray:
+    """Return the base colours ``[3,n]`` of Gaussians as int16 from 0 to 255."""
+    return np.ascontiguousarray(np.rint(255 * base_colors(gaussians)).astype(np.int16).T)
+
+
+def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:
+    """Return the colours ``[3,p+length]`` int16 at ``pixels [p]`` of a uint8 ``photo [h,w,3]``, padded at the end."""
+    shown = photo.reshape(-1, 3)[pixels].T.astype(np.int16)
+    return np.concatenate([shown, np.full((3, length), _OUTSIDE, np.int16)], 1)
+
+
+def _place_stretch(shown: np.ndarray, wanted: np.ndarray, low: int, high: int) -> tuple[int, int, int]:
+    """Find the place of the colours ``wanted [3,l]`` in ``shown [3,m]`` by the sum of absolute differences.
+
+    Returns the best place, from ``low`` on and below ``high``, its sum, and the sum of the next best place.
+    """
+    sums, difference = np.zeros(high - low, np.int32), np.empty(high - low, np.int16)
+    for offset in range(0, wanted.shape[1], _STEP):
+        for channel in range(3):
+            values = shown[channel, low + offset : high + offset]
+            np.subtract(values, wanted[channel, offset], out=difference)
+            np.abs(difference, out=difference)
+            sums += difference
+    best = int(sums.argmin())
+    other_sums = np.concatenate([sums[: max(0, best - 2)], sums[best + 3 :]])
+    return low + best, int(sums[best]), int(other_sums.min(initial=np.iinfo(np.int32).max))
 
 
 def _agreed_frame(inputs: AlignmentInput, pairs: Correspondences, rotation: Similarity) -> Similarity | None:

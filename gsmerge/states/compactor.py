@@ -81,7 +81,7 @@ class Compactor:
         return compactor
 
     def __repr__(self) -> str:
-        return f"Compactor({len(self):,} Gaussians of {len(self.batches)} batches)"
+        return f"Compactor({len(self):,} Gaussians of {len(self.batches)} batch(es))"
 
     def __len__(self) -> int:
         """Return the number of Gaussians, or Feature Gaussians, so far."""

@@ -39,6 +39,9 @@ class State:
     scene: Scene | None = None
     features: FeatureState | None = None  # where there is no scene
 
+    def __repr__(self) -> str:
+        return f"State({len(self):,} Gaussians of {len(self.about['batches'])} batch(es))"
+
     def __len__(self) -> int:
         return len(self.scene.gaussians) if self.scene is not None else len(self.features or ())
 

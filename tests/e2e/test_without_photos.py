@@ -88,7 +88,8 @@ def test_states(bare: Path, tmp_path: Path, run: Run) -> None:
     state, out = tmp_path / "state.gsm", tmp_path / "small.ply"
     run("extend", state, bare, "--set", "superpixels=200", code=0)
     document = json.loads(run("compact", state, "-o", out, "--json", code=0).out)
-    assert document["fit"]["method"] == "full"
+    assert document["choices"]["fit"]["method"] == "full"
+    assert noted(document["notes"], ROW_COLORS)
 
 
 def test_a_batch_says_it_of_every_scene(

@@ -52,8 +52,8 @@ def test_objects_are_one_short_line(scene: gsmerge.Scene, result: gsmerge.Compac
         (result.report, (f"{scene.num_gaussians:,} -> 100", "dB")),
         (file, (f"{len(scene.gaussians):,}", str(tiny_scene / "scene.ply"))),
         (cameras, (str(views), cameras.path, cameras.source)),
-        (compactor, ("Feature Gaussians", f"{views} views")),
-        (compactor.state, ("Feature Gaussians", f"{views} views")),
+        (compactor, ("Gaussians", "1 batch")),
+        (compactor.state, ("Gaussians", "1 batch")),
         (gsmerge.evaluate(scene, {"small": result.gaussians}, options=options), ("input", "small", "dB", "photos")),
     ]  # fmt: skip
     for value, words in shown:

@@ -50,8 +50,8 @@ class End:
 
 
 @dataclass(frozen=True, eq=False)
-class Matches:
-    """Matches between the keypoints of two scenes, row by row."""
+class KeypointMatches:
+    """KeypointMatches between the keypoints of two scenes, row by row."""
 
     scenes: tuple[int, int]
     ends: tuple[End, End]
@@ -60,7 +60,7 @@ class Matches:
     def __len__(self) -> int:
         return len(self.ends[0].points)
 
-    def select(self, mask: np.ndarray) -> Matches:
+    def select(self, mask: np.ndarray) -> KeypointMatches:
         """Select matches by a mask."""
         first, second = self.ends
         return replace(self, ends=(first.select(mask), second.select(mask)))
@@ -169,14 +169,14 @@ def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.n
 
 def match_photos(
     scenes: tuple[int, int], photos: Sequence[Photo], other_photos: Sequence[Photo], size: tuple[int, int]
-) -> Matches:
+) -> KeypointMatches:
     """Match the keypoints of all photos of two scenes; ``size``: width and height of their grids."""
     pairs = [(a, b) for a in photos for b in other_photos]
     rows = [_match(a.descriptors, b.descriptors) for a, b in pairs]
     first = _make_end([a for a, _ in pairs], [ids for ids, _ in rows])
     second = _make_end([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
-    return Matches(scenes, (first, second), PIXEL_SPREAD * diagonal)
+    return KeypointMatches(scenes, (first, second), PIXEL_SPREAD * diagonal)
 
 
 def _make_end(photos: Sequence[Photo], rows: Sequence[np.ndarray]) -> End:

@@ -15,7 +15,7 @@ from model_rows import take_views
 from sweeps import sweep
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_images, write_npz
 
-from gsmerge.alignment.layouts import grids_of_count, patch_grids
+from gsmerge.alignment.grids import patch_grids, shown_sizes
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
 from gsmerge.io.photo_files import PhotoTransform, resize_and_crop, resize_to
@@ -227,15 +227,15 @@ def test_mappings_move_a_point_and_its_photo_alike() -> None:
         assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
 
 
-def test_sizes_that_the_number_of_rows_allows() -> None:
-    actual = [(m.width, m.height) for m in grids_of_count(2 * 64 * 48, 2, (640, 480))]
+def test_sizes_of_photos_whose_pixels_may_have_a_shape() -> None:
+    actual = [(m.width, m.height) for m in shown_sizes((640, 480), (64, 48))]
     assert actual[0] == (64, 48)
-    assert (64, 48) in actual
-    assert list(grids_of_count(2 * 97 * 89, 2, (640, 480))) == []
-    assert (256, 256) in [(m.width, m.height) for m in grids_of_count(3 * 256 * 256, 3, (640, 360))]
+    assert (64 + 16, 48 + 16) in actual
+    assert shown_sizes((640, 480), (97, 89)) == []
+    assert (256, 256) in [(m.width, m.height) for m in shown_sizes((640, 360), (256, 256))]
     for height in (160, 161):  # half of 320, and of 322, the next multiple of 14
-        bordered = 7 * (224 - 2 * 7) * (height - 2 * 5)
-        assert (224, height) in [(m.width, m.height) for m in grids_of_count(bordered, 7, (448, 320))]
+        bordered = 224 - 2 * 7, height - 2 * 5
+        assert (224, height) in [(m.width, m.height) for m in shown_sizes((448, 320), bordered)]
 
 
 def test_sizes_of_patches() -> None:

@@ -13,7 +13,7 @@ from messages import noted, refuses
 from sweeps import sweep
 from tiny_scene import make_tiny, write_images
 
-from gsmerge.alignment import readings, unaligned
+from gsmerge.alignment import match, unaligned
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
 from gsmerge.kernels import elementary
@@ -47,18 +47,12 @@ def padded(rows: np.ndarray) -> np.ndarray:
 
 def test_volsplat_with_the_cameras_of_its_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The number of its rows allows many grids; none of them is worth a search for a frame, as no camera shows them."""
-    efforts = []
-    usual = readings.candidate_similarities
-
-    def count(*args: object, effort: int = 2, **options: object) -> object:
-        efforts.append(effort)
-        return usual(*args, effort=effort, **options)
-
-    monkeypatch.setattr(readings, "candidate_similarities", count)
+    tried = []
+    monkeypatch.setattr(match, "read_views", lambda *args: tried.append(args))
     rows = turned(padded(voxels()), SMOOTH.w2c[0, :3, :3])
     loaded = load_scene(save_export(tmp_path, SMOOTH, rows))
     assert not loaded.scene.aligned
-    assert set(efforts) == {0}
+    assert not tried
     assert "the cameras are rotated into the first camera, as the photos' colours show" in loaded.notes
     assert any("Gaussians that only fill the file up are left out" in note for note in loaded.notes)
     viewmats = loaded.scene.cameras.viewmats

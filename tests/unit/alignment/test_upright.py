@@ -12,7 +12,7 @@ from exports import Smooth, export_rows, save_export, smooth_scene, turned
 from messages import noted, refuses
 from sweeps import sweep
 
-from gsmerge.alignment.score import UPRIGHT
+from gsmerge.alignment.frames import UPRIGHT
 from gsmerge.errors import SceneError
 from gsmerge.kernels import elementary
 from gsmerge.scene.read import Loaded, load_scene

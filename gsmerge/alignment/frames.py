@@ -1,0 +1,176 @@
+"""Solve for the frame of the Gaussians: poses of their own views, and the similarity that moves cameras there.
+
+Rows that are pixels show the pose of each view by themselves. A Gaussian lies on the ray of its pixel:
+``(x - c) x d = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place; the cameras are
+moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.alignment.resection import projection_errors, refine_poses, start_pose
+from gsmerge.alignment.score import Correspondences
+from gsmerge.geometry import IDENTITY, Similarity, camera_centres, mean_pose_frame, robust_weights
+from gsmerge.kernels.elementary import arccos, log
+from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
+from gsmerge.types import Cameras
+
+_ROUNDS = 4  # of reweighted least squares
+_MAX_POINTS = 2000  # that a camera's pose is solved from
+_SAME_TURN = 0.01  # of rotation matrices that differ by errors alone
+_NEAR_TURN = 0.2  # by which the rotation that own poses show may be off a usual one
+_MIN_AGREEMENT = 0.9  # smallest singular value of a mean rotation: rotations that agree have a mean that is nearly one
+_SMALL_ROTATION, _SMALL_SCALE = 10.0, 0.05  # degrees, and natural logarithm
+_HALF = np.sqrt(0.5)
+# As the pixelSplat family turns its world: axes swapped, then an eighth of a turn about the last one.
+UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
+
+
+def scale_by(scale: float, note: str = "") -> Similarity:
+    """Return the similarity that only changes the unit."""
+    text = f"positions scaled by {scale:.4g}{note}"
+    return Similarity(np.eye(3), scale, np.zeros(3), text, "scaled")
+
+
+def _usual_rotations(cameras: Cameras) -> tuple[tuple[np.ndarray, str, str], ...]:
+    """Return the rotations of exporters, their description and their kind."""
+    first, middle = cameras.viewmats[0, :3, :3], cameras.viewmats[len(cameras) // 2, :3, :3]
+    return (
+        (np.eye(3), "", ""),
+        (first, "rotated into the first camera", "first"),
+        (middle, "rotated into the middle camera", "middle"),
+        (matmul(UPRIGHT, first), "rotated upright from the first camera", "upright"),
+    )
+
+
+def usual_frames(cameras: Cameras, scale: float | None = None) -> list[Similarity]:
+    """List the frames of exporters that need no solving, the frame of the cameras first.
+
+    ``scale``: size of the Gaussians' world in units of the cameras', if known.
+    """
+    frames = [IDENTITY if scale is None else scale_by(scale, ", as given")]
+    for rotation, name, kind in _usual_rotations(cameras)[1:]:
+        frames.append(Similarity(rotation, scale or 1.0, np.zeros(3), name, kind))
+    return frames if scale is not None else [*frames, mean_pose_frame(cameras.viewmats)]
+
+
+def solved_frames(
+    pairs: Correspondences, cameras: Cameras, own: Mapping[int, np.ndarray], scale: float | None = None
+) -> Iterator[tuple[int, Similarity]]:
+    """Yield the frames that own poses of views and ``pairs`` show, the simple ones first; none where views disagree.
+
+    They are a usual rotation with a scale, or with scale and shift; then any rotation. ``own``: poses ``[4,4]`` of
+    views in the frame of the Gaussians. Each frame comes with the effort, see :class:`Reading`.
+    """
+    free = mean_rotation(own, cameras.viewmats)
+    if free is None:
+        return
+    rays = ray_directions(pairs, cameras)
+    for rotation, name, kind in _usual_rotations(cameras):
+        if np.abs(rotation - free).max() > _NEAR_TURN:
+            continue
+        for shifted in (False, True) if scale is None else (True,):
+            frame = solve_frame(pairs.points, rays, rotation, shifted=shifted)
+            if frame is not None:
+                text = f"positions scaled by {frame.scale:.4g}" + (" and shifted" if shifted else "")
+                text = f"{name}, {text}" if name else text
+                yield 1, replace(frame, description=text, kind=kind or ("shifted" if shifted else "scaled"))
+    frame = solve_frame(pairs.points, rays, free, shifted=True)
+    if frame is None and len(own) == 1:  # which has no scale
+        ((view, pose),) = own.items()
+        shift = camera_centres(pose[None])[0] - matmul(free, camera_centres(cameras.viewmats)[view])
+        frame = Similarity(free, 1.0, shift)
+    if frame is not None:
+        angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
+        if angle < _SMALL_ROTATION and abs(log(frame.scale)) < _SMALL_SCALE:
+            return  # no exporter does so: the cameras are inexact, and a rotation hides it
+        turned = (matmul(UPRIGHT, viewmat[:3, :3]) for viewmat in cameras.viewmats)
+        upright = any(np.abs(rotation - free).max() < _SAME_TURN for rotation in turned)
+        name = "rotated upright" if upright else f"rotated by {angle:.1f} degrees"
+        text = f"{name}, positions scaled by {frame.scale:.4g} and shifted"
+        yield 2, replace(frame, description=text, kind="upright" if upright else "other")
+
+
+def mean_rotation(own: Mapping[int, np.ndarray], viewmats: np.ndarray) -> np.ndarray | None:
+    """Average the rotations between the frames of two poses of each view; None where the views disagree."""
+    if not own:
+        return None
+    mean = np.mean([matmul(pose[:3, :3].T, viewmats[view, :3, :3]) for view, pose in own.items()], 0)
+    squares, _ = eigh(matmul(mean.T, mean))
+    return closest_rotation(mean) if squares[0] >= _MIN_AGREEMENT**2 else None
+
+
+def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
+    ones = np.ones((len(pairs.pixels), 1))
+    inverse = invert(cameras.Ks)[pairs.views]
+    local = _apply(inverse, np.concatenate([pairs.pixels, ones], 1))
+    rays = _apply(cameras.viewmats[pairs.views, :3, :3].swapaxes(1, 2), local)
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True), camera_centres(cameras.viewmats)[pairs.views]
+
+
+def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Apply matrices ``[t,3,3]`` to vectors ``[t,3]``, one to one."""
+    return matmul(matrices, vectors[:, :, None])[..., 0]
+
+
+def solve_frame(
+    points: np.ndarray, rays_and_centres: tuple[np.ndarray, np.ndarray], rotation: np.ndarray, *, shifted: bool
+) -> Similarity | None:
+    """Solve robustly for scale and shift that bring rotated points nearest to their rays.
+
+    The scale is None if it is not positive.
+    """
+    rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    columns = [_apply(across, centres)[:, :, None]] + ([across] if shifted else [])
+    A, b = np.concatenate(columns, 2), _apply(across, points)
+    weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
+    for _ in range(_ROUNDS):
+        heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
+        left, right = matmul(heavy.T, A.reshape(-1, A.shape[2])), matmul(heavy.T, b.reshape(-1))
+        unit = np.sqrt(np.maximum(np.diag(left), 1e-300))
+        solution = solve_symmetric(left / np.outer(unit, unit), right / unit) / unit
+        if not np.isfinite(solution).all() or solution[0] <= 0:
+            return None
+        shift = solution[1:] if shifted else np.zeros(3)
+        away = points - solution[0] * centres - shift
+        depth = np.abs((away * rays).sum(1)) + 1e-12
+        angle = np.linalg.norm(_apply(across, away), axis=1) / depth
+        weights = robust_weights(angle, 3, 1e-12, depth)
+    return Similarity(rotation, float(solution[0]), shift)
+
+
+def own_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
+    """Solve for the pose ``[4,4]`` of each view from only its own pixels; leave out views where that fails."""
+    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in np.unique(pairs.views))
+    return {view: pose for view, pose in poses if pose is not None}
+
+
+def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
+    """Solve for one view's world-to-camera matrix ``[4,4]`` in the frame of the Gaussians from only its own pixels."""
+    rows = np.flatnonzero(pairs.views == view)
+    rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
+    if len(rows) < 6:
+        return None
+    points, pixels = pairs.points[rows], pairs.pixels[rows]
+    middle, unit = np.median(points, 0), float(np.median(np.abs(points - np.median(points, 0)))) or 1.0
+    near, K = (points - middle) / unit, K.astype(np.float64)
+    for _ in range(2):
+        start = start_pose(near, pixels, K)
+        if start is None:
+            return None
+        pose = start
+        error = projection_errors(near, pixels, K, pose)
+        good = error <= max(1.0, 3 * float(np.median(error)))
+        near, pixels = near[good], pixels[good]
+    try:
+        _, (pose,) = refine_poses([near], [pixels], K, pose[None])
+    except np.linalg.LinAlgError:  # points in one place
+        return None
+    pose[:3, 3] = unit * pose[:3, 3] - matmul(pose[:3, :3], middle)
+    return pose if np.isfinite(pose).all() else None

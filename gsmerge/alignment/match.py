@@ -1,0 +1,213 @@
+"""Match the views of rows with the cameras of a file: which of them each is, and how their world lies.
+
+Rows in the right place show their pixels to some camera, and the pose of each view. One similarity moves the file's
+cameras to these poses, in the right convention and order alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import chain
+
+import numpy as np
+
+from gsmerge.alignment.cameras import other_conventions
+from gsmerge.alignment.frames import own_poses, solved_frames, usual_frames
+from gsmerge.alignment.grids import Grid
+from gsmerge.alignment.judge import Fit
+from gsmerge.alignment.layouts import Layout, every_nth, some_views, subsample, view_orders
+from gsmerge.alignment.resection import projective_error
+from gsmerge.alignment.score import (
+    QUICK_SAMPLES,
+    SAMPLES,
+    SMALLEST_PX,
+    AlignmentInput,
+    Correspondences,
+    Reading,
+    pixel_limit,
+    sample_layout,
+    score_layout,
+)
+from gsmerge.geometry import IDENTITY, camera_centres
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.photo_files import NO_IMAGES, Photos, Size, as_floats, photo_size
+from gsmerge.types import Cameras
+
+_SIMPLER, _SIMPLER_PX = 1.15, 0.02  # a simpler frame wins unless it is worse than this factor and these pixels
+_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
+# pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
+_SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
+_SHOWN_SAMPLES = 200  # Gaussians of a view that it is judged by
+
+Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
+
+
+@dataclass(frozen=True)
+class Source:
+    """The Gaussians, the cameras, the photos and the known facts about the rows."""
+
+    ply: GaussianFile
+    camera_file: CameraFile
+    photos: Photos
+    order: str
+    scale: float | None
+    depths: Callable[[], np.ndarray | None]
+
+    @property
+    def size(self) -> Size | None:
+        """(width, height) of the photos; None without any."""
+        return photo_size(self.photos)
+
+    @cached_property
+    def images(self) -> np.ndarray:
+        """Photos at their own size, ``[c,h,w,3]`` float32."""
+        return as_floats(self.photos)
+
+    def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
+        """Bring rows, cameras and photos to the size of a grid; without photos if only positions matter."""
+        images = NO_IMAGES
+        if photos:
+            images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
+        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
+
+    def may_be(self, order: str) -> bool:
+        """Return whether rows may be in an order."""
+        return self.order in ("auto", order)
+
+    def orders(self, grid: Grid) -> list[tuple[int, ...]]:
+        """List the orders that the views may be in: the file's, and that of the names.
+
+        Orders that only exchange views of equal poses and photos are all right, and left out.
+        """
+        first, *others = view_orders(self.camera_file.names)
+        cameras, photos = grid.cameras, self.photos
+
+        def same(a: int, b: int) -> bool:
+            pairs = [(cameras.viewmats[a, :3], cameras.viewmats[b, :3]), (cameras.Ks[a], cameras.Ks[b])]
+            pairs += [(photos[a], photos[b])] if len(photos) else []
+            return all(np.array_equal(one, other) for one, other in pairs)
+
+        alike = (all(a == b or same(a, b) for a, b in zip(first, other, strict=True)) for other in others)
+        return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
+
+
+def match_views(source: Source, places: Sequence[Place]) -> list[Fit]:
+    """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
+    errors = [_projective_error(source, *place) for place in places]
+    far = _AS_SHOWN * max(min(errors, default=0.0), SMALLEST_PX)
+    shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
+    fits = [fit for place in shown for fit in _fit_views(source, *place)]
+    usual, convention = source.camera_file.viewmats, source.camera_file.convention
+    for poses in other_conventions(usual, convention) if shown and not fits else ():
+        for grid, layout in shown:
+            file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
+            fits += _fit_views(source, grid.with_poses(file), layout)
+    return fits
+
+
+def _projective_error(source: Source, grid: Grid, layout: Layout) -> float:
+    """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
+
+    Of the first, the middle and the last view, one that a camera shows counts.
+    """
+    limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
+    inputs = source.inputs(grid, photos=False)
+    for view in some_views(layout):
+        pairs = inputs.pairs(subsample(layout.select(view), _SHOWN_SAMPLES))
+        error = projective_error(pairs.points, pairs.pixels)
+        if error <= limit:
+            return error
+    return math.inf
+
+
+def _fit_views(source: Source, grid: Grid, layout: Layout) -> list[Fit]:
+    """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
+    inputs = source.inputs(grid, photos=False)
+    pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
+    numbers, parts = np.unique(layout.views, return_inverse=True)  # of the views; the view of each part
+    count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
+
+    @cache
+    def solve(Ks: bytes) -> dict[int, np.ndarray]:
+        return own_poses(pairs, np.frombuffer(Ks).reshape(-1, 3, 3))
+
+    def find_own(cameras: Sequence[int]) -> dict[int, np.ndarray]:
+        return solve(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
+
+    def fit(cameras: Sequence[int]) -> Fit:
+        own = {cameras[view]: pose for view, pose in find_own(cameras).items()}
+        views = np.array(cameras)
+        labelled = replace(layout, views=tuple(views[parts].tolist()))
+        return Fit(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
+
+    some = [ids for ids in (*every_nth(len(grid.cameras)), tuple(range(count))) if len(ids) == count]
+    orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
+    fits = [fit(order) for order in orders]
+    nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)
+    if nearest is not None and nearest not in orders and source.scale is None:
+        other = fit(nearest)
+        same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
+        fits += [other] if other.reading.frame.kind in same_axes else []
+    return [each for each in fits if each.reading.ok]
+
+
+def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
+    """Find the cameras whose poses are nearest to those of ``count`` views; None where two have one, or no pose.
+
+    Distances are in units of the cameras' spread.
+    """
+    if len(own) < count:
+        return None
+    viewmats, centres = np.stack([own[view] for view in range(count)]), cameras.centres
+    unit = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
+    turned = np.abs(viewmats[:, None, :3, :3] - cameras.viewmats[:, :3, :3]).max((2, 3))
+    away = np.linalg.norm(camera_centres(viewmats)[:, None] - centres, axis=2) / unit
+    nearest = (turned + away).argmin(1).tolist()
+    return tuple(nearest) if len(set(nearest)) == count else None
+
+
+def read_views(
+    inputs: AlignmentInput, layout: Layout, pairs: Correspondences, own: Mapping[int, np.ndarray]
+) -> Reading:
+    """Score a layout in the simplest frame in which the cameras are about as near as the views' ``own`` poses.
+
+    ``pairs`` are a sample of the rows, and ``own`` poses ``[4,4]`` by view.
+    """
+    cameras, viewmats = inputs.cameras, inputs.cameras.viewmats.astype(np.float64)
+    for view, pose in own.items():
+        viewmats[view] = pose
+    bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
+    if not bound.ok and set(own) >= set(layout.views):
+        return bound  # nothing is nearer than poses of their own
+    frames = chain(
+        ((0, frame) for frame in usual_frames(cameras, inputs.scale)),
+        solved_frames(pairs, cameras, own, inputs.scale),
+    )
+    as_good = max(_AS_GOOD * bound.median_px, bound.median_px + _AS_GOOD_PX)
+    readings: list[Reading] = []
+    for effort, frame in frames:
+        reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
+        if effort == 2 and readings:
+            break
+        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
+            return reading
+        if reading.ok and (effort == 0 or inputs.scale is not None or reading.median_px <= as_good):
+            readings.append(reading)  # otherwise cameras are wrong
+    lowest = min((reading.worst_px for reading in readings), default=math.inf)
+    return next((reading for reading in readings if _is_near(reading.worst_px, lowest)), replace(bound, ok=False))
+
+
+def _is_near(px: float, lowest: float) -> bool:
+    """Return whether a simpler frame is near enough to the nearest one."""
+    return px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX)
+
+
+def refine(source: Source, fit: Fit) -> Fit:
+    """Score a fit again, with its frame solved again, on more Gaussians."""
+    inputs = source.inputs(fit.grid, photos=False)
+    pairs = inputs.pairs(sample_layout(fit.reading.layout, SAMPLES))
+    return replace(fit, reading=read_views(inputs, fit.reading.layout, pairs, own_poses(pairs, fit.grid.cameras.Ks)))

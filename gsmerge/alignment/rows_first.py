@@ -1,0 +1,412 @@
+"""Find which row is which pixel: by the grid that rows show, whose views are then found among the file's cameras.
+
+Most files are plain: rows are the pixels in order, which the stored cameras show. Otherwise rows show by themselves
+whether they are the pixels of a grid, since some camera shows them in their pixels then, and the pose of each of its
+views. What is left to find is which of the file's cameras each view is, and how their world lies in that of the
+Gaussians: one similarity, for every convention of the poses and every likely order of the views.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from gsmerge.alignment.cameras import NEAR_PX, describe_reading, max_pixels, move_cameras, other_conventions
+from gsmerge.alignment.frames import scale_by, usual_frames
+from gsmerge.alignment.grids import (
+    Grid,
+    check_photo_size,
+    file_grids,
+    grids_of,
+    network_sizes,
+    photo_grid,
+    shown_sizes,
+    square_sizes,
+    with_photo_size,
+)
+from gsmerge.alignment.judge import Fit, Recovery, judge
+from gsmerge.alignment.layouts import (
+    ESTIMATED,
+    MAY_BE_UNALIGNED,
+    Layout,
+    depth_layouts,
+    dropped_layout,
+    every_nth,
+    exact_layouts,
+    move_layout,
+    plain_layout,
+    subsample,
+    view_orders,
+)
+from gsmerge.alignment.match import Place, Source, match_views, refine
+from gsmerge.alignment.score import (
+    SHUFFLED_MARGIN,
+    SMALLEST_PX,
+    score_layout,
+)
+from gsmerge.errors import SceneError
+from gsmerge.geometry import IDENTITY, Similarity
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.formats.read import GaussianFile
+from gsmerge.io.photo_files import Photos, PhotoTransform, photo_size
+from gsmerge.runtime.memory import free_pages
+from gsmerge.types import Cameras
+
+_PLAIN_PX = 0.5  # a file whose rows are the grid as they are is not searched if it is this near to its pixels
+_ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will do where they are no such small share
+_MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
+_PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
+_SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
+_MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
+
+
+@dataclass(frozen=True)
+class AlignmentResult:
+    """Result of :func:`align`: the pixel of every row, or for rows without pixels the cameras that see them."""
+
+    # ``[n]`` int64, the pixel ``(part·H + y)·W + x`` of each row, -1: none; None where the rows belong to no pixels.
+    # A part is a view, or one layer of a view with several Gaussians per pixel
+    pixel_ids: np.ndarray | None
+    cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
+    images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
+    camera_file: CameraFile | None  # as it was read in the end; None where there are no cameras
+    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    transform: PhotoTransform | None = None  # what was done to the photos
+    recovery: Recovery | None = None  # which reading of the rows won, and by how much; None without pixels
+    moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty where none was
+    given: np.ndarray | None = None  # ``[c,4,4]`` poses to which each view's Gaussians are yet to be moved with it
+    problem: str | None = None  # why the rows belong to no pixels; None where they do
+
+    @property
+    def layout(self) -> Layout | None:
+        """Pixel of each row, part by part; None for rows without pixels."""
+        return None if self.recovery is None else self.recovery.best.layout
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """Camera of each part; for rows without pixels, all cameras."""
+        return tuple(range(len(self.cameras))) if self.layout is None else self.layout.views
+
+
+def align(
+    ply: GaussianFile,
+    camera_file: CameraFile,
+    photos: Photos = (),
+    *,
+    order: str = "auto",
+    scale: float | None = None,
+    depths: Callable[[], np.ndarray | None] = lambda: None,
+    frames: Callable[[], Sequence[Similarity]] = tuple,
+) -> AlignmentResult:
+    """Find the pixel of every row; for rows without pixels, choose the camera poses that see them.
+
+    Also finds the size of the grid, the frame and convention of the poses, and the transform of the photos.
+
+    Args:
+        ply: The file's rows.
+        camera_file: Its cameras.
+        photos: c uint8 photos of one size, or none.
+        order: The order of the rows where it is known, see :class:`gsmerge.settings.reading.ReadHints`.
+        scale: Size of the Gaussians' world in units of the cameras', where it is given.
+        depths: Reads ``[c,h,w]`` depth maps next to the cameras; None where there are none.
+        frames: Reads the frames that a file names in which the cameras may see rows without pixels.
+
+    Raises:
+        SceneError: If sizes do not agree, several conventions fit, the Gaussians are not those of the cameras' views,
+            or other cameras would make pixels of the rows.
+    """
+    camera_file = with_photo_size(camera_file, photo_size(photos))
+    source = Source(ply, camera_file, photos, order, scale, depths)
+    grids, problem = file_grids(camera_file, source.size), None
+    try:
+        grids.insert(0, photo_grid(camera_file, source.size))
+    except SceneError as error:
+        problem = error
+    found = _read_in_order(source, grids) or _find_pixels(source, grids)
+    if found is not None:
+        return _make_result(source, *found)
+    cropped = None if problem is None else _cropped_grid(source, grids)
+    if problem is not None and cropped is None:
+        raise problem
+    return _choose_cameras(source, cropped or grids[0], frames)
+
+
+def _read_in_order(source: Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+    """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
+
+    Or read them by the pixels that they showed when their cameras were estimated.
+    """
+    count, pixel_ids, fits = len(source.ply.gaussians), source.camera_file.pixel_ids, []
+    for grid in grids:
+        inputs = source.inputs(grid, photos=False)
+        if pixel_ids is not None:
+            layout = dropped_layout(pixel_ids, len(grid.cameras), *grid.size)
+            fits.append(Fit(grid, score_layout(inputs, layout, IDENTITY)))
+        elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_enough(source):
+            layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
+            best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
+            far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+            if source.scale is None and best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others):
+                fits.append(Fit(grid, best))
+    fits = [fit for fit in fits if fit.reading.ok]
+    return judge(fits, source.inputs, lambda fit: fit) if fits else None
+
+
+def _has_enough(source: Source) -> bool:
+    """Return whether enough rows are finite to find their pixels."""
+    finite = int(source.ply.valid.sum())
+    return finite >= _ENOUGH or finite >= _FEW * len(source.ply.gaussians)
+
+
+# Rows show their grid
+
+
+def _find_pixels(source: Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+    """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
+
+    ``named``: the grids of sizes that files name.
+    """
+    if source.order in MAY_BE_UNALIGNED or not _has_enough(source):
+        return None
+    found = None
+    for turn, places in enumerate(_rounds(source, named)):
+        fits = match_views(source, places)
+        other = judge(fits, source.inputs, partial(refine, source)) if fits else None
+        if other is None and turn == 0 and named:
+            other = _move_cameras(source, named[0])
+        found = min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
+        if found is not None and not found[0].is_doubtful:
+            return found
+    return found
+
+
+def _rounds(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
+    """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
+    from gsmerge.alignment.row_grid import find_layouts  # few files come here
+
+    yield [(grid, layout) for grid in named for layout in _layouts(source, grid)]
+    pixels = max((len(grid.cameras) * math.prod(grid.size) for grid in named), default=0)
+    is_small = _MANY_PIXELS * len(source.ply.gaussians) < pixels  # and likely a whole grid of another size
+    if not is_small:
+        yield from _follow_cameras(source, named)
+    layouts = find_layouts(source.ply.gaussians, source.ply.valid)
+    if layouts:
+        shown = partial(shown_sizes, shape=(layouts[0].width, layouts[0].height))
+        grids = grids_of(source.camera_file, source.size, shown)
+        yield [(grid, each) for grid in grids for each in _layouts(source, grid) if _are_same(each, layouts)]
+        return
+    if is_small:
+        yield from _follow_cameras(source, named)
+    yield from _lacking_places(source, named)
+
+
+def _lacking_places(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
+    """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
+    from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
+
+    if not _may_lack_pixels(source, named):
+        return
+    shown = find_dropped_grid(source.ply.gaussians.means, source.ply.valid)
+    usual = grids_of(source.camera_file, source.size, network_sizes)
+    if shown is None:
+        yield from _follow_cameras(source, usual)
+        return
+    layout, own = shown[0], shown[1].cameras
+    for grids in (named, usual):
+        yield [(g, place) for g in grids for place in _moved_layouts(source, g, layout, own)]
+
+
+def _layouts(source: Source, grid: Grid) -> list[Layout]:
+    """List the layouts in a grid that the number of rows allows, or the depth maps next to the cameras."""
+    views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
+    layouts = list(exact_layouts(count, views, width, height))
+    if count < views * width * height and source.may_be("view-major"):
+        depths = source.depths()
+        if depths is not None and depths.shape == (views, height, width):
+            layouts += depth_layouts(count, depths)
+    return [layout for layout in layouts if source.may_be(layout.order)]
+
+
+def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
+    """Return whether a layout without its borders is one of those that rows have shown."""
+    y, x = np.divmod(layout.pixels[0][[0, -1]], layout.width)
+    what = int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, layout.order, layout.per_pixel
+    return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
+
+
+def _may_lack_pixels(source: Source, grids: Sequence[Grid]) -> bool:
+    """Return whether rows may be pixels of some of the grids, of which many are missing."""
+    most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
+    enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
+    return enough and len(source.ply.gaussians) < most
+
+
+def _follow_cameras(source: Source, grids: Sequence[Grid]) -> Iterator[list[Place]]:
+    """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
+
+    Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
+    """
+    from gsmerge.alignment.dropped_rows import follow_rows  # few files come here
+
+    others = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
+    for grid in grids:
+        if not _may_lack_pixels(source, [grid]):
+            continue
+        moved = chain(
+            (frame.move(grid.cameras) for frame in usual_frames(grid.cameras, source.scale)),
+            (replace(grid.cameras, viewmats=poses.viewmats) for poses in others),
+        )
+        for cameras in moved:
+            layout = follow_rows(source.ply.gaussians.means, source.ply.valid, cameras)
+            if layout is not None and source.may_be(layout.order):
+                yield [(grid, layout)]
+
+
+def _moved_layouts(source: Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
+    """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
+    cameras = grid.cameras
+    margins = cameras.width - layout.width, cameras.height - layout.height
+    focal = np.median(own.Ks[:, (0, 1), (0, 1)], 0) / np.median(cameras.Ks[:, (0, 1), (0, 1)], 0)
+    if min(margins) < 0 or len(layout.views) > len(cameras) or not (np.abs(focal - 1) <= _SAME_FOCAL).all():
+        return []
+    if not source.may_be(layout.order):
+        return []
+    chosen = next((ids for ids in every_nth(len(cameras)) if len(ids) == len(layout.views)), layout.views)
+    layout = replace(layout, views=chosen)
+    shifts = np.rint(np.median(cameras.Ks[:, :2, 2], 0) - np.median(own.Ks[:, :2, 2], 0)).astype(int)
+    lefts, tops = (
+        sorted({place for place in (margin // 2, *range(shift - _OFF, shift + _OFF + 1)) if 0 <= place <= margin})
+        for margin, shift in zip(margins, shifts.tolist(), strict=True)
+    )
+    return [move_layout(layout, cameras.width, cameras.height, left, top) for left in lefts for top in tops]
+
+
+# Cameras that are off
+
+
+def _move_cameras(source: Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+    """Fit rows of every pixel by slightly moved cameras; None if that does not fit.
+
+    Also None if the colours of the photos disagree: views in the wrong order look the same.
+    """
+    if source.scale is not None:
+        return None
+    inputs = source.inputs(grid)
+    layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
+    readings = [score_layout(inputs, layout, IDENTITY) for layout in layouts]
+    best = min(readings, key=lambda reading: reading.worst_px, default=None)
+    if best is None or not NEAR_PX < best.worst_px <= max_pixels(*grid.size):
+        return None
+    pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
+    path = str(source.camera_file.path)
+    moved = move_cameras(pairs, grid.cameras, source.camera_file.names, path, inputs.images)
+    if moved is None:
+        return None
+    given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
+    grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
+    fit = Fit(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
+    found = judge([fit], source.inputs, lambda each: each) if fit.reading.ok else None
+    return None if found is None or found[1].confirmed is False else found
+
+
+# Rows without pixels, and results
+
+
+def _cropped_grid(source: Source, grids: Sequence[Grid]) -> Grid | None:
+    """Return the one of the grids whose photos show the colours of rows best; None if none do."""
+    from gsmerge.alignment.unaligned import check_cameras
+
+    best, least = None, 0.0
+    for grid in grids:
+        inputs = source.inputs(grid)
+        check = check_cameras(inputs.gaussians, inputs.valid, inputs.cameras, inputs.images)
+        if check.ok and not math.isnan(check.color_ratio) and check.score > least:
+            best, least = grid, check.score
+    return best
+
+
+def _choose_cameras(source: Source, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+    """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
+    from gsmerge.alignment.explain import explain_count
+    from gsmerge.alignment.unaligned import choose_cameras
+    from gsmerge.alignment.upright import upright_rotation
+
+    info, camera_file, inputs = source.ply.info, source.camera_file, source.inputs(grid)
+    if source.order not in MAY_BE_UNALIGNED:
+        check_photo_size(info, camera_file, source.size)
+    rotation = upright_rotation(inputs)
+    if rotation is not None:
+        return _place_upright(source, grid, rotation)
+    why = explain_count(info, inputs, camera_file)
+    if source.scale is not None:
+        inputs = replace(inputs, cameras=scale_by(source.scale).move(inputs.cameras))
+    cameras, camera_file, notes = choose_cameras(inputs, camera_file, frames(), why)
+    return AlignmentResult(
+        None, cameras, inputs.images, camera_file, (*grid.notes, *notes), grid.transform, problem=why.problem
+    )
+
+
+def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> AlignmentResult:
+    """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
+    from gsmerge.alignment.upright import solve_upright, upright_error
+
+    grids = [grid, *grids_of(source.camera_file, source.size, square_sizes)] if len(source.photos) else []
+    solved = ((each, solve_upright(source.inputs(each), rotation)) for each in grids)
+    placed = next(((each, frame) for each, frame in solved if frame is not None), None)
+    if placed is None:
+        raise upright_error(source.ply.info, len(source.photos))
+    grid, frame = placed
+    inputs, moved = source.inputs(grid), replace(grid, cameras=frame.move(grid.cameras))
+    for ((_, layout),) in _follow_cameras(source, [moved]):
+        found = judge([Fit(grid, score_layout(inputs, layout, frame))], source.inputs, lambda fit: fit)
+        if found is not None:
+            return _make_result(source, *found)
+    return AlignmentResult(
+        None,
+        moved.cameras,
+        inputs.images,
+        replace(source.camera_file, viewmats=moved.cameras.viewmats),
+        (*grid.notes, f"the cameras are {frame.description}, as the photos' colours show"),
+        grid.transform,
+        problem="expected one Gaussian per pixel, found Gaussians that were merged",
+    )
+
+
+def _make_result(source: Source, fit: Fit, recovery: Recovery) -> AlignmentResult:
+    """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
+    inputs, grid, best = source.inputs(fit.grid), fit.grid, recovery.best
+    free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
+    frame, layout, count = best.frame, best.layout, len(grid.cameras)
+    notes, usual = [*grid.notes], source.camera_file
+    if grid.camera_file.convention != usual.convention:
+        notes.append(f"{describe_reading(grid.camera_file.convention, usual.convention)}: read so")
+    if usual.source == ESTIMATED:
+        from_what = "own grid" if usual.pixel_ids is None else "own order"
+        separate = len(set(map(bytes, usual.Ks))) > 1
+        what = "poses, and focal lengths that differ between the views," if separate else "poses and focal length"
+        notes.append(f"no cameras were given: {what} are estimated from the Gaussians' {from_what}")
+    in_order = layout.is_plain and frame is IDENTITY and len(layout.views) == count
+    orders = view_orders(usual.names)
+    if in_order and layout.views == orders[1] != orders[0]:
+        notes.append("views are in the order of the image names, not of the camera file")
+    elif not (in_order and layout.views in orders):
+        used = len(set(layout.views))
+        notes.append(f"read as: {recovery.description}")
+        notes += [f"{used} of {count} views are in the file"] * (used < count)
+    return AlignmentResult(
+        pixel_ids=layout.pixel_ids(len(inputs.gaussians)),
+        cameras=grid.cameras if frame is IDENTITY else frame.move(grid.cameras),
+        images=inputs.images,
+        camera_file=grid.camera_file,
+        notes=tuple(notes),
+        transform=grid.transform,
+        recovery=recovery,
+        moves=grid.moves,
+        given=None if grid.given is None else frame.move_viewmats(grid.given),
+    )
