@@ -13,7 +13,7 @@ from gsmerge.alignment.dropped_rows import find_dropped_grid
 from gsmerge.alignment.layouts import ESTIMATED, exact_layouts, subsample
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, base_colors, find_correspondences
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, View, make_camera_file
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
@@ -64,5 +64,5 @@ def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> t
 def _make_cameras(path: Path, names: Sequence[str], cameras: Cameras) -> CameraFile:
     """Make the camera file of estimated cameras."""
     posed = zip(names, cameras.viewmats[:, :3], cameras.Ks, strict=True)
-    views = [View(name, pose, K, (cameras.width, cameras.height)) for name, pose, K in posed]
+    views = [StoredView(name, pose, K, (cameras.width, cameras.height)) for name, pose, K in posed]
     return make_camera_file(path, ESTIMATED, W2C_OPENCV, views)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from batches import InlinePool, records
+from messages import noted
 from sweeps import sweep
 
 import gsmerge

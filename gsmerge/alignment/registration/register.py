@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from gsmerge.alignment.registration.keypoints import End, Matches, Photo, find_keypoints, match_photos
+from gsmerge.alignment.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
 from gsmerge.alignment.registration.similarities import (
     apply_after,
     fit_similarities,
@@ -86,7 +86,7 @@ def register(scenes: Sequence[Scene]) -> Registration:
 # Two scenes
 
 
-def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
+def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | None:
     """Find the similarity from the first scene to the second that agrees with the most matches.
 
     Returns the similarity and the matches that agree; None if they are too few.
@@ -110,7 +110,7 @@ def connect(matches: Matches) -> tuple[Similarity, Matches] | None:
     return place, matches.select(agree)
 
 
-def _sample_places(matches: Matches) -> list[Similarity]:
+def _sample_places(matches: KeypointMatches) -> list[Similarity]:
     """Fit similarities to triples of matches; return those that most matches agree with."""
     rng = np.random.default_rng(0)
     p, q = (end.points for end in matches.ends)
@@ -182,13 +182,13 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return matmul(matrices, vectors[..., None])[..., 0]
 
 
-def _squares(places: Places, matches: Matches, spread: float) -> np.ndarray:
+def _squares(places: Places, matches: KeypointMatches, spread: float) -> np.ndarray:
     """Return the squared residual ``[m]`` of each match: the larger one of both directions."""
     both = [(residuals.values**2).sum(1) for residuals in _both_ways(places, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
-def _both_ways(places: Places, matches: Matches, spread: float) -> list[_Residuals]:
+def _both_ways(places: Places, matches: KeypointMatches, spread: float) -> list[_Residuals]:
     first, second = matches.ends
     there = _between(places, matches.scenes)
     return [
@@ -197,7 +197,7 @@ def _both_ways(places: Places, matches: Matches, spread: float) -> list[_Residua
     ]
 
 
-def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[Matches], float]:
+def _measure_spreads(places: Places, matches: Sequence[KeypointMatches]) -> tuple[list[KeypointMatches], float]:
     """Measure the errors of keypoints and of the logarithms of depths, robustly.
 
     Returns the matches with the error of keypoints, and the error of logarithmic depths.
@@ -214,7 +214,7 @@ def _measure_spreads(places: Places, matches: Sequence[Matches]) -> tuple[list[M
 # All scenes
 
 
-def _chain(links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
+def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Places:
     """Place the largest connected set by its strongest links, in the frame of its first scene."""
     strength = [0] * count
     for _, pair in links:
@@ -234,7 +234,7 @@ def _num_placed(places: Places) -> int:
     return sum(place is not None for place in places)
 
 
-def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: int) -> Places:
+def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Places:
     """Place scenes in the frame of ``start``, each by its strongest link to a scene already placed."""
     places: list[Similarity | None] = [None] * count
     places[start] = IDENTITY
@@ -252,7 +252,7 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, Matches]], count: 
             places[b] = apply_after(first, invert_place(place))
 
 
-def _refine(places: Places, matches: Sequence[Matches], spread: float, fixed: int | None = None) -> Places:
+def _refine(places: Places, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None) -> Places:
     """Move all placed scenes but one to the best agreement of matches, by damped Gauss-Newton steps.
 
     ``fixed``: the scene that stays; None: the first placed scene.
@@ -285,7 +285,7 @@ def _make_step(step: np.ndarray) -> Similarity:
 
 
 def _normal_equations(
-    places: Places, matches: Sequence[Matches], spread: float, free: Sequence[int]
+    places: Places, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return cost (Cauchy's), curvature and slope with respect to the steps of the free scenes."""
     size = len(free) * SIZE

@@ -98,7 +98,7 @@ class CameraFile:
         return f"CameraFile({len(self)} of {self.path}, {self.source})"
 
 
-class View(NamedTuple):
+class StoredView(NamedTuple):
     """One camera of a file, in the convention of the file."""
 
     name: str  # of its image
@@ -118,7 +118,7 @@ def make_camera_file(
     path: StrPath,
     source: str,
     convention: Convention,
-    views: Sequence[View],
+    views: Sequence[StoredView],
     images: Photos = (),
     order: str = "auto",
 ) -> CameraFile:

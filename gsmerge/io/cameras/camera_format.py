@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from plyfile import PlyData
 
 from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras.camera_file import CameraFile, Convention, View, make_camera_file
+from gsmerge.io.cameras.camera_file import CameraFile, Convention, StoredView, make_camera_file
 from gsmerge.io.formats.ply import open_ply
 from gsmerge.io.photo_files import Photos
 
@@ -49,7 +49,7 @@ class CameraSource:
 class StoredCameras(NamedTuple):
     """Cameras as a file stores them, before conversion."""
 
-    views: list[View]
+    views: list[StoredView]
     images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
     convention: Convention | None = None  # where the numbers show another one than the format's

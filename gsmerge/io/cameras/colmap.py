@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
-from gsmerge.io.cameras.camera_file import View, check_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
 # model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
@@ -92,7 +92,7 @@ def _pose(numbers: list[float]) -> np.ndarray:
     return np.concatenate([rotation, np.array(numbers[4:7])[:, None]], 1)
 
 
-def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> View:
+def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], params: list[float]) -> StoredView:
     if model not in _PERSPECTIVE | _FISHEYE:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
         raise SceneError(path, problem, "undistort the images first")
@@ -100,7 +100,7 @@ def _camera(path: Path, camera_id: int, model: str, size: tuple[int, int], param
     K = make_pinhole(params[0], *params[:3]) if one_focal else make_pinhole(*params[:4])
     distortion = params[3 if one_focal else 4 : _NUM_PARAMS[model]]
     lens = make_lens(model, "fisheye" if model in _FISHEYE else "perspective", distortion)
-    return View("", np.eye(4), K, size if lens else _size_of(K, size), lens)
+    return StoredView("", np.eye(4), K, size if lens else _size_of(K, size), lens)
 
 
 def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
@@ -111,7 +111,7 @@ def _size_of(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
     return (int(own[0]), int(own[1])) if same_shape and x < _SMALLER and (own == np.rint(own)).all() else size
 
 
-def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, View]:
+def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
     (count,) = _numbers(file, "<Q")
     check_count(path, count)
     cameras = {}
@@ -142,8 +142,8 @@ def _says_something(line: str) -> bool:
     return line.strip()[:1] not in ("", "#")
 
 
-def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, View]:
-    cameras: dict[int, View] = {}
+def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
+    cameras: dict[int, StoredView] = {}
     for line in filter(_says_something, lines):
         check_count(path, len(cameras) + 1)
         camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
@@ -154,7 +154,7 @@ def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, View]:
     return cameras
 
 
-def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, View]) -> list[_Image]:
+def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
     """Parse the lines of the images: pose and name, which may have spaces; a line of points may follow each.
 
     Programs that rewrite ``images.txt`` leave out the lines of points, or only empty ones.
@@ -174,7 +174,7 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, View]) 
     return images
 
 
-def _lists_points(line: str, cameras: Mapping[int, View]) -> bool:
+def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
     """Return whether the line after an image lists its points, x y id each, and is not another image."""
     start = line.split(maxsplit=9)
     if len(start) < 3 or not all(_WHOLE.fullmatch(number) for number in start[2:9:3]):

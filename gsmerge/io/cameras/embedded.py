@@ -12,7 +12,7 @@ from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import ReadBudget, check_file, parse_json, read_errors
-from gsmerge.io.cameras.camera_file import View, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.json_files import transforms_views
 from gsmerge.io.formats.ply import MAX_HEADER_BYTES
@@ -89,4 +89,4 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     if len(extrinsic) == 12:  # its first versions: the rotation column by column
         pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
-    return StoredCameras([View(source.path.stem, pose, K, (side, side))])
+    return StoredCameras([StoredView(source.path.stem, pose, K, (side, side))])

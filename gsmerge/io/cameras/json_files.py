@@ -19,7 +19,7 @@ from gsmerge.io.cameras.camera_file import (
     MAX_NORMALISED_FOCAL,
     MAX_NUMBER,
     Lens,
-    View,
+    StoredView,
     check_count,
     is_orthonormal,
     make_lens,
@@ -74,7 +74,7 @@ def read_transforms(source: CameraSource) -> StoredCameras:
     return StoredCameras(transforms_views(source.path, source.json))
 
 
-def transforms_views(path: Path, data: Any) -> list[View]:
+def transforms_views(path: Path, data: Any) -> list[StoredView]:
     """Read the views of a parsed ``transforms.json``; see :func:`read_transforms`."""
     frames = data["frames"] if isinstance(data, dict) else data
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
@@ -95,7 +95,7 @@ def transforms_views(path: Path, data: Any) -> list[View]:
         with _number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values)
             K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values, size_of)
-            views.append(View(name, pose, K, size, lens))
+            views.append(StoredView(name, pose, K, size, lens))
     return views
 
 
@@ -199,11 +199,11 @@ def read_inria(source: CameraSource) -> StoredCameras:
             middle = {"cx": width / 2, "cy": height / 2}
             cx, cy = (_number(entry.get(key, half)) for key, half in middle.items())
         K = make_pinhole(fx, fy, cx, cy)
-        views.append(View(name, np.concatenate([rotation, centre], 1), K, size))
+        views.append(StoredView(name, np.concatenate([rotation, centre], 1), K, size))
     return StoredCameras(_with_optimised_poses(views, path.parent / "pose"))
 
 
-def _with_optimised_poses(views: list[View], folder: Path) -> list[View]:
+def _with_optimised_poses(views: list[StoredView], folder: Path) -> list[StoredView]:
     """Return views with the poses that InstantSplat optimised, where it wrote them with those that it began from."""
     from gsmerge.io.cameras.npz_files import read_matrices  # few folders need it
 
@@ -234,7 +234,7 @@ def read_ffgs(source: CameraSource) -> StoredCameras:
         name = str(view.get("file") or f"view {i}")
         with _number_errors(path, f"view {name}: expected numbers in 'c2w' and 'k_normalized'"):
             pose, K = _array(view["c2w"]).reshape(4, 4), _array(view["k_normalized"]).reshape(3, 3)
-        views.append(View(name, pose, K * np.array([[width], [height], [1]]), (width, height)))
+        views.append(StoredView(name, pose, K * np.array([[width], [height], [1]]), (width, height)))
     return StoredCameras(views)
 
 
@@ -259,7 +259,7 @@ def read_world_mirror(source: CameraSource) -> StoredCameras:
         raise SceneError(path, f"expected extrinsics and intrinsics of the same cameras, found only one for {odd}")
     names = sorted(poses, key=natural_key) if all(name.isdecimal() for name in poses) else list(poses)
     size = _centred_size([Ks[name] for name in names])
-    return StoredCameras([View(name, poses[name], Ks[name], size) for name in names])
+    return StoredCameras([StoredView(name, poses[name], Ks[name], size) for name in names])
 
 
 def _centred_size(Ks: Sequence[np.ndarray]) -> tuple[int, int]:
@@ -302,7 +302,7 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
         with _number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
             pose = _array(frame["w2c"]).reshape(4, 4)
             K = make_pinhole(*(_number(frame[key]) for key in ("fx", "fy", "cx", "cy")))
-            frames.append(View(name, pose, K, (round(_number(frame["w"])), round(_number(frame["h"])))))
+            frames.append(StoredView(name, pose, K, (round(_number(frame["w"])), round(_number(frame["h"])))))
     beside = path.parent
     if folder is not None and not (beside / FRAMES_FILE).is_file() and (folder / FRAMES_FILE).is_file():
         beside = folder

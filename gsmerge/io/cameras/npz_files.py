@@ -23,7 +23,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, View, check_count
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, StoredView, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
 from gsmerge.io.photo_files import Photos
@@ -171,8 +171,8 @@ def _missing(path: Path, missing: list[str], arrays: dict[str, np.ndarray]) -> S
     return SceneError(path, f"missing array{'s' * (len(missing) > 1)} {', '.join(missing)}, found {list(arrays)}")
 
 
-def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> list[View]:
-    return [View(f"view {i}", pose, None if Ks is None else Ks[i], size) for i, pose in enumerate(poses)]
+def _views(poses: np.ndarray, Ks: np.ndarray | None, size: tuple[int, int]) -> list[StoredView]:
+    return [StoredView(f"view {i}", pose, None if Ks is None else Ks[i], size) for i, pose in enumerate(poses)]
 
 
 def _check_poses(path: Path, poses: np.ndarray, Ks: np.ndarray | None, names: tuple[str, str]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_lines
-from gsmerge.io.cameras.camera_file import View, check_count, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.formats.table import FRAMES, POSES
@@ -45,13 +45,15 @@ def read_poses(source: CameraSource) -> StoredCameras:
     path, poses = source.path, _rows(source.path, _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
-        return StoredCameras([View(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
+        return StoredCameras([StoredView(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
     values = _rows(intrinsics, (4,))
     if len(values) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
     size = _frame_size(path)
     Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
-    views = [View(f"{i:06d}", pose.reshape(-1, 4), K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))]
+    views = [
+        StoredView(f"{i:06d}", pose.reshape(-1, 4), K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))
+    ]
     return StoredCameras(views)
 
 

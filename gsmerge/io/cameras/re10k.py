@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError, refuse_without_torch
 from gsmerge.io.bounds import MAX_VIEWS, read_budget
-from gsmerge.io.cameras.camera_file import View, make_pinhole
+from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.photo_files import Photos, decode_embedded, photo_size
 
@@ -66,7 +66,8 @@ def _read_scene(path: Path, entry: Mapping[str, Any]) -> StoredCameras:
     photos = _photos(path, entry.get("images"), names)
     size = photo_size(photos) or (0, 0)
     views = [
-        View(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size) for name, row in zip(names, rows, strict=True)
+        StoredView(name, row[6:].reshape(3, 4), make_pinhole(*row[:4]), size)
+        for name, row in zip(names, rows, strict=True)
     ]
     return StoredCameras(views, photos)
 

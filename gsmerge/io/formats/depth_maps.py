@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, read_budget
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, View, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.io.cameras.camera_format import CameraSource
 from gsmerge.io.cameras.npz_files import (
     array_names,
@@ -109,7 +109,7 @@ def read_images(frames: Sequence[Path]) -> Photos:
 def _read_frame(path: Path) -> tuple[np.ndarray, CameraFile]:
     """Read the depth map ``[1,h,w]`` of a frame of DA3-Streaming, and its camera with the image."""
     frame = read_depth_frame(path)
-    view = View(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
+    view = StoredView(f"{path.stem} with its pose in {POSES}", pose_of_frame(path), frame.K, frame.size)
     return frame.depth[None], make_camera_file(path, "", C2W_OPENCV, [view], frame.image[None])
 
 

@@ -21,7 +21,7 @@ from gsmerge import __version__
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_pixels, parse_json, read_budget
-from gsmerge.io.cameras.camera_file import View
+from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, copied_comments, to_stored
 from gsmerge.io.tensor_file import read_tensors
@@ -183,7 +183,7 @@ def read_views(source: CameraSource) -> StoredCameras:
         raise file.error(f"names: expected one of each of {len(cameras)} views, found others")
     size = cameras.width, cameras.height
     images = file.array("images", np.uint8, len(cameras), cameras.height, cameras.width, 3)
-    views = [View(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
+    views = [StoredView(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
     return StoredCameras(views, images, "none")
 
 

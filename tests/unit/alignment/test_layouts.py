@@ -17,7 +17,7 @@ from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_im
 
 from gsmerge.alignment.grids import patch_grids, shown_sizes
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, View, from_viewmats, make_camera_file
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, StoredView, from_viewmats, make_camera_file
 from gsmerge.io.photo_files import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
@@ -285,7 +285,7 @@ def test_intrinsics_divided_by_the_size(tmp_path: Path, tiny: Tiny) -> None:
 
 def test_short_intrinsics_in_pixels_stay() -> None:
     for K, size in (([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))):
-        read = make_camera_file("x", "x", W2C_OPENCV, [View("a", np.eye(4), np.array(K), size)])
+        read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
         assert np.array_equal(read.Ks[0], np.array(K))
         assert (int(read.widths[0]), int(read.heights[0])) == size
 
