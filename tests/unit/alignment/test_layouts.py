@@ -17,7 +17,14 @@ from tiny_scene import Tiny, edited_json, frames_of, write_colmap_text, write_im
 
 from gsmerge.alignment.grids import patch_grids, shown_sizes
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, StoredView, from_viewmats, make_camera_file
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENGL,
+    CONVENTIONS,
+    W2C_OPENCV,
+    StoredView,
+    from_viewmats,
+    make_camera_file,
+)
 from gsmerge.io.photo_files import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras
