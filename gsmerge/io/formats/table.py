@@ -104,7 +104,7 @@ STATE = Format(
     _lazy("gsm.read_rows"),
     None,
     -1,
-    each=(68.0,),
+    each=(56.0,),
 )
 META = "meta.json"  # of a .sog that is a folder
 HTML = Format(
