@@ -220,7 +220,7 @@ def choose_for_scene(
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
     keeps = keeps_input(scene, options)
-    if not scene.photos:
+    if not scene.fitted:
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
     if segment.superpixels == AUTO_SHARE:  # which work on the scene decides
@@ -332,7 +332,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
     """
     if options.checkpoint != "auto":
         return options.checkpoint
-    photos, unfitted = size.photos and not size.drawn, options.fit.fit == "none"
+    photos, unfitted = size.pictures == "photos", options.fit.fit == "none"
     return "shipped" if (size.aligned and (unfitted or not photos)) or (photos and unfitted) else "none"
 
 
@@ -429,7 +429,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
         return decode
     asked = budget != BudgetOptions() or segment.superpixels != SHARE
     other = options.method != OURS or options.recipe is not None or options.checkpoint not in ("auto", "none")
-    fits = scene.photos and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    fits = scene.fitted and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)
 

@@ -32,7 +32,6 @@ from gsmerge.facts.partition import (
 )
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
 from gsmerge.facts.row_colors import PHOTOS
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
@@ -89,7 +88,7 @@ def compact_in_blocks(
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)
     size = gaussians_at_once(scene.num_gaussians, count)
-    memory = memory_bytes(size, photos=measure_size(scene).photos, num_rest=3 * scene.gaussians.shN.shape[1])
+    memory = memory_bytes(size, photos=True, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
     with start_work(engine.engine, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)

@@ -155,8 +155,8 @@ class Prepared:
     def size(self) -> SceneSize:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
-        fitted = bool(self.reference.fit_views)
-        size = measure_size(measured, photos=fitted, drawn=fitted and not self.reference.of_views)
+        reference = self.reference
+        size = measure_size(measured, "photos" if reference.of_views else "renders" if reference.fit_views else "none")
         # Gaussians that fill holes are not the file's
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from gsmerge.facts.views import camera_kinds
 from gsmerge.types import Scene
+
+Pictures = Literal["photos", "renders", "none"]  # photos or what stands in for them; drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -17,15 +20,19 @@ class SceneSize:
     height: int  # pixels
     width: int
     aligned: bool  # whether each Gaussian belongs to a pixel
-    photos: bool  # whether there are photos to fit to, or what stands in for them
-    drawn: bool = False  # whether that is drawings of the scene itself
+    pictures: Pictures  # what results are fitted to
     num_cameras: int = 2  # views at different places; 1: one camera took all
     sh_degree: int = 0
 
     @property
+    def fitted(self) -> bool:
+        """Whether there are pictures to fit to."""
+        return self.pictures != "none"
+
+    @property
     def rendered(self) -> bool:
         """Whether results are measured against renders of the input, for lack of photos and of pixels."""
-        return self.drawn or not (self.photos or self.aligned)
+        return self.pictures == "renders" or not (self.fitted or self.aligned)
 
     @property
     def pixels_per_view(self) -> int:
@@ -33,17 +40,13 @@ class SceneSize:
         return self.height * self.width
 
 
-def measure_size(scene: Scene, *, photos: bool | None = None, drawn: bool | None = None) -> SceneSize:
-    """Return the sizes of a scene.
-
-    ``photos``, ``drawn``: see :class:`SceneSize`; None: as they are before photos are compared with the Gaussians.
-    """
-    if drawn is None:
-        drawn = len(scene) > 0 and not scene.is_shown
+def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
+    """Return the sizes of a scene; ``pictures`` None: as they are before photos are compared with the Gaussians."""
+    if pictures is None:
+        pictures = "photos" if scene.is_shown else "renders" if len(scene) else "none"
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
-        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned,
-        photos=scene.is_shown or drawn if photos is None else photos, drawn=drawn,
+        scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned, pictures,
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip

@@ -174,7 +174,7 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 def has_few_rows(scene: SceneSize) -> bool:
     """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
-    shown = scene.photos and not scene.drawn and not scene.aligned
+    shown = scene.pictures == "photos" and not scene.aligned
     return shown and scene.num_gaussians < FEW * _few_pixels(scene)
 
 

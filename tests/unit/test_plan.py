@@ -107,7 +107,7 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    size = SceneSize(768, 1, 24, 32, aligned=aligned, photos=photos)
+    size = SceneSize(768, 1, 24, 32, aligned, "photos" if photos else "none")
     assert choose_networks(options_of(**settings), size) == name
 
 

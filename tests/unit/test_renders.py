@@ -126,7 +126,7 @@ def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
     for settings in ({"max_color": 0.11}, {"segmentation": "slic"}, {"checkpoint": "shipped"}, {"method": "voxel"}):
         assert not merges_pairs(size, CompactOptions().with_settings(settings))
-    assert not merges_pairs(replace(size, photos=True, drawn=False), CompactOptions())
+    assert not merges_pairs(replace(size, pictures="photos"), CompactOptions())
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:
