@@ -23,6 +23,7 @@ from gsmerge.scene.files import (
     other_plys,
 )
 from gsmerge.scene.no_gaussians import find_remedy
+from gsmerge.settings.extend import SUFFIX
 
 MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
 _JOB_BYTES = 700  # of memory for each scene of a list
@@ -59,7 +60,7 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
             yield from _require_some(search.walk(path), argument, "in the folder")
-        elif path.suffix in SCENE_SUFFIXES and path.is_file():
+        elif path.suffix in (*SCENE_SUFFIXES, SUFFIX) and path.is_file():
             yield path
         elif glob.has_magic(argument) and not path.exists():
             yield from _require_some(_matches(argument, search), argument, "that match")

@@ -176,12 +176,12 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
 
-    decoding, writing = args.make(DecodeOptions, FileOptions, viewer_cameras=False, columns="needed")
+    decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(
-        path, out, decoding, normals=writing.normals, overwrite=args.overwrite, dry_run=args.dry_run,
-        seconds_before=before,
+        path, out, decoding, normals=writing.normals, viewer_cameras=writing.viewer_cameras,
+        overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
     )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)

@@ -35,7 +35,10 @@ from gsmerge.types import PicturedScene, Scene
 WINDOW = np.full(5, 1 / 5, np.float32)
 FAINT = 0.05  # opacity below which a pixel's Gaussian is not compared
 FAR = 0.06  # such a difference from which on the Gaussians' colours count
-OTHER = 0.75  # share of a photo's pixels that differ, from which on it does not show the scene
+# Share of a photo's pixels that differ, from which on it does not show the scene; the same of those that are not of one
+# colour, as masks and bands are: 0.28 to 0.53 of the photos of other views.
+OTHER, OTHER_TEXTURED = 0.75, 0.25
+SAME = 2.5 / 255  # range of one colour
 SIDE, DRAWN_SIDE, EDGES_SIDE = 192, 96, 48  # pixels of the longer side for tones, the same of drawings, and for edges
 SAMPLES = 1 << 17  # Gaussians that are drawn
 SWAPPED, MIN_SWAP = 0.75, 0.01  # difference with channels reversed, of that without; and by how much it is less
@@ -78,7 +81,7 @@ def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]
     changes = find_tones(small, names)
     if scene.aligned:
         covers, pictures = _find_covers(scene, changes)
-        odd = np.flatnonzero(covers.mean((1, 2)) > OTHER).tolist()
+        odd = [view for view in range(len(scene)) if _is_other(scene.images[view], covers[view])]
     else:
         covers, pictures = np.zeros(scene.images.shape[:3], bool), None
         odd = odd_photos(_mend_small(small, changes))
@@ -90,7 +93,7 @@ def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]
         most = 100 * max(float(covers[view].mean()) for view in covered)
         note(
             f"{len(covered)} of {len(scene)} photos show in part what their Gaussians do not (up to {most:.0f} % of a"
-            " photo: a mask, a mark, a finger, another view?): the Gaussians' colours take its place:"
+            " photo: a mask, a mark, a finger, or the photo of another camera?): the Gaussians' colours take its place:"
             f" {list_names(names, covered)}"
         )
     if odd and not _leave_out(scene, odd):
@@ -99,6 +102,15 @@ def compare_photos(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]
     if scene.masks is not None:
         covers |= ~scene.masks
     return _change(scene, changes, covers, pictures), tuple(view for view in range(len(scene)) if view not in odd)
+
+
+def _is_other(photo: np.ndarray, cover: np.ndarray) -> bool:
+    """Return whether so much of a photo ``[h,w,3]`` differs that it shows something else, or black."""
+    if cover.mean() <= OTHER_TEXTURED:
+        return False
+    square = np.ones((3, 3), np.uint8)
+    spread = _over_channels(np.maximum, cv2.dilate(photo, square) - cv2.erode(photo, square))
+    return bool(cover.mean() > OTHER or (cover & (spread > SAME)).mean() > OTHER_TEXTURED)
 
 
 def _leave_out(scene: PicturedScene, odd: Sequence[int]) -> bool:

@@ -125,7 +125,8 @@ def find_scene_files(
     if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
         check_file(path)
         own = path if _HOLDS_VIEWS(path) else None
-        return SceneFiles(path, _named(cameras) or own, _named(images) or (own if cameras is None else None))
+        photos = _named(images) or (own if cameras is None else None)
+        return SceneFiles(path, _named(cameras) or own, photos, _mask_folder(masks))
     plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
@@ -157,15 +158,20 @@ def find_scene_files(
         if folder.name == SCENES_PLACE:
             folders = [place / ply.stem for place in folders] + folders
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
-    mask_path = _named(masks)
-    if mask_path is not None and not mask_path.is_dir():
-        raise SceneError(mask_path, "expected a folder of masks, found a file")
+    mask_path = _mask_folder(masks)
     if mask_path is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies)
+
+
+def _mask_folder(path: StrPath | None) -> Path | None:
+    named = _named(path)
+    if named is not None and not named.is_dir():
+        raise SceneError(named, "expected a folder of masks, found a file")
+    return named
 
 
 def _depths_cameras(path: Path) -> Path:

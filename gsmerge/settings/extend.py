@@ -22,9 +22,9 @@ class ExtendOptions(Settings):
 
 
 def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendOptions]:
-    """Make the settings of a batch: those given, else of a draft without a fit; raise ValueError for unknown ones."""
+    """Make the settings of a batch: those given, else those of a draft; raise ValueError for unknown ones."""
     names = ExtendOptions.__dataclass_fields__.keys()
-    given = {"effort": "draft", "fit": "none"} | dict(settings)
+    given = {"effort": "draft"} | dict(settings)
     extend_options = ExtendOptions(**{name: given.pop(name) for name in names if name in given})
     options = CompactOptions().with_settings(given)
     if options.budget.levels > 1:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
 from gsmerge.runtime.record import Progress
-from gsmerge.settings.extend import batch_settings
+from gsmerge.scene.read import as_scene
+from gsmerge.settings.extend import SUFFIX, batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
@@ -22,7 +24,7 @@ def extend_state(
 ) -> tuple[State, BatchReport]:
     """Add a batch of views to a state, which is not changed; None: begin one.
 
-    ``settings``: those of a draft by default, see :func:`gsmerge.settings.extend.batch_settings`; with
+    ``settings``: those of a draft by default, without a fit where each Gaussian has a pixel; with
     ``recipe="paper"`` the first batch begins Feature Gaussians, and later ones go on with its networks. Raises
     ValueError if a setting is unknown, out of range, or impossible for the state or the scene.
     """
@@ -36,7 +38,8 @@ def extend_state(
         options, _ = batch_settings({"recipe": "paper", "effort": "default"} | dict(settings))
         made["features"], report = extend_features(features, scene, options, progress=progress)
     else:
-        made["scene"], report = extend(scene_before, scene, *batch_settings(settings), progress=progress)
+        usual = {"fit": "none"} if scene.aligned else {}  # the photos are fitted to in the end
+        made["scene"], report = extend(scene_before, scene, *batch_settings(usual | dict(settings)), progress=progress)
     about |= {"batches": [*about.get("batches", []), report.numbers]}
     about |= {"pictures": sorted({*about.get("pictures", []), report.pictures})}
     return State(about, **made), report
@@ -99,9 +102,9 @@ class Compactor:
         """Numbers of every batch so far; see :class:`gsmerge.states.extend.BatchReport`."""
         return () if self._state is None else tuple(self._state.about["batches"])
 
-    def extend(self, scene: Scene, *, progress: Progress | None = None) -> BatchReport:
+    def extend(self, scene: Scene | StrPath, *, progress: Progress | None = None) -> BatchReport:
         """Add a batch of views in the world of the earlier ones; see :func:`gsmerge.states.extend.extend`."""
-        self._state, report = extend_state(self._state, scene, self._settings, progress=progress)
+        self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
 
     def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:
@@ -132,7 +135,9 @@ class Compactor:
         """Write the state to a file.
 
         Raises:
-            ValueError: If there was no batch yet.
+            ValueError: If there was no batch yet, or the name does not end in ``.gsm``.
             SceneError: If the file exists or cannot be written.
         """
+        if Path(path).suffix.lower() != SUFFIX:
+            raise ValueError(f"{path}: expected a name that ends in {SUFFIX}")
         save_state(path, self.state, overwrite=overwrite)

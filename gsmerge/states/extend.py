@@ -16,11 +16,14 @@ from gsmerge.facts.exposure import camera_distances
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.geometry import camera_centres
+from gsmerge.measure.coverage import shares_inside
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
+
+SAMPLES, SEEN = 10_000, 0.02  # earlier Gaussians that are looked up in new views; share that one sees, at the least
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,10 @@ def extend(
         prepared = method.prepare(scene.numpy(), options.prepare)
         result = compact_prepared(prepared, method, options)
     gaussians, views = result.gaussians.numpy(), _keep_pictures(prepared)
+    notes = [text for text in result.report.notes if text != result.report.worse]  # that is for results
     if before is not None:
+        if len(views) and max(shares_inside(replace(views, gaussians=before.gaussians), SAMPLES)) < SEEN:
+            notes.append("no view of this batch sees the earlier Gaussians: are they in one world?")
         gaussians, views = _join_gaussians(before.gaussians, gaussians), _join_views(before, views)
     joined = replace(subset(views, choose_far(views.cameras, extend_options.max_views)), gaussians=gaussians)
     report = BatchReport(
@@ -87,7 +93,7 @@ def extend(
         pictures=prepared.reference.name,
         seconds=result.report.seconds,
         choices=result.report.choices,
-        notes=tuple(text for text in result.report.notes if text != result.report.worse),  # that is for results
+        notes=tuple(notes),
         options=options.to_dict() | asdict(extend_options),
     )
     return joined, report
@@ -122,19 +128,21 @@ def _join_views(first: Scene, second: Scene) -> Scene:
     if images.shape[2:0:-1] != size:
         images = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
         cameras = resize_cameras(cameras, *size)
-    names, taken = [], set(first.names)
-    for name in second.names:
-        number = 2
-        while name in taken:
-            name, number = f"{number}-{name.split('-', 1)[-1] if number > 2 else name}", number + 1
-        names.append(name)
-        taken.add(name)
     return replace(
         first,
         cameras=concat_cameras(first.cameras, cameras),
         images=np.concatenate([first.images, images]),
-        names=(*first.names, *names),
+        names=number_names(first.names, second.names),
     )
+
+
+def number_names(before: tuple[str, ...], names: tuple[str, ...]) -> tuple[str, ...]:
+    """Append names of views to those before; one that is taken gets a number in front."""
+    all_names = list(before)
+    for name in names:
+        numbered = (f"{number}-{name}" for number in range(2, len(all_names) + 3))
+        all_names.append(name if name not in all_names else next(other for other in numbered if other not in all_names))
+    return tuple(all_names)
 
 
 def choose_far(cameras: Cameras, count: int) -> list[int]:

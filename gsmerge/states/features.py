@@ -35,7 +35,7 @@ from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, refine
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.states.extend import BatchReport
+from gsmerge.states.extend import BatchReport, number_names
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Scene
 
 SAMPLE_STEP = 8  # pixels between the samples of a view along each axis
@@ -72,6 +72,7 @@ class FeatureState:
     frame: Frame  # from canonical to world
     networks: NetworkWeights
     checkpoint: str = ""  # the name by which they were given
+    names: tuple[str, ...] = ()  # of the views
 
     def __len__(self) -> int:
         return len(self.refined)
@@ -130,7 +131,9 @@ def extend_features(
     for name in options.compact_only:
         raise UsageError(f"{name}: goes with a whole scene, not with Feature Gaussians of several batches")
     if options.budget.budget is not None:
-        raise UsageError(f"budget {options.budget.budget}: expected superpixels, of which compact makes k Gaussians")
+        raise UsageError(
+            f"budget {options.budget.budget}: recipe paper takes superpixels=NUMBER; compact --k decides the rest"
+        )
     if options.fit.fit != "none":
         raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
     options = replace(options, prepare=replace(options.prepare, poses="fixed", exposure="fixed"))
@@ -161,7 +164,10 @@ def extend_features(
         **numbers, num_gaussians=len(made), num_kept=0, pictures=prepared.reference.name, seconds=record.seconds,
         choices=record.choices | plan.network_facts, notes=tuple(record.notes), options=options.to_dict(),
     )  # fmt: skip
-    return replace(made, checkpoint=options.checkpoint), report
+    names = prepared.input_scene.names
+    views = tuple(names[prepared.repeated.index(view)] for view in range(len(pictured)))
+    names = views if state is None else number_names(state.names, views)
+    return replace(made, checkpoint=options.checkpoint, names=names), report
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:

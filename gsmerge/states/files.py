@@ -14,16 +14,19 @@ from zipfile import ZipFile
 import numpy as np
 
 from gsmerge.compaction.files import read_input
+from gsmerge.compaction.placement import add_views
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_output, output_format, write_gaussians
+from gsmerge.io import atomic_output, atomic_outputs, output_format, write_gaussians
 from gsmerge.io.archives import new_member
+from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.write import lost_harmonics
 from gsmerge.io.locks import lock_folder
-from gsmerge.report import document_head, file_sha256, seconds_document, seconds_line
+from gsmerge.report import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, peak_memory
 from gsmerge.runtime.record import Progress
+from gsmerge.scene.content_hash import content_hash, read_files
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.settings.extend import batch_settings
@@ -60,12 +63,12 @@ def extend_file(
     except ValueError as error:
         raise UsageError(str(error)) from error
     state = None if identity is None else load_state(path)
-    sha256 = file_sha256(*files.plys)
+    sha256 = content_hash(read_files(files))
     known = [] if state is None else [batch.get("sha256") for batch in state.about["batches"]]
     document = {**document_head(), "input": {"path": str(files.ply), "sha256": sha256}}
     if sha256 in known:
         place = {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(known)}
-        note = f"{files.ply}: left out, as it is batch {known.index(sha256) + 1} of {path.name} already"
+        note = f"{files.ply}: left out, as all its files are batch {known.index(sha256) + 1} of {path.name} already"
         return document | {"left_out": True, "state": place, "notes": [note]}
     with ExitStack() as until_renamed, atomic_output(path, overwrite=identity is not None) as temporary:
         loaded = perf_counter()
@@ -123,11 +126,12 @@ def decode_file(
     options: DecodeOptions,
     *,
     normals: bool = True,
+    viewer_cameras: bool = True,
     overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Decode the Feature Gaussians in a ``.gsm``, write Gaussians to a file, and return the report as plain JSON types.
+    """Decode the Feature Gaussians in a ``.gsm`` into a file, with the cameras beside it; return the report.
 
     ``dry_run``: write nothing. Raises SceneError if a file cannot be read or written, UsageError for a K that the
     networks do not make.
@@ -143,7 +147,9 @@ def decode_file(
         most = options.max_k * len(features)
         return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}, "notes": []}
     read = perf_counter()
-    with atomic_output(out, overwrite=overwrite) as temporary:
+    cameras_path = viewer_cameras_path(out) if viewer_cameras else None
+    with atomic_outputs(overwrite=overwrite) as add:
+        temporary = add(out)
         gaussians, done = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "extend a new state by the scene")
@@ -152,6 +158,9 @@ def decode_file(
             temporary, gaussians, overwrite=True, comments=[RESULT_COMMENT], ending=output_format(out).ending,
             normals=normals,
         )  # fmt: skip
+        if cameras_path is not None:
+            cameras = features.frame.leave_cameras(features.cameras)
+            add_views(add, cameras_path, cameras, features.names, overwrite=overwrite)
     seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
     return document | {
         "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},

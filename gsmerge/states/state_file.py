@@ -18,6 +18,7 @@ from gsmerge.io.formats.gsm import (
     GsmFile,
     read_gsm,
     stored_cameras,
+    stored_names,
     write_gsm,
     write_scene,
 )
@@ -62,7 +63,8 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False) -> None:
     cameras, frame = features.cameras, features.frame
     arrays |= {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "merged.views": features.merged.views}
     arrays["origin"] = frame.origin
-    header = {"kind": FEATURES, "width": cameras.width, "height": cameras.height, "names": [], "unit": frame.unit}
+    header = {"kind": FEATURES, "width": cameras.width, "height": cameras.height, "unit": frame.unit}
+    header["names"] = list(features.names)
     header |= {"networks": asdict(features.networks.options), "checkpoint": features.checkpoint}
     header |= {"about": dict(state.about)}
     write_gsm(path, header, arrays, overwrite=overwrite)
@@ -138,6 +140,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=weights,
         checkpoint=str(file.header.get("checkpoint")),
+        names=stored_names(file, num_views),
     )
 
 

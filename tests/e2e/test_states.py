@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hostile.gsm_files import Spoil, cut, damaged
@@ -21,6 +22,7 @@ from scripts import load_script
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
+from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene
@@ -123,6 +125,16 @@ def test_cameras_of_one_batch(state: Path, walks: list[Path], tmp_path: Path, ru
     assert len(load_scene(state).scene) == 7
 
 
+def test_the_same_gaussians_with_other_photos_are_another_batch(
+    states: list[Path], state: Path, walks: list[Path], run: Run
+) -> None:
+    """As who forgot the photos of a batch adds them."""
+    again = Path(shutil.copytree(walks[0], state.parent / "again"))
+    shutil.rmtree(again / "images")
+    run("extend", state, again, *SMALL, code=0)
+    assert len(load_state(state).about["batches"]) == 2
+
+
 # what a state is, for the other commands: a scene
 
 
@@ -147,6 +159,22 @@ def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Pat
         run(*words, code=0)
     whole = gsmerge.read_ply(tmp_path / "whole.ply").gaussians
     assert len(whole) == len(load_state(alone))
+
+
+def test_masks_of_a_state_are_used(state: Path, run: Run) -> None:
+    masks = state.parent / "half"
+    masks.mkdir()
+    for name in read_cameras(state).names:
+        (masks / f"{Path(name).stem}.png").write_bytes(
+            cv2.imencode(".png", np.repeat(np.uint8([0, 255]), (8, 8))[:, None].repeat(24, 1))[1]
+        )
+    outcome = run("compact", state, "--masks", masks, "--effort", "draft", "-o", state.parent / "a.ply", code=0)
+    assert "masks leave out 50 %" in outcome.err
+
+
+def test_batch_takes_states(state: Path, tmp_path: Path, run: Run) -> None:
+    run("batch", state, "-o", tmp_path / "out", "--effort", "draft", "--jobs", "1", code=0)
+    assert list((tmp_path / "out").rglob("*.ply"))
 
 
 def test_a_word_makes_a_result_and_its_page(state: Path, run: Run) -> None:
@@ -182,6 +210,7 @@ def test_feature_gaussians_are_decoded(k: str, features: Path, tmp_path: Path, r
     assert document["input"]["num_gaussians"] == 7 * 24 * 16
     assert document["output"]["num_gaussians"] == len(gsmerge.read_ply(out).gaussians) <= most["num_gaussians_at_most"]
     assert set(document["seconds"]) == {"import", "read", "decode", "write"}
+    assert len(gsmerge.read_cameras(tmp_path / "a.cameras.json")) == 7
     assert "Feature Gaussians ->" in run("compact", features, *words, "--overwrite", code=0).out
 
 

@@ -94,8 +94,8 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
     header = _read_header(path, metadata)
     if kind not in (None, header["kind"]):
-        what = {SCENE: "results", FEATURES: "Feature Gaussians"}
-        raise SceneError(path, f"expected a .gsm of {what[str(kind)]}, found one of {what[header['kind']]}")
+        remedy = f"gsmerge compact {path} --k 2 makes Gaussians of them, convert arrays"
+        raise SceneError(path, "expected results in the .gsm, found Feature Gaussians", remedy)
     file, sums, found = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
     if sums != found:
         wrong = [name for name in found if not isinstance(sums, dict) or sums.get(name) != found[name]]
@@ -155,7 +155,8 @@ def read_rows(path: Path) -> StoredRows:
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
     comments = file.header["about"].get("comments")
-    stored = to_stored([Packed(n, num_higher, unpack)], "batches of views", sizes)
+    count = len(batches) if isinstance(batches := file.header["about"].get("batches"), list) else 0
+    stored = to_stored([Packed(n, num_higher, unpack)], f"{count} batch(es) of views", sizes)
     kept = copied_comments(comments if isinstance(comments, list) else ())
     return replace(stored, format="binary little-endian", comments=kept, notes=_picture_notes(file.header["about"]))
 
@@ -178,13 +179,20 @@ def holds_views(path: Path) -> bool:
 def read_views(source: CameraSource) -> StoredCameras:
     """Read the cameras of a ``.gsm``, with the pictures of results."""
     file = read_gsm(source.path)
-    cameras, names = stored_cameras(file), file.header["names"]
-    if len(names) != len(cameras) or not all(isinstance(name, str) for name in names):
-        raise file.error(f"names: expected one of each of {len(cameras)} views, found others")
+    cameras = stored_cameras(file)
+    names = stored_names(file, len(cameras))
     size = cameras.width, cameras.height
     images = file.array("images", np.uint8, len(cameras), cameras.height, cameras.width, 3)
     views = [StoredView(*view, size) for view in zip(names, cameras.viewmats, cameras.Ks, strict=True)]
     return StoredCameras(views, images, "none")
+
+
+def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
+    """Return the names of a file's views."""
+    names = file.header["names"]
+    if len(names) != num_views or not all(isinstance(name, str) for name in names):
+        raise file.error(f"names: expected one of each of {num_views} views, found others")
+    return tuple(names)
 
 
 def stored_cameras(file: GsmFile) -> Cameras:

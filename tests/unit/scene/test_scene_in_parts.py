@@ -16,8 +16,7 @@ from gsmerge.cli import main
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
-from gsmerge.report import file_sha256
-from gsmerge.scene.content_hash import read_files
+from gsmerge.scene.content_hash import content_hash, read_files
 from gsmerge.scene.files import find_scene_files
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.settings.compact import CompactOptions
@@ -124,7 +123,7 @@ def test_a_state_is_of_all_parts(tmp_path: Path, tiny: Tiny) -> None:
     folder = split(tmp_path, tiny, ["view_0.ply", "view_1.ply", "view_2.ply"], [280, 560])
     assert main(["extend", str(folder / "scene.gsm"), str(folder), "--set", "superpixels=20%", "-q"]) == 0
     (batch,) = load_state(folder / "scene.gsm").about["batches"]
-    assert batch["sha256"] == file_sha256(*find_scene_files(folder).plys)
+    assert batch["sha256"] == content_hash(read_files(find_scene_files(folder)))
     assert batch["num_input"] == len(tiny.gaussians)
 
 

@@ -101,6 +101,31 @@ def test_gaussians_without_pixels_and_photos_keep_renders(room: Scene) -> None:
     assert scene_of(compactor).images is not None
 
 
+def test_a_batch_without_pixels_is_compacted_too(room: Scene) -> None:
+    """With a fit to its photos: without one, no number would do."""
+    rows = Scene(room.gaussians, room.cameras, room.images, None, room.names)
+    compactor = Compactor(checkpoint="none")
+    report = compactor.extend(rows)
+    assert report.num_new < 0.7 * report.num_input
+    assert report.options["fit"] == "full"
+    assert Compactor(checkpoint="none").extend(room).options["fit"] == "none"
+
+
+def test_a_batch_that_sees_nothing_of_the_others_is_noted(room: Scene) -> None:
+    turned = room.cameras.viewmats.copy()
+    turned[:, [0, 2]] *= -1
+    elsewhere = scenes.make_scene(scenes.room(), scenes.arc(2, 48, 36), noise=0.005)
+    turn = np.diag([-1.0, 1.0, -1.0])
+    moved = replace(
+        elsewhere,
+        gaussians=replace(elsewhere.gaussians, means=(elsewhere.gaussians.means @ turn).astype(np.float32)),
+        cameras=replace(elsewhere.cameras, viewmats=turned[:2]),
+    )
+    compactor = fed(scenes.take_views(room, range(3)))
+    assert "one world" not in " ".join(compactor.extend(scenes.take_views(room, range(3, 6))).notes)
+    assert "one world" in " ".join(compactor.extend(moved).notes)
+
+
 def test_a_batch_without_cameras_adds_gaussians_alone(room: Scene) -> None:
     alone = Scene(room.gaussians, room.cameras[[]], None, None, ())
     only, after = fed(alone), fed(scenes.take_views(room, range(3)), alone)
@@ -172,6 +197,8 @@ def test_wrong_use(room: Scene) -> None:
             call()
     with pytest.raises(ValueError, match="recipe"):
         compactor.decode(k=1)
+    with pytest.raises(ValueError, match=r"\.gsm"):
+        compactor.save("a.ply")
     with pytest.raises(ValueError, match="unknown setting 'moods'"):
         Compactor(moods=3)
     with pytest.raises(ValueError, match="levels"):
