@@ -129,7 +129,7 @@ class CountSearch:
         count, limits = self.best.count or 0, self.plan.limits
         if not self.plan.keeps_input or count <= limits.default:
             return []
-        kept = f"kept {count:,} of {limits.num_input:,} Gaussians"
+        kept = f"kept {len(self.best.gaussians):,} of {limits.num_input:,} Gaussians"
         short = f"be below {self.plan.target_psnr:g} dB from it"
         good = f"are {self.plan.target_psnr:g} dB from the input or better"
         if not self.rendered:
