@@ -175,7 +175,8 @@ def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     if covers.any() or not inside.all():
         with record_part(silent=True):
             colored = add_row_colors(scene)
-        pictures, known = colored.images, inside if colored.masks is None else inside & colored.masks
+        pictures, known = colored.images, scene.stored & inside  # what spills over from beside says nothing
+        known = known if colored.masks is None else known & colored.masks
         covers = differ(pictures, known) & differ(_draw_own(scene), known)
     return covers, pictures
 
