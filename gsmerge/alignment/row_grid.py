@@ -159,7 +159,7 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
         return 1, []
     starts = np.linspace(0, count - lags[-1] - 1, _STEPS).astype(int)
     starts = starts[valid[starts]]
-    steps = np.abs(means[starts + lags[:, None]] - means[starts]).sum(2)
+    steps = np.abs(means[starts + lags[:, None]].astype(np.float64) - means[starts]).sum(2)
     lengths = np.median(steps, 1) if np.isfinite(steps).all() else np.array(list(map(_median, steps)))
     fastest = int(lags[np.argmax(lengths <= _AS_SHORT * lengths.min())])
     segment = 1 << min(_SEGMENT, count - fastest).bit_length() - 1
