@@ -118,7 +118,7 @@ def _join_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
 
 
 def _join_views(first: Scene, second: Scene) -> Scene:
-    """Concatenate views, at the size of the first; a name that is taken gets the number of the batch before it."""
+    """Concatenate views, at the size of the first; a name that is taken gets a number in front."""
     if len(second) == 0 or len(first) == 0:
         return first if len(second) == 0 else second
     size = first.cameras.width, first.cameras.height

@@ -150,13 +150,14 @@ def extend_features(
         pooled = encode(pictured, members, segmentation.groups)
         features = correct(pooled, members, cameras, context, weaken=False)
         samples = sample_views(members, cameras, state)
-        saliency = group_saliency(features, members, scene_saliency(pictured.images))
+        corners = scene_saliency(pictured.images)
         if state is None:
             merged = merge(features, match(features, plan.match), context)
-            of_merged = group_saliency(merged, members, scene_saliency(pictured.images))
-            made = _refine(merged, context, of_merged, samples, prepared.frame, plan.unseen)
+            saliency = group_saliency(merged, members, corners)
+            made = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
         else:
             _check_degree(state, scene)
+            saliency = group_saliency(features, members, corners)
             made = _join(state, features, saliency, context, samples, plan.match)
             made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
     numbers = {"num_views": len(pictured), "num_input": scene.num_gaussians, "num_new": len(features)}
@@ -215,12 +216,12 @@ def _refine(
     refined = refine(merged, context)
     with stage("decode"):
         described = context.describe(refined)
-        traced = context.trace(refined) if isinstance(context, _JoinContext) else (None, np.diff(refined.starts))
+    num_members = context.trace(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
     return FeatureState(
         merged=_without_members(merged),
         refined=_without_members(refined),
         views=described.views,
-        num_members=traced[1],
+        num_members=num_members,
         saliency=saliency,
         group=np.asarray(described.group),
         samples=samples,

@@ -154,8 +154,8 @@ def read_rows(path: Path) -> StoredRows:
         return Columns(part.means, part.quats, log_scales, part.opacities, part.sh0[:, 0], part.shN)
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
-    comments = file.header["about"].get("comments")
-    count = len(batches) if isinstance(batches := file.header["about"].get("batches"), list) else 0
+    comments, batches = (file.header["about"].get(name) for name in ("comments", "batches"))
+    count = len(batches) if isinstance(batches, list) else 0
     stored = to_stored([Packed(n, num_higher, unpack)], f"{count} batch(es) of views", sizes)
     kept = copied_comments(comments if isinstance(comments, list) else ())
     return replace(stored, format="binary little-endian", comments=kept, notes=_picture_notes(file.header["about"]))
