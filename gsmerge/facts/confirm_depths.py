@@ -1,0 +1,88 @@
+"""Aligned scene -> how much of its depth other views confirm: what says before a fit whether it can succeed.
+
+Each pixel's Gaussian is looked up in the other views, and the Gaussian found there is drawn back: the depth is confirmed
+where the two agree, and contradicted where more views see through it than confirm it. Where no other view looks, it is
+alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.geometry import camera_depths, nearest_views, project
+from gsmerge.kernels.elementary import log
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+SAMPLES = 1200  # pixels of a view
+NEIGHBORS = 16  # nearest other views in which they are looked up
+REACH = 1 / 120  # of the longer side: distance to which a pixel is found again
+SAME = 0.05  # logarithm of two depths of one surface
+TINY = 1e-9  # canonical units, least depth
+# Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
+POOR, LONELY = 0.5, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Shares of the pixels of a scene by what other views say of their depth."""
+
+    confirmed: float  # by at least one view, and by no fewer than see through it
+    contradicted: float  # more views see through it than confirm it
+    alone: float  # no other view looks there
+    confirmed_by_view: tuple[float, ...]  # the first, of each view
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the shares of the scene, for reports."""
+        return {name: round(getattr(self, name), 4) for name in ("confirmed", "contradicted", "alone")}
+
+    @property
+    def doubt(self) -> str | None:
+        """Why a result will be poor and what would help, in one sentence; None where depth is sound."""
+        if self.confirmed >= POOR:
+            return None
+        problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
+        if self.alone > LONELY:
+            cause = f"{100 * self.alone:.0f} % are seen by no other view: the photos are too few or too far apart"
+            return f"{problem}, and {cause}; more photos between these would help most"
+        return f"{problem}, though others look at them: the depth is wrong; an export with better depth would help most"
+
+
+def confirm_depths(scene: Scene) -> Agreement | None:
+    """Measure how far the views of a scene confirm each other's depth; None with fewer than two or without pixels."""
+    views = len(scene)
+    if not scene.aligned or views < 2 or not scene.valid.any():
+        return None
+    means, centres = scene.gaussians.means.reshape(views, -1, 3), scene.cameras.centres
+    cameras, valid = scene.cameras, scene.valid.reshape(views, -1)
+    width, height = cameras.width, cameras.height
+    reach = REACH * max(width, height)
+
+    def count(view: int) -> np.ndarray:
+        rows = np.flatnonzero(valid[view])
+        rows = rows[len(rows) // (2 * SAMPLES) :: max(1, len(rows) // SAMPLES)]
+        points, pixels = means[view, rows].astype(np.float64), np.stack([rows % width, rows // width], 1) + 0.5
+        others = nearest_views(centres, view)[:NEIGHBORS]
+        places, depths = project(points, cameras[others])
+        inside = (depths > TINY) & (places > 0).all(2) & (places < (width, height)).all(2)
+        same, through = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
+        for other, place, depth, seen in zip(others, places, depths, inside, strict=True):
+            column, row = place[seen].astype(np.int64).T
+            there = row * width + column
+            known = valid[other, there]
+            ids, there = np.flatnonzero(seen)[known], there[known]
+            surface = means[other, there].astype(np.float64)
+            (back,), (ahead,) = project(surface, cameras[[view]])
+            away = np.where(ahead > TINY, np.sqrt(((back - pixels[ids]) ** 2).sum(1)), np.inf) / reach
+            behind = log(depth[ids] / np.maximum(camera_depths(surface, cameras.viewmats[other]), TINY))
+            agrees = (away < 1) & (np.abs(behind) < SAME)
+            same[ids] += agrees
+            through[ids] += ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (away > 2)))
+        confirmed = (same > 0) & (same >= through)
+        return np.array([len(rows), confirmed.sum(), (through > same).sum(), (~inside.any(0)).sum()])
+
+    counts = np.stack(parallel_map(count, range(views)))
+    shares = counts[:, 1:].sum(0) / counts[:, 0].sum()
+    return Agreement(*map(float, shares), tuple((counts[:, 1] / np.maximum(counts[:, 0], 1)).tolist()))
