@@ -12,7 +12,8 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.formats import arrays
 
-_MOST_NAMES = 6  # that a note lists of one kind
+UNUSED = "not used: "  # how the note of a file begins
+_MOST_NAMES, _LONGEST = 6, 60  # names that a note lists of one kind, and characters of each
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 
 
@@ -89,7 +90,7 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     parts = [f"{_list(names)} ({kind.what}: {kind.effect})" for kind, names in found.items() if kind and kind.what]
     parts += [f"{_list(found[None])} (unknown)"] if None in found else []
     parts += [f"{_list(layers)} (more Gaussians)"] if layers else []
-    return (f"not used: {'; '.join(parts)}",) if parts else ()
+    return (UNUSED + "; ".join(parts),) if parts else ()
 
 
 def _check_types(path: Path, row: np.dtype[np.void]) -> None:
@@ -105,4 +106,4 @@ def _check_types(path: Path, row: np.dtype[np.void]) -> None:
 
 def _list(names: Sequence[str]) -> str:
     more = len(names) - _MOST_NAMES
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+    return ", ".join(name[:_LONGEST] for name in names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
