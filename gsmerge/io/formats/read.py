@@ -106,10 +106,7 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 
 
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements unused.
-
-    Notes name those that change what is drawn; ``filter_3D`` is worked in. Files in which Gaussians come and go are
-    refused.
+    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, ``filter_3D`` worked in, others unused.
 
     Colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]) where the harmonics of degree 0 are
     missing. Of two scales, as 2D Gaussians have, the third is a thousandth of the smaller one.
