@@ -168,11 +168,14 @@ class Totals:
     num_output: int = 0  # Gaussians in their results
     unmet: int = 0  # results that miss their target
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
+    unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Count the record of one scene."""
+        from gsmerge.io.formats.columns import UNUSED
+
         self.counts[record["status"]] += 1
         report = record["report"]
         worse = report["worse"] if report else record.get("worse")
@@ -181,6 +184,8 @@ class Totals:
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
+            unused = [note for note in report["notes"] if note.startswith(UNUSED)]
+            self.unused += [(record["scene"], note.removeprefix(UNUSED)) for note in unused]
             self.num_input += report["input"]["num_gaussians"]
             self.num_output += report["output"]["num_gaussians"]
             self.unmet += bool(report["unmet"])
@@ -190,13 +195,14 @@ class Totals:
     def lines(self, columns: int | None = None) -> list[str]:
         """Write a table of the results, ``columns`` wide, what is worse, what failed, and a line of totals."""
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
+        from gsmerge.io.formats.columns import UNUSED
         from gsmerge.report import text_table
 
         header = ("result", "Gaussians", "of", "kept", "dB before", "dB after", "seconds")
         lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 6, 4, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        for status, reasons in (("worse", self.worse), (FAILED, self.failed)):
+        for status, reasons in ((UNUSED[:-2], self.unused), ("worse", self.worse), (FAILED, self.failed)):
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
         counts = [f"{self.counts[x]:,} {x}" for x in (DONE, SKIPPED, FAILED) if self.counts[x] or x == DONE]

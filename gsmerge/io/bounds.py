@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
+from gsmerge.io.first_bytes import check_first_bytes
 from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # of a camera file, far more than any has
@@ -94,7 +95,7 @@ def read_errors(path: StrPath) -> Iterator[None]:
 
 
 def check_file(path: Path) -> int:
-    """Return the size of a file in bytes; SceneError if it is missing, a folder, a pipe or a device."""
+    """Return the size of a file in bytes; SceneError if it is missing, no file, or not what its name says."""
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
@@ -105,6 +106,7 @@ def check_file(path: Path) -> int:
         raise SceneError(path, "expected a file, found a folder")
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
+    check_first_bytes(Path(path), status.st_size)
     return status.st_size
 
 

@@ -122,16 +122,17 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     report = {
         "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
         "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None,
-        "choices": {},
+        "choices": {}, "notes": ["of no weight"],
     }  # fmt: skip
     for number in range(300):
         totals.add(record("done", f"{number}", f"{number}.ply", report=report))
         totals.add(record("failed", f"{number}", f"{number}.ply", error="no"))
         totals.add(record("skipped", f"{number}", f"{number}.ply"))
-    totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few"}))
+    totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few", "notes": ["not used: t (time)"]}))
     *table, last = totals.lines()
     assert table[0].split() == ["result", "Gaussians", "of", "kept", "dB", "before", "dB", "after", "seconds"]
-    assert len(table) == 1 + 20 + 1 + 20 + 1
+    assert len(table) == 1 + 20 + 1 + 1 + 20 + 1
+    assert "not used: x: t (time)" in table
     assert [line for line in table if "more" in line] == ["... and 281 more", "... and 280 more failed"]
     counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"

@@ -25,6 +25,7 @@ SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of the former, in nerfstudio's files and 4DGT's
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+FILTER = "filter_3D"  # of Mip-Splatting: the standard deviation by which scales grow
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of a compressed PLY instead
 REQUIRED = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
 _EXACT = 1e-5  # by which a number that turns harmonics may differ from a whole one that it is

@@ -21,6 +21,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, check_file, read_budget
 from gsmerge.io.formats import arrays
+from gsmerge.io.formats.columns import check_columns
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.types import Gaussians
@@ -33,7 +34,6 @@ MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infi
 BLOCK_BYTES = 1 << 19  # of file rows converted at a time: they stay in the cache from the first column to the last
 
 MAX_HEADER_BYTES = 1 << 20
-_TENSORS_START = 1 << 10  # bytes of a file of torch.save in which its first member is named
 MAX_LINE = 1 << 20  # characters of a row of text: its words take many times as much memory
 MAX_LIST_VALUES = 1_000_000  # of elements with lists, which are read one value at a time
 _LIST_BYTES = 140  # of memory for each of these values
@@ -51,6 +51,9 @@ def read_rows(path: Path) -> arrays.StoredRows:
     data = open_ply(path)
     compressed = _is_compressed(data)
     rows = _PACKED_ROWS(path, data) if compressed else _vertex(path, data).data
+    others = tuple(e for e in data.elements if e.name != "vertex")
+    layers = [f"element {e.name}" for e in others if {"opacity", arrays.QUATS[0]} <= {p.name for p in e.properties}]
+    unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
     linear, notes = arrays.color_columns(names) == arrays.PLAIN_COLORS[1] and not _has_log_scales(path, rows), []
@@ -65,8 +68,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
         encoding="logit" if compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
-        extra_elements=tuple(e.name for e in data.elements if e.name != "vertex"),
-        notes=tuple(notes),
+        extra_elements=tuple(e.name for e in others),
+        notes=(*notes, *unused),
         adapt=partial(_with_log_scales, linear=linear) if notes else None,
     )
 
@@ -106,6 +109,7 @@ def _vertex(path: Path, data: PlyData) -> PlyElement:
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
     missing = [name for name in arrays.REQUIRED if name not in columns | optional]
     if missing:
+        check_columns(path, vertex.data.dtype, ())  # which may say why
         remedy = "this is no Gaussian splat"
         if any(name.startswith("packed_") for name in columns):
             remedy = "it is compressed, but lacks its element 'chunk'"
@@ -168,9 +172,6 @@ def open_ply(path: Path) -> PlyData:
     try:
         with path.open("rb") as file:
             start = file.read(MAX_HEADER_BYTES)
-        if b"/data.pkl" in start[:_TENSORS_START] and start.startswith(b"PK"):
-            remedy = "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig"
-            raise SceneError(path, "expected a PLY file, found tensors of torch.save, as Lyra 1 names .ply", remedy)
         if start[:4] not in (b"ply\n", b"ply\r"):
             problem = "expected a PLY file, found one that does not start with the line 'ply'"
             raise SceneError(path, problem, "name the .ply")

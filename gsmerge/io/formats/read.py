@@ -106,7 +106,7 @@ def degree_notes(info: FileInfo) -> tuple[str, ...]:
 
 
 def read_ply(path: StrPath, *, opacity: OpacityChoice = "auto") -> GaussianFile:
-    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, extra columns and elements ignored.
+    """Read a PLY file of Gaussians: binary or ascii, any SH degree up to 4, ``filter_3D`` worked in, others unused.
 
     Colours may be red, green and blue, or r, g and b (bytes, or floats in [0, 1]) where the harmonics of degree 0 are
     missing. Of two scales, as 2D Gaussians have, the third is a thousandth of the smaller one.
@@ -179,6 +179,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
     most = arrays.most_in_memory(file_bytes)
     out = {"means": make_array((n, 3), np.float64 if wide else np.float32), "valid": np.empty(n, np.bool_)}
     out |= {name: make_array(shape, np.float32, most) for name, shape in shapes.items()}
+    out |= {arrays.FILTER: np.empty(n, np.float32)} if arrays.FILTER in names else {}
     num_clipped = num_zero_quats = first = 0
     for name, part in zip(paths, parts, strict=True):
         part_rows = slice(first, first + len(part.rows))
@@ -186,11 +187,12 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
     declared_encoding = opacity if opacity != "auto" else _declared_encoding(paths, parts, out["opacities"])
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
+    notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
     if byte_columns == arrays.NORMALS:
         _spread_low_degree(out["shN"])
-    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS}
+    used = {*arrays.REQUIRED, *arrays.color_columns(names), *arrays.NORMALS, arrays.FILTER}
     extra = tuple(name for name in names if name not in used and not name.startswith("f_rest_"))
     info = FileInfo(
         path=str(path),
@@ -211,7 +213,7 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         num_clipped_scales=num_clipped,
         num_zero_quats=num_zero_quats,
         odd_scales=_describe_odd_scales(out["means"], out["scales"], out["valid"]),
-        adapted=stored.notes,
+        adapted=(*notes, *stored.notes),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -224,7 +226,11 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
         def convert(start: int) -> tuple[int, int]:
             block = slice(start, min(start + size, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
-            counts = _convert(rows, {name: column[block] for name, column in out.items()})
+            parts = {name: column[block] for name, column in out.items()}
+            if arrays.FILTER in parts:
+                with np.errstate(all="ignore"):
+                    parts[arrays.FILTER][:] = rows[arrays.FILTER]
+            counts = _convert(rows, parts)
             if start % FREED_ROWS < size:
                 free_pages(out.values())
             return counts
@@ -373,6 +379,21 @@ def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str | None) ->
         np.add(opacities, 1, out=opacities)
         np.reciprocal(opacities, out=opacities)
     return encoding
+
+
+def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
+    """Widen Gaussians by their filter, fainter by as much as they grow, as Mip-Splatting draws them; return a note."""
+    widths, scales, most = out.pop(arrays.FILTER), out["scales"], np.float32(exp(arrays.MAX_LOG_SCALE))
+    out["valid"] &= np.isfinite(widths)
+
+    def widen(start: int) -> None:
+        block = slice(start, start + FREED_ROWS)
+        before, added = scales[block].copy(), np.minimum(np.abs(widths[block]), most)[:, None]
+        scales[block] = np.sqrt(before * before + added * added)
+        out["opacities"][block] *= (before / scales[block]).prod(1)
+
+    parallel_map(widen, range(0, len(widths), FREED_ROWS))
+    return (f"{arrays.FILTER} of Mip-Splatting is worked into the scales and opacities",)
 
 
 def _guess_encoding(opacities: np.ndarray) -> str:

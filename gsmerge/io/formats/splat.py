@@ -34,7 +34,7 @@ def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
 def read_rows(path: Path) -> StoredRows:
     """Read the Gaussians of a ``.splat``; SceneError unless it consists of whole rows of 32 bytes."""
     size = check_file(path)
-    if size == 0 or size % ROW.itemsize:
+    if size % ROW.itemsize:
         problem = f"expected a .splat of {ROW.itemsize} bytes per Gaussian, found {size} bytes"
         raise SceneError(path, problem, "copy or export it again")
     with read_errors(path):

@@ -92,9 +92,9 @@ def test_one_image_cannot_serve_two_views(tmp_path: Path) -> None:
 
 def test_what_cannot_be_read(tmp_path: Path, tiny: Tiny) -> None:
     write_images(tmp_path, tiny)
-    for data in (b"no image", b""):
+    for data, found in ((b"\0no image", "decoded"), (b"no image", "text"), (b"", "empty")):
         (tmp_path / tiny.names[1]).write_bytes(data)
-        with refuses(SceneError, "10.png", "decoded"):
+        with refuses(SceneError, "10.png", found):
             read_images(tmp_path, tiny.names)
     with pytest.raises(SceneError, match="no such"):
         read_images(tmp_path / "none", tiny.names)

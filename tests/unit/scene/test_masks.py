@@ -81,7 +81,7 @@ def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
 
 
 def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"no image")
+    (tmp_path / "a.png").write_bytes(b"\0no image")
     with pytest.raises(SceneError, match="decoded"):
         decode_mask(tmp_path / "a.png")
 

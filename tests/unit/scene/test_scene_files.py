@@ -14,7 +14,7 @@ from gsmerge.scene.files import find_scene_files
 def make(folder: Path, *names: str) -> Path:
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).touch()
+        (folder / name).write_bytes(b"\0")
     return folder
 
 

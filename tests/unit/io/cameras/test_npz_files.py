@@ -86,7 +86,7 @@ def test_npz_that_are_refused(tmp_path: Path, tiny: Tiny) -> None:
     write_npz(tmp_path / "a.npz", tiny, extrinsics=None, intrinsics=None)
     write_npz(tmp_path / "b.npz", tiny, intrinsics=np.eye(3))
     write_npz(tmp_path / "c.npz", tiny, image=tiny.images[:2])
-    (tmp_path / "d.npz").write_bytes(b"no archive")
+    (tmp_path / "d.npz").write_bytes(b"\0no archive")
     write_npz(tmp_path / "e.npz", tiny)
     data = bytearray((tmp_path / "e.npz").read_bytes())
     data[200:240] = bytes(40)  # in the first array: its checksum no longer fits

@@ -108,7 +108,7 @@ def resident(path: str) -> int:
         ("vertex 5", "vertex -5", (-5,)),
         ("property float rot_3", "property list uchar float rot_3", ("list",)),
         ("end_header\n", "", ("end of file",)),
-        ("ply\n", "plywood\n", ("'ply'",)),
+        ("ply\n", "plywood\n", ("text", "'plywood'")),
     ],
 )
 def test_headers_that_are_refused(tmp_path: Path, old: str, new: str, found: tuple[object, ...]) -> None:

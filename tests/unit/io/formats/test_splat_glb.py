@@ -20,7 +20,7 @@ from gsmerge.io import read_gaussians, write_gaussians
 
 
 @pytest.mark.parametrize(
-    ("content", "found"), [(b"", "0 bytes"), (bytes(33), "33 bytes"), (np.full(8, np.nan, "<f4").tobytes(), "NaN")]
+    ("content", "found"), [(b"", "empty"), (bytes(33), "33 bytes"), (np.full(8, np.nan, "<f4").tobytes(), "NaN")]
 )
 def test_damage_is_refused(content: bytes, found: str, tmp_path: Path) -> None:
     (tmp_path / "a.splat").write_bytes(content)

@@ -131,8 +131,8 @@ def test_without_the_program_nothing_is_written(tmp_path: Path, no_program: None
 def test_a_stand_in_is_given_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put_stand_in(tmp_path, monkeypatch)
     write_ply(tmp_path / "a.ply", corners())
-    (tmp_path / "a.ply").rename(tmp_path / "a.ksplat")
-    np.testing.assert_array_equal(read_gaussians(tmp_path / "a.ksplat").gaussians.means, corners().means)
+    (tmp_path / "a.ply").rename(tmp_path / "a.lcc")
+    np.testing.assert_array_equal(read_gaussians(tmp_path / "a.lcc").gaussians.means, corners().means)
     write_gaussians(tmp_path / "a.html", corners())
     assert (tmp_path / "a.html").read_text() == "<html>"
 
@@ -154,7 +154,7 @@ def test_a_program_that_fails_is_one_line(
     put_stand_in(tmp_path, monkeypatch, f"#!{{python}}\n{script}\n")
     with refuses(GsmergeError, tmp_path / "splat-transform", *said):
         splat_transform.run_program("a.ply", tmp_path / "b.ply")
-    (tmp_path / "a.ksplat").write_bytes(b"any")
+    (tmp_path / "a.ksplat").write_bytes(b"\0any")
     with refuses(SceneError, "a.ksplat", *said):
         read_gaussians(tmp_path / "a.ksplat")
 

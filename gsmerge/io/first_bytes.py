@@ -1,0 +1,79 @@
+"""Files that stand in the place of scenes, cameras or photos, recognised by their first bytes."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsmerge.errors import SceneError
+
+_PACKED_SCENES = (".spz", ".splat", ".sog", ".ksplat", ".npz", ".glb", ".gsm")
+_PHOTOS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin")  # endings of what is never plain text
+_START = 1 << 10  # bytes of a file that are looked at
+_DOWNLOAD = "download it again, from a browser if it needs a click or a login"
+_UNPACK = "unpack it, and name the scene that is in it"
+_AGAIN = "copy or download it again"
+
+
+@dataclass(frozen=True)
+class OtherContent:
+    """Content by which a file is refused, and what to do about it."""
+
+    what: str
+    start: str  # a pattern of a file's first bytes; its group ``quote``, if any, is shown
+    remedy: str
+    right: tuple[str, ...] = ()  # endings of files that rightly start so
+    wrong: tuple[str, ...] | None = None  # the only endings of files that do not; None: all others
+
+
+# In the order of trial
+OTHER_CONTENTS = (
+    OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
+    OtherContent(
+        "a web page",
+        r"(?is)(?:\xef\xbb\xbf)?\s*<(?:!doctype\s+html|html|head|body|script)\b"
+        r"(?:.*?<title[^>]*>\s*(?P<quote>[^<]*[^<\s]))?",
+        _DOWNLOAD,
+        right=(".html", ".htm"),
+    ),
+    OtherContent(
+        "tensors of torch.save, as Lyra 1 names .ply",
+        r"(?s)PK.*/data\.pkl",
+        "run Lyra with save_gaussians_orig: true, and name the file in gaussians_orig",
+        right=(".torch",),
+    ),
+    OtherContent("a zip archive", r"PK\x03\x04", _UNPACK, right=(".sog", ".npz", ".usdz", ".torch")),
+    OtherContent("a gzip archive", r"\x1f\x8b\x08[\0-\x1f]", _UNPACK, right=(".spz",)),
+    OtherContent("a tar archive", r"(?s).{257}ustar", _UNPACK),
+    OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
+    OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
+    OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
+    OtherContent("a PLY file", r"ply\r?\n", "give it the ending .ply", wrong=_PACKED_SCENES),
+    OtherContent(
+        "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
+        wrong=NO_TEXT,
+    ),
+)  # fmt: skip
+_PATTERNS = tuple(re.compile(row.start.encode("latin-1")) for row in OTHER_CONTENTS)
+
+
+def check_first_bytes(path: Path, size: int) -> None:
+    """Raise SceneError for a file of ``size`` bytes that cannot be what its name says, with what it is instead.
+
+    A file that cannot be read is left to its reader.
+    """
+    ending, start = path.suffix.lower(), b""
+    if size == 0 and ending in NO_TEXT:
+        raise SceneError(path, "expected content, found an empty file", _AGAIN)
+    with suppress(OSError), path.open("rb") as file:
+        start = file.read(_START)
+    for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
+        match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None
+        if match:
+            quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
+            shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
+            expected = "scene" if row.remedy == _UNPACK else f"{ending} file".strip()
+            raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

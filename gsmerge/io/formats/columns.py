@@ -1,0 +1,109 @@
+"""Columns of a PLY file beside those of Gaussians: which change what is drawn, and what becomes of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.formats import arrays
+
+UNUSED = "not used: "  # how the note of a file begins
+_MOST_NAMES, _LONGEST = 6, 60  # names that a note lists of one kind, and characters of each
+_MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
+
+
+@dataclass(frozen=True)
+class ColumnKind:
+    """Columns of one meaning."""
+
+    what: str  # they hold; empty: they change nothing that is drawn
+    names: str  # a pattern
+    effect: str = ""  # of leaving them out
+    remedy: str = ""  # files with them are refused, and this is what to do; empty: a note names them
+
+
+# In the order of trial; a column of floats that is in none is named as unknown
+COLUMN_KINDS = (
+    ColumnKind(
+        "when each Gaussian appears",
+        r"trbf_.*|(scale|scaling)_?t(_\d+)?|t_scale|(log_)?(life_?(time|span)|duration).*|(opacity|cov|sigma)_t(_\d+)?",
+        remedy=_MOMENT,  # of all times at once they are the scene at no time
+    ),
+    ColumnKind("anchors, of which a network makes Gaussians", r"f_(offset|anchor).*", remedy="save its Gaussians"),
+    ColumnKind(
+        "time and motion",
+        r"t|t_?\d+|time(stamp)?|(mu|mean|center)_t|motion.*|omega.*|rot_?[lr](_\d+)?|(angular_)?(velocity|vel|acceleration"
+        r"|acc).*|v[xyz]|(delta|d|deform|dynamic|traj|flow|poly|fourier|control|keyframe)_.*|[xyz]_?t?\d+"
+        r"|.*_t_?\d+|frames?(_\d+)?",
+        "the scene does not move",
+    ),
+    ColumnKind(
+        "materials and light",
+        r"(albedo|base_?color|diffuse|specular|spec|roughness|metal|fresnel|refl|emissi|incident|indirect|visibility"
+        r"|ambient|brdf|f_brdf|irradiance|radiance|env|asg|sg|transmi|clearcoat|occlusion|ior|f0).*|k[ads](_\d+)?"
+        r"|(ind|f_sh|f_asg)_.*",
+        "colours are those of f_dc and f_rest",
+    ),
+    ColumnKind(
+        "the shape of other primitives than Gaussians",
+        r"(beta|nu|degree|shape|kernel|sharpness|gamma|exponent|epsilon|eps|inverse_deviation|nd|hermite|sites?|skew"
+        r"|dof|hardness|edge|cutoff|truncat)(_.*)?|nu_?degree|negative.*|sb_.*",
+        "they are drawn as Gaussians",
+    ),
+    ColumnKind(
+        "",
+        r"n[xyz]|normals?_.*|red|green|blue|alpha|[rgba]|.*(label|_?ids?|class|categor|segment|instance|object|group|cluster)"
+        r"(_.*)?|(.*_)?(mask|selected|state|score|prob|conf|confidence|uncertainty|importance|contribution|weight|quality"
+        r"|error|variance|var|count|radii|radius|radii2d|depth|index|idx|generation|age|flag)(_.*)?|conf.*|max_radii2d"
+        r"|(obj|sem|semantic|feat|feature|fea|lang|language|clip|dino|sam|ins|embed|latent|f_lang|ancestry|lod|level)"
+        r".*",
+    ),
+)  # fmt: skip
+_PATTERNS = tuple(re.compile(kind.names, re.IGNORECASE) for kind in COLUMN_KINDS)
+_NUMBERS = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}  # of 1, 2 and 4 bytes
+
+
+def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> tuple[str, ...]:
+    """Return a note on columns, and elements that are ``layers``, that are not used and change what is drawn.
+
+    It is alone, or there is none. SceneError for columns without which the file is no scene, and for whole
+    numbers in the place of floats.
+    """
+    _check_types(path, row)
+    found: dict[ColumnKind | None, list[str]] = {}
+    for name in row.names or ():
+        if name in arrays.REQUIRED or name.startswith("f_rest_") or name == arrays.FILTER:
+            continue
+        kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
+        kind = next(kinds, None)
+        if kind is not None or row[name].kind == "f":
+            found.setdefault(kind, []).append(name)
+    for kind, names in found.items():
+        if kind is not None and kind.remedy:
+            problem = f"expected Gaussians to be drawn as they are stored, found {_list(names)}: {kind.what}"
+            raise SceneError(path, problem, kind.remedy)
+    parts = [f"{_list(names)} ({kind.what}: {kind.effect})" for kind, names in found.items() if kind and kind.what]
+    parts += [f"{_list(found[None])} (unknown)"] if None in found else []
+    parts += [f"{_list(layers)} (more Gaussians)"] if layers else []
+    return (UNUSED + "; ".join(parts),) if parts else ()
+
+
+def _check_types(path: Path, row: np.dtype[np.void]) -> None:
+    """Raise SceneError if the columns of Gaussians are whole numbers, but for plain colours of bytes."""
+    colors = arrays.color_columns(row.names)
+    for name in row.names or ():
+        number, used = row[name], name in (*arrays.REQUIRED, *colors, arrays.FILTER) or name.startswith("f_rest_")
+        if used and number.kind != "f" and not (number == np.uint8 and name in colors and colors != arrays.SH0):
+            kind = _NUMBERS[number.kind][number.itemsize // 2]
+            problem = f"expected {name} as float, found {kind}, as which some write half floats or places in a codebook"
+            raise SceneError(path, problem, "export it with floats")
+
+
+def _list(names: Sequence[str]) -> str:
+    more = len(names) - _MOST_NAMES
+    return ", ".join(name[:_LONGEST] for name in names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")

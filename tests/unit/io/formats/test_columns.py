@@ -1,0 +1,118 @@
+"""Columns that change what is drawn are worked in, refused, or named in one note."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from messages import names, refuses
+from plyfile import PlyElement
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_ply
+from gsmerge.io.formats.read import file_notes, read_parts
+
+from .test_read import NAMES, columns, save
+
+MOTION = tuple(f"motion_{i}" for i in range(9))
+
+
+def with_columns(path: Path, *more: str, kind: str = "<f4") -> Path:
+    old = columns(6)
+    rows = np.zeros(6, [*((name, "<f4") for name in NAMES), *((name, kind) for name in more)])
+    for name in NAMES:
+        rows[name] = old[name]
+    return save(path, rows)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("trbf_center", "trbf_scale", *MOTION), ("t", "scaling_t"), ("t", "scale_t_0", "rot_r_0"), ("t_scale",),
+        ("velocity_0", "lifespan"), ("velocity_x", "duration"), ("f_offset_0", "f_anchor_feat_0"),
+    ],
+)  # fmt: skip
+def test_gaussians_that_come_and_go_are_refused(more: tuple[str, ...], tmp_path: Path) -> None:
+    known = next(name for name in more if name.startswith(("trbf", "scal", "t_", "life", "dur", "f_off")))
+    with refuses(SceneError, "a.ply", known):
+        read_ply(with_columns(tmp_path / "a.ply", *more))
+
+
+def test_columns_are_refused_before_missing_ones(tmp_path: Path) -> None:
+    left = tuple(f"rot_l_{i}" for i in range(4))
+    rows = columns(names=(*(name for name in NAMES if name[:3] != "rot"), *left, "t_scale"))
+    with refuses(SceneError, "a.ply", "t_scale", "moment"):
+        read_ply(save(tmp_path / "a.ply", rows))
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (MOTION, (*MOTION[:6], "3 more", "motion")),
+        (("t",), ("t", "time")),
+        (("albedo_0", "roughness", "Metallic"), ("albedo_0", "roughness", "Metallic", "materials")),
+        (("beta",), ("beta", "primitives")),
+        (("nu_degree", "omega_0"), ("nu_degree", "primitives", "omega_0", "motion")),
+        (("opacity_2", "foo"), ("opacity_2", "foo", "unknown")),
+    ],
+)
+def test_unused_columns_are_in_one_note(more: tuple[str, ...], said: tuple[str, ...], tmp_path: Path) -> None:
+    ply = read_ply(with_columns(tmp_path / "a.ply", *more, "label", "semantic_0", "red", "confidence"))
+    (note,) = file_notes(ply.info)
+    assert names(note, *said)
+    assert not names(note, "label")
+    assert not names(note, "semantic_0")
+    assert ply.info.extra_columns == (*more, "label", "semantic_0", "red", "confidence")
+
+
+def test_whole_numbers_that_are_unknown_have_no_note(tmp_path: Path) -> None:
+    assert file_notes(read_ply(with_columns(tmp_path / "a.ply", "foo", kind="u1")).info) == ()
+
+
+def test_more_gaussians_in_another_element_are_named(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.ply", columns(), before=(PlyElement.describe(columns(), "sky"),))
+    assert names(file_notes(read_ply(path).info)[0], "element sky")
+
+
+def test_a_filter_widens_as_mip_splatting_does(tmp_path: Path) -> None:
+    path = with_columns(tmp_path / "a.ply", "filter_3D")
+    plain, rows = read_ply(path), columns(6)
+    old = np.zeros(6, [*rows.dtype.descr, ("filter_3D", "<f4")])
+    for name in NAMES:
+        old[name] = rows[name]
+    old["filter_3D"] = (0, 0.1, 0.5, 2, -1, np.nan)
+    save(path, old)
+    for wide in (read_ply(path), read_parts([path])):
+        squared = plain.gaussians.scales[:5].astype(float) ** 2
+        grown = squared + old["filter_3D"][:5, None].astype(float) ** 2
+        np.testing.assert_allclose(wide.gaussians.scales[:5], np.sqrt(grown), rtol=1e-6)
+        factor = np.sqrt(squared.prod(1) / grown.prod(1))
+        np.testing.assert_allclose(wide.gaussians.opacities[:5], plain.gaussians.opacities[:5] * factor, rtol=1e-5)
+        assert wide.valid.tolist() == [True] * 5 + [False]
+        assert wide.info.extra_columns == ()
+        assert names(file_notes(wide.info)[0], "filter_3D")
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "found"),
+    [("x", "<u2", "ushort"), ("scale_1", "i2", "short"), ("rot_0", "u1", "uchar"), ("opacity", "<u2", "ushort"),
+     ("f_dc_2", "<u2", "ushort"), ("f_rest_3", "u1", "uchar"), ("z", "<i4", "int")],
+)  # fmt: skip
+def test_whole_numbers_in_the_place_of_floats_are_refused(name: str, kind: str, found: str, tmp_path: Path) -> None:
+    rows = columns(4, num_rest=9)
+    rows = rows.astype([(each, kind if each == name else "<f4") for each in rows.dtype.names])
+    with refuses(SceneError, "a.ply", name, found, "float"):
+        read_ply(save(tmp_path / "a.ply", rows))
+
+
+@pytest.mark.parametrize(("kind", "right"), [("u1", True), ("<f8", True), ("<u2", False)])
+def test_plain_colours_are_bytes_or_floats(kind: str, right: bool, tmp_path: Path) -> None:
+    rows = columns(names=(*NAMES[:6], "red", "green", "blue", *NAMES[9:]))
+    rows = rows.astype([(name, kind if name in ("red", "green", "blue") else "<f4") for name in rows.dtype.names])
+    path = save(tmp_path / "a.ply", rows)
+    if right:
+        assert file_notes(read_ply(path).info) == ()
+        return
+    with refuses(SceneError, "a.ply", "red", "ushort"):
+        read_ply(path)
