@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.budget import FileSize, exact_count, file_size
 from gsmerge.errors import UsageError
+from gsmerge.facts.confirm_depths import Agreement
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
@@ -33,7 +34,6 @@ from gsmerge.settings.stages import (
     SegmentOptions,
 )
 from gsmerge.stages.assign import merge_unseen
-from gsmerge.stages.encode import measured_share
 from gsmerge.stages.segment import CountLimits, SuperpixelChoices, count_limits, has_few_rows, scene_tree
 from gsmerge.types import Gaussians, Scene
 
@@ -96,6 +96,7 @@ class Plan:
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+    new_views: bool = False  # Whether the quality of new views is estimated
     before: PhotoScore | None = None  # Of the input, where photos and not pixels decide the count
 
     @property
@@ -145,8 +146,9 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
             checkpoint = load_networks(options, size)
-        asked, options = options, resolve_budget(options, scene)
-        segment = _resolve_superpixels(options.segment, scene, EFFORTS[options.effort])
+        agreement = prepared.agreement
+        asked, options = options, resolve_budget(options, agreement)
+        segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])
         clean_options = options.clean
         if "sky" in clean_options.drops and not reference.fit_views:
             note("drop sky: no photo is used that could say where the sky is, so it stays")
@@ -192,6 +194,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
+        new_views=options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
 
@@ -372,22 +375,26 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
         )
 
 
-def resolve_budget(options: CompactOptions, scene: Scene) -> CompactOptions:
-    """Replace an automatic budget of a fit by a share, by how well the depths of several views agree; with a note."""
-    fits = options.budget.auto and options.fit.fit != "none"
-    share, why = measured_share(scene) if fits else (None, "")
-    if share is None:
+def resolve_budget(options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
+    """Replace an automatic budget of a fit by a share, by how far views confirm each other's depth; with a note."""
+    if agreement is None or not options.budget.auto or options.fit.fit == "none":
         return options
-    text = f"{100 * share:.2g}%"
+    text, why = describe_share(agreement)
     note(f"budget: {text} of the input, because {why}")
     return replace(options, budget=replace(options.budget, budget=text))
 
 
-def _resolve_superpixels(options: SegmentOptions, scene: Scene, effort: Effort) -> SegmentOptions:
+def describe_share(agreement: Agreement | None) -> tuple[str, str]:
+    """Return the share of a scene's pixels that it bears Gaussians for, as text such as "10%", and the reason."""
+    if agreement is None:
+        return SHARE, "depths of several views cannot be compared"
+    return f"{100 * agreement.share:.2g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
+
+
+def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:
     """Fill in the options of superpixels that depend on effort and scene; a note gives the reason."""
     if options.superpixels == AUTO_SHARE:
-        share, why = measured_share(scene)
-        text = SHARE if share is None else f"{100 * share:.2g}%"
+        text, why = describe_share(agreement)
         note(f"superpixels: {text} of the pixels, because {why}")
         options = replace(options, superpixels=text)
     rectangles = effort.rectangles if options.rectangles is None else options.rectangles

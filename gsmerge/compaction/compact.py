@@ -11,6 +11,7 @@ from typing import Any
 from weakref import ref
 
 from gsmerge.compaction.methods import Method, choose_method
+from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import add_target, level_counts, search_count
 from gsmerge.errors import UsageError
@@ -94,7 +95,8 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
-    return make_result(best, levels, prepared, plan, search.facts())
+    trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
+    return make_result(best, levels, prepared, plan, search.facts(), trial)
 
 
 @record_part()

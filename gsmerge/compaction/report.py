@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from gsmerge.compaction.new_views import NewViews
 from gsmerge.report import (
     document_head,
     file_sha256,
@@ -83,6 +84,7 @@ class CompactReport:
     worse: str | None = None
     covered: Covered | None = None
     psnr_reference: str | None = None
+    new_views: NewViews | None = None
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
@@ -160,6 +162,7 @@ def report_document(
         "seed": numbers["options"]["seed"],
         "choices": numbers["choices"],
         **seconds_document({**seconds_before, **report.seconds, **seconds_after}),
+        "new_views": None if report.new_views is None else report.new_views.to_dict(),
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "psnr_reference": numbers["psnr_reference"],
         "psnr_covered": numbers["covered"],

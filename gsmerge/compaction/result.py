@@ -11,6 +11,7 @@ from weakref import ReferenceType
 
 import numpy as np
 
+from gsmerge.compaction.new_views import Trial
 from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
@@ -240,6 +241,7 @@ def make_result(
     prepared: Prepared,
     plan: Plan,
     search: Mapping[str, Any],
+    trial: Trial | None = None,
 ) -> CompactResult:
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
@@ -276,7 +278,11 @@ def make_result(
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
     main = report(best, covered[0], seconds, "the result")
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
-    main = replace(main, choices=choices, notes=notes, unmet=search["unmet"])
+    new_views = None
+    if trial is not None and before is not None and main.psnr_after is not None:
+        own = (covered[0].before, covered[0].after) if covered[0] else (before, main.psnr_after)
+        new_views = trial.predict(*own, prepared.agreement)
+    main = replace(main, choices=choices, notes=notes, unmet=search["unmet"], new_views=new_views)
     coarser = tuple(
         CompactResult(
             candidate.gaussians,

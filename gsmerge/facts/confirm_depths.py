@@ -23,6 +23,9 @@ SAME = 0.05  # logarithm of two depths of one surface
 TINY = 1e-9  # canonical units, least depth
 # Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
 POOR, LONELY = 0.5, 0.2
+# Gaussians per pixel that a scene bears: most, down to a share of confirmed pixels, then falling to the fewest at another
+# one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
+MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.75, 0.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,11 @@ class Agreement:
     def to_dict(self) -> dict[str, float]:
         """Return the shares of the scene, for reports."""
         return {name: round(getattr(self, name), 4) for name in ("confirmed", "contradicted", "alone")}
+
+    @property
+    def share(self) -> float:
+        """Gaussians per pixel that the scene bears."""
+        return min(MOST, max(FEWEST, MOST * (self.confirmed - WRONG) / (SOUND - WRONG)))
 
     @property
     def doubt(self) -> str | None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
+from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.place_cameras import (
@@ -33,7 +34,7 @@ from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.images import seen_weights
-from gsmerge.runtime.record import note, record_part, stage
+from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
@@ -150,6 +151,7 @@ class Prepared:
     repeated: tuple[int, ...]  # Place in the scene of every given view
     moved: bool  # Whether views were moved to where their photos agree, before a fit or by it
     unseen: Gaussians  # Canonical Gaussians that no view sees, if they are kept
+    agreement: Agreement | None = None  # How far views confirm each other's depth; None without pixels
 
     @property
     def size(self) -> SceneSize:
@@ -200,6 +202,12 @@ def prepare(
     scene, frame = canonicalise(add_views(scene), frame)
     finish = _prepare_pixels if scene.aligned else _prepare_others
     prepared = finish(given, scene, frame, tuple(repeated), options)
+    agreement = confirm_depths(prepared.scene)
+    if agreement is not None:
+        choose(agreement=agreement.to_dict())
+        if agreement.doubt:
+            note(agreement.doubt)
+        prepared = replace(prepared, agreement=agreement)
     return _without_holes(prepared) if fill and prepared.reference.of_views else prepared
 
 

@@ -1,6 +1,6 @@
 """Groups -> Feature Gaussians: one per superpixel, analytic, corrected by the networks' encoder if any.
 
-Where the depths of the views disagree, groups start fainter, and fewer superpixels are enough.
+Where the depths of the views disagree, groups start fainter.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.pooling import Members, Moments, Rule, pool_members, scene_members
-from gsmerge.runtime.record import choose, stage
+from gsmerge.pooling import Members, Moments, Rule, pool_members
+from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene, to_float32
 
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
 # Factors on the optical depth of groups that other views see through: those at whose place no other view has its
 # surface, and those of which fewer views have it there than see through it
 ALONE, DISPUTED = 0.15, 0.39
-SAMPLES = 65536  # pixels whose depths are compared
-# Gaussians per pixel that a scene bears: most, up to a share of pixels that other views see through, then falling to
-# the fewest at another one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
-MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.18, 0.38
 
 
 def make_corrector(
@@ -109,25 +105,6 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
         members=ids,
         latents=np.zeros((count, 0), np.float32),
     )
-
-
-def measured_share(scene: Scene) -> tuple[float | None, str]:
-    """Choose Gaussians per pixel by how well the depths of the views agree (None: unknown); also return the reason."""
-    if not scene.aligned or len(scene) < 2:
-        return None, "depths of several views cannot be compared"
-    wrong = contradicted_share(scene, scene_members(scene))
-    share = min(MOST, max(FEWEST, MOST * (WRONG - wrong) / (WRONG - SOUND)))
-    choose(agreement={"share": share, "contradicted": wrong})
-    return share, f"other views see through {100 * wrong:.0f} % of the pixels"
-
-
-def contradicted_share(scene: Scene, members: Members) -> float:
-    """Return the share of sampled pixels whose Gaussian is seen through by more views than confirm it."""
-    rows = np.flatnonzero(scene.valid)
-    rows = rows[:: max(1, len(rows) // SAMPLES)]
-    views = rows // scene.pixels_per_view
-    factors = agreement_factors(members.means[rows], scene.gaussians.sh0[rows], views, members, scene.cameras)
-    return float((factors < 1).mean()) if len(rows) else 0.0
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
