@@ -21,9 +21,10 @@ from gsmerge.scene.content_hash import content_hash, digest, filled, read_files,
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
-from gsmerge.settings.reading import OpacityChoice, ReadHints
+from gsmerge.settings.reading import NONE, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import Engine
+from gsmerge.types import StrPath
 
 FIELDS = ("stem", "parent", "index", "k")
 
@@ -37,7 +38,7 @@ class BatchOptions(Settings):
     hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
     cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
         "each in it.",
-        "By default those beside each scene.")  # fmt: skip
+        "By default those beside each scene; `none`: without.")  # fmt: skip
     images: str | None = setting(None, "Folder of the photos, in the same way.")
     output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
         "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
@@ -95,7 +96,8 @@ class CompactCall:
         checkpoint = Path(self.settings.checkpoint)
         if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
             settings["checkpoint"] = file_sha256(checkpoint)
-        reading = {"opacity": self.opacity, **vars(self.hints)}
+        without = [name for name in sorted(files.named) if getattr(files, name) is None]
+        reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
         version = {"tool_version": __version__, "schema_version": SCHEMA_VERSION}
         return digest({"scene": content_hash(read_files(files)), "settings": settings, "reading": reading, **version})
 
@@ -117,8 +119,8 @@ class Job:
     call: SceneCall
     num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
     num_rest: int = 0  # columns of higher harmonics, likewise
-    cameras: Path | None = None  # None: beside the scene
-    images: Path | None = None  # likewise
+    cameras: StrPath | None = None  # None: beside the scene
+    images: StrPath | None = None  # likewise
 
     @property
     def output(self) -> str:
@@ -165,7 +167,8 @@ def find_jobs(
                     f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
-        cameras, images = (filled(template, scene) for template in (options.cameras, options.images))
+        named = options.cameras, options.images
+        cameras, images = (path if path == NONE else filled(path, scene) for path in named)
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images))
     for name in owners:
         if os.path.realpath(out / name) in inputs:
