@@ -15,6 +15,7 @@ from gsmerge.compaction.files import Outputs, compact_files, level_output
 from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
+from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import content_hash, digest, filled, read_files, stem_of
@@ -147,8 +148,10 @@ def find_jobs(
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
     line. ``results`` has the real paths of former results, which are not scenes. SceneError if something does not exist
-    or has no scene; UsageError if two scenes would be written to one file, or one over another.
+    or has no scene, or networks are unusable; UsageError if two scenes would be written to one file, or over another.
     """
+    if options.settings.checkpoint not in CHECKPOINTS:
+        load_checkpoint(options.settings.checkpoint)  # once, and not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
     jobs: list[Job] = []
     owners: dict[str, str] = {}

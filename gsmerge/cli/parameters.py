@@ -358,10 +358,11 @@ _TABLE = (
     panel(
         INPUT,
         option("cameras", Path, "Camera file or COLMAP folder: transforms.json, cameras.json, results.npz, ... "
-               "Default: beside the .ply, where they belong to it; none: leave them out.", parser=named_or_none),
-        option("images", Path, "Folder of the input photos; default and none as for --cameras.", parser=named_or_none),
+               "Default: beside the .ply; none: without.", parser=named_or_none),
+        option("images", Path, "Folder of the input photos. Default: beside the .ply; none: without.",
+               parser=named_or_none),
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
-               "beside the photos, and where these are transparent; none: the latter alone.", parser=named_or_none),
+               "beside the photos, and where these are transparent; none: without.", parser=named_or_none),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
@@ -394,7 +395,7 @@ _TABLE = (
         option("output", Path, "", "--output", "-o"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
-               "than the input does, by more than .5 dB, or cameras or photos beside it are left out."),
+               "than the input does, by more than .5 dB, or cameras or photos do not fit."),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

@@ -143,11 +143,10 @@ def read_scene(
     Args:
         path: The ``.ply``, or a folder that has it.
         *more: Other scenes of the same place, which are joined with it in its frame (docs/guide/sharp.md).
-        cameras: Camera file or folder; None looks next to the ``.ply``, and what does not belong to it is left out
-            with a warning; "none": the scene is read without.
-        images: Folder of images, or an ``.npz`` that holds them; None and "none" as for cameras.
-        masks: Folder of images named as the photos, dark where a photo does not count; None: ``masks`` beside the
-            photos, and where these are transparent; "none": the latter alone.
+        cameras: Camera file or folder, or "none"; None looks next to the ``.ply``, and warns if they do not fit.
+        images: Folder of images, an ``.npz`` that holds them, or "none"; None: likewise.
+        masks: Folder of images named as the photos, dark where a photo does not count, or "none"; None: ``masks``
+            beside the photos, and where these are transparent.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
@@ -156,7 +155,7 @@ def read_scene(
         The scene; its ``pixel_ids`` are None where the rows belong to no pixels.
 
     Raises:
-        SceneError: If a file is missing or damaged, or the Gaussians are not those of the named cameras' views.
+        SceneError: If a file is missing or damaged, or the Gaussians are not those of named cameras' views.
         ValueError: If an argument is none of the possible ones.
 
     Example:
@@ -256,6 +255,8 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
             is_sure = load.scene.aligned or of_photos or fewer.cameras != files.cameras or fewer.masks != files.masks
             if is_sure and ("images" not in files.named or files.images is None or load.scene.images is not None):
                 return _leave_out(load, files, why)
+    if "cameras" not in files.named:
+        _check_hints(ply, hints)
     left = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     remedy = "; ".join(filter(None, (why.remedy, f"{' and '.join(left)} reads the file alone" if left else "")))
     raise SceneError(why.path, why.problem, remedy)
@@ -330,11 +331,11 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError for rows without pixels if a hint says how they are those of pixels."""
+    """Raise SceneError for rows that are no pixels if a hint says how they are."""
     hinted = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
     hinted += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
     if hinted:
-        problem = f"expected the pixels of views with --hint {hinted[0]}, found Gaussians that belong to none"
+        problem = f"expected Gaussians that are the pixels of views with --hint {hinted[0]}, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or give the cameras that fit with --cameras")
 
 
@@ -509,6 +510,10 @@ def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadH
         else:
             pictures = stored_photos(files, camera_file) if photos else ()
             cameras = to_cameras(camera_file, photo_size(pictures))
+            from gsmerge.alignment import check_cameras  # few scenes come here
+
+            if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
+                return align_scene(ply, files, hints=hints, photos=photos)
             note = "the cameras do not fit the Gaussians and stay as their file has them"
             as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
             load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)

@@ -70,8 +70,8 @@ class CompactOptions(Settings):
         metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
         "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
-    require_checkpoint: bool = setting(False, "Networks of the package that cannot be used are an error, as a file "
-        "is, instead of a note and the analytic stages.")  # fmt: skip
+    require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
+        "analytic stages.")  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
         "Runs with one seed are bit-identical.", least=0)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
