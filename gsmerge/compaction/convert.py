@@ -139,7 +139,7 @@ def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
     except SceneError as error:
         if named is not None or path == first:
             raise
-        return None, [f"{path} is left out: {error.problem}; name what belongs to it with --cameras"]
+        return None, [f"{path} is left out: {error.problem}; name what fits, or say none"]
 
 
 def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:

@@ -273,9 +273,8 @@ def _leave_out(load: Loaded, files: SceneFiles, why: SceneError) -> Loaded:
         names.append(photos)
     known = files.ply, files.ply.parent, files.cameras, files.images, files.masks
     where = "" if why.path in map(str, known) else f"{why.path}: "
-    option, verb = "images" if names == [photos] else "cameras", "is" if names == [str(files.cameras)] else "are"
-    remedy = why.remedy or f"name what belongs to it with --{option}"
-    note = f"{' and '.join(names)} {verb} left out: {where}{why.problem}; {remedy}"
+    verb, remedy = "is" if names == [str(files.cameras)] else "are", why.remedy or "name what fits, or say none"
+    note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{why.problem}; {remedy}".split())
     return replace(load, notes=(*(text for text in load.notes if text not in said), note), left_out=note)
 
 
