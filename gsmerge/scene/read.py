@@ -243,7 +243,9 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
     :func:`read_scene`; without ``photos`` no photos are searched.
     """
     try:
-        return _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
+        load = _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
+        strange = f"the photos in {files.images} are not used: they do not show"
+        return replace(load, left_out=next((text for text in load.notes if text.startswith(strange)), None))
     except SceneError as error:
         why = SceneError(error.path, error.problem, error.remedy)  # without what it holds in memory
     of_photos = Path(why.path).suffix.lower() in IMAGE_SUFFIXES

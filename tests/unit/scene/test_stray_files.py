@@ -98,6 +98,12 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
         load_scene(folder, images=folder / "images")
 
 
+def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
+    folder = save(tmp_path, "grid")
+    write_images(folder / "images", another())
+    assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "not used")
+
+
 def test_a_damaged_photo(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid", cameras=True)
     (folder / "images" / SMOOTH.names[0]).write_bytes(b"\x89PNG nothing")
