@@ -336,7 +336,7 @@ def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
     hinted = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
     hinted += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
     if hinted:
-        problem = f"expected Gaussians that are the pixels of views with --hint {hinted[0]}, found others"
+        problem = f"expected rows that are pixels of views with --hint {hinted[0]}, found no such pixels"
         raise SceneError(ply.info.path, problem, "leave the hint out, or give the cameras that fit with --cameras")
 
 

@@ -102,7 +102,7 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
         for photo in (folder / "images").rglob("*.png"):
             photo.unlink()
     with refuses(SceneError, "scene.ply", "upright", "photos", "far cut"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder)
 
 
 def test_rows_scaled_and_shifted_again_show_their_pixels(tmp_path: Path, textured: Smooth) -> None:

@@ -171,10 +171,10 @@ def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with refuses(SceneError, "transforms.json", "20 x 14", "30 x 14", "crop"):
-        read_scene(tiny_folder, order="view-major")
+        read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "14 x 20", "swapped"):
-        read_scene(tiny_folder, order="view-major")
+        read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
 
 
 def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
