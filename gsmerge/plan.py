@@ -21,7 +21,7 @@ from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
@@ -146,6 +146,10 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
     with stage("prepare"):
         if checkpoint is None and cuts:  # baselines learn nothing
             checkpoint = load_networks(options, size)
+        elif checkpoint is None and options.checkpoint not in CHECKPOINTS:  # a file that is named must be one
+            from gsmerge.networks.checkpoint import load_checkpoint
+
+            load_checkpoint(options.checkpoint)
         agreement = prepared.agreement
         asked, options = options, resolve_budget(options, agreement)
         segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])

@@ -96,7 +96,7 @@ def choose_rotations(scene: Scene, turn: np.ndarray | None = None) -> tuple[Quat
         return "wxyz", ""
     return best, (
         f"rotations are {_DESCRIPTIONS[best]}: the thinnest axes are at a mean cosine of {cosine[best]:.2f} to the"
-        f" surface then, {cosine['wxyz']:.2f} as stored; quats 'wxyz' says otherwise"
+        f" surface then, {cosine['wxyz']:.2f} as stored; --hint quats=wxyz says otherwise"
     )
 
 

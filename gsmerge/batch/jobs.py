@@ -15,15 +15,17 @@ from gsmerge.compaction.files import Outputs, compact_files, level_output
 from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
+from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.content_hash import content_hash, digest, filled, read_files, stem_of
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
-from gsmerge.settings.reading import OpacityChoice, ReadHints
+from gsmerge.settings.reading import NONE, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import Engine
+from gsmerge.types import StrPath
 
 FIELDS = ("stem", "parent", "index", "k")
 
@@ -37,7 +39,7 @@ class BatchOptions(Settings):
     hints: ReadHints = setting(ReadHints(), "What is known of all files and need not be recognised.")
     cameras: str | None = setting(None, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of "
         "each in it.",
-        "By default those beside each scene.")  # fmt: skip
+        "By default those beside each scene; `none`: without.")  # fmt: skip
     images: str | None = setting(None, "Folder of the photos, in the same way.")
     output: str = setting("{stem}.ply", "Name of a result in the output folder: {stem} (the scene's name), {parent} "
         "(the folder it is in), {index} (its place in the list, from 0) and {k} are filled in; its ending says the "
@@ -95,7 +97,8 @@ class CompactCall:
         checkpoint = Path(self.settings.checkpoint)
         if self.settings.checkpoint not in CHECKPOINTS and checkpoint.is_file():  # by its content, wherever it is
             settings["checkpoint"] = file_sha256(checkpoint)
-        reading = {"opacity": self.opacity, **vars(self.hints)}
+        without = [name for name in sorted(files.named) if getattr(files, name) is None]
+        reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
         version = {"tool_version": __version__, "schema_version": SCHEMA_VERSION}
         return digest({"scene": content_hash(read_files(files)), "settings": settings, "reading": reading, **version})
 
@@ -117,8 +120,8 @@ class Job:
     call: SceneCall
     num_gaussians: int  # about, by the header or the bytes of its files; 0 where they cannot be read
     num_rest: int = 0  # columns of higher harmonics, likewise
-    cameras: Path | None = None  # None: beside the scene
-    images: Path | None = None  # likewise
+    cameras: StrPath | None = None  # None: beside the scene
+    images: StrPath | None = None  # likewise
 
     @property
     def output(self) -> str:
@@ -145,8 +148,10 @@ def find_jobs(
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per
     line. ``results`` has the real paths of former results, which are not scenes. SceneError if something does not exist
-    or has no scene; UsageError if two scenes would be written to one file, or one over another.
+    or has no scene, or networks are unusable; UsageError if two scenes would be written to one file, or over another.
     """
+    if options.settings.checkpoint not in CHECKPOINTS:
+        load_checkpoint(options.settings.checkpoint)  # once, and not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
     jobs: list[Job] = []
     owners: dict[str, str] = {}
@@ -165,7 +170,8 @@ def find_jobs(
                     f" {scene}; tell them apart with --name, such as '{{parent}}-{{stem}}.ply'"
                 )
             owners[name] = str(scene)
-        cameras, images = (filled(template, scene) for template in (options.cameras, options.images))
+        named = options.cameras, options.images
+        cameras, images = (path if path == NONE else filled(path, scene) for path in named)
         jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images))
     for name in owners:
         if os.path.realpath(out / name) in inputs:

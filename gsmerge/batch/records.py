@@ -27,6 +27,7 @@ class Result:
     files: list[dict[str, Any]]  # ``path`` in the output folder, ``sha256`` and ``bytes`` of each
     end: int  # byte after its record
     worse: str | None = None  # that it shows its photos worse than its input
+    left_out: str | None = None  # that cameras or photos beside its scene do not belong to it
 
     def holds(self, folder: Path, key: str) -> bool:
         """Return whether the key is the same and every file is unchanged."""
@@ -73,8 +74,8 @@ class RecordIndex:
 
 def _read_result(line: Mapping[str, Any], end: int) -> Result:
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
-    worse = line["report"].get("worse")
-    return Result(_text(line["key"]), files, end, None if worse is None else _text(worse))
+    doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
+    return Result(_text(line["key"]), files, end, *(None if doubt is None else _text(doubt) for doubt in doubts))
 
 
 def _text(value: Any) -> str:

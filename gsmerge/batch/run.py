@@ -99,7 +99,8 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     key, known = job.call.key(files), read_index(run.folder, run.start).read_on().results.get(job.output)
     is_new = known is not None and known.end > run.start  # by another run, or process of this one
     if known is not None and (is_new or not run.overwrite) and known.holds(run.folder, key):
-        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, worse=known.worse)
+        doubts = {"worse": known.worse, "left_out": known.left_out}
+        return record(SKIPPED, job.scene, job.output, key=key, files=known.files, **doubts)
     if known is not None and is_new and known.key not in (key, ""):
         problem = "another run with other settings has made it meanwhile; wait for that run, or name another --output"
         raise UsageError(f"{run.folder / job.output}: {problem}")

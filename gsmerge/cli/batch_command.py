@@ -39,7 +39,7 @@ def parse_jobs(text: str) -> int:
     *opt.panel(
         opt.INPUT,
         opt.option("cameras", str, "Cameras: one path for all scenes, or with {scene}, {parent} and {stem} of each in "
-                   "it.", wording="beside each"),
+                   "it; none: without.", wording="beside each"),
         opt.option("images", str, "Folder of the photos, in the same way.", wording="beside each"),
     ),
     "hint budget quality effort",
@@ -118,6 +118,10 @@ def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     check_failures(totals.failed, len(jobs), "scenes", listed=not args.silent)
     if totals.unmet:
         raise TargetError(f"{totals.unmet} of {totals.total} results miss the target")
+    if totals.left_out:
+        left_out = f"{len(totals.left_out)} of {totals.total} scenes are read without what does not belong to them"
+        left_out += _first(totals.left_out, listed=not args.silent)
+        worse = f"{worse}; {left_out}" if worse else left_out
     if worse and args.strict:
         raise TargetError(worse)
 
@@ -170,6 +174,7 @@ class Totals:
     rows: list[tuple[str, ...]] = field(default_factory=list)  # of the table, for the first results that were made
     unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
+    left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and the note on what beside it is left out
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -181,6 +186,9 @@ class Totals:
         worse = report["worse"] if report else record.get("worse")
         if worse:
             self.worse.append((record["scene"], worse))
+        left_out = report["input"].get("left_out") if report else record.get("left_out")
+        if left_out:
+            self.left_out.append((record["scene"], left_out))
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
@@ -202,7 +210,8 @@ class Totals:
         lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 6, 4, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        for status, reasons in ((UNUSED[:-2], self.unused), ("worse", self.worse), (FAILED, self.failed)):
+        told = ((UNUSED[:-2], self.unused), ("worse", self.worse), ("note", self.left_out), (FAILED, self.failed))
+        for status, reasons in told:
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
         counts = [f"{self.counts[x]:,} {x}" for x in (DONE, SKIPPED, FAILED) if self.counts[x] or x == DONE]

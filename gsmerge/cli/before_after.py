@@ -67,7 +67,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.runtime.record import record_run
     from gsmerge.scene.files import result_cameras
 
-    if files.cameras is None:  # a result may know those that its scene has lost
+    if files.cameras is None and "cameras" not in files.named:  # a result may know those that its scene has lost
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
     load, notes = args.load(files), list[str]()
     views = vars(args).get("views")

@@ -33,6 +33,7 @@ from gsmerge.cli.paths import (
 from gsmerge.errors import TargetError, UsageError
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
@@ -150,7 +151,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
     from gsmerge.io.formats.table import PLY, SITE
 
-    say_notes([note for note in document["notes"] if note != document["worse"]], quiet=args.silent)
+    doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
+    say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) and not shown else []
@@ -159,7 +161,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     if args.strict and document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
-    problems = [document["unmet"], document["worse"] if args.strict else None]
+    problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:
         say_warning(f"{document['worse']}; {MORE}", quiet=args.silent)
     if any(problems):
@@ -201,7 +203,7 @@ def _check_scenes(args: opt.Args) -> None:
     """Raise an error for several scenes with one ``--cameras``, a missing scene, or a scene given twice."""
     if len(args.scenes) == 1:
         return
-    if args.cameras is not None:
+    if args.cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
         raise UsageError(f"{problem}, whose cameras are beside or inside them")
     for place, scene in enumerate(args.scenes):

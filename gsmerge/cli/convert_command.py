@@ -30,7 +30,7 @@ class PhotoOptions(Settings):
                  ".ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html, lod-meta.json, a new folder for a web site, or "
                  "one named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
-                "the cameras inside a result or beside it."),
+                "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
     opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
     "up scale rotate translate sh_degree crop drop overwrite",
@@ -44,9 +44,10 @@ def convert(args: opt.Args) -> None:
         _convert_features(args, inputs, output)
         return
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
-    images = None if photos.images is None else Path(photos.images)
+    images = None if photos.images is None else opt.named_or_none(photos.images)
+    named = [path for path in (args.cameras, images) if isinstance(path, Path)]
     output = output_file(output, inputs[0].name)
-    check_outputs((output, *model_files(output)), (*inputs, args.cameras, images), overwrite=args.overwrite)
+    check_outputs((output, *model_files(output)), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run

@@ -58,7 +58,7 @@ def evaluate(args: opt.Args) -> None:
     options, own = args.make(EvaluateOptions, MeasuringOptions)
     if not options.context and args.targets is None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
-    args.views, args.masks = own.views, None if own.masks is None else Path(own.masks)
+    args.views, args.masks = own.views, None if own.masks is None else opt.named_or_none(own.masks)
     files, outputs = args.files(args.before), args.output or []
     _check_files(args, outputs, own, input_files(files))
     seconds = [_seconds_of(making) for making in own.merge_seconds]

@@ -13,6 +13,7 @@ from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import SUFFIX, ExtendOptions
+from gsmerge.settings.reading import NONE
 
 
 @opt.command(
@@ -27,7 +28,7 @@ def extend(args: opt.Args) -> None:
     if args.state.suffix.lower() != SUFFIX:
         raise UsageError(f"{args.state}: expected a state, which ends in {SUFFIX}")
     hints = args.hints()
-    if len(args.scenes) > 1 and (args.cameras is not None or args.images is not None):
+    if len(args.scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
         raise UsageError("--cameras and --images: expected one batch with them, got several; extend by one at a time")
     from gsmerge.states.files import batch_line, extend_file
 

@@ -33,7 +33,7 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 from gsmerge.settings.placement import PlacementOptions
-from gsmerge.settings.reading import FileHints, OpacityChoice, ReadHints
+from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, change_settings, flat_settings, join_words
 from gsmerge.settings.stages import CROP_FILES, Engine
 
@@ -333,6 +333,11 @@ def share_list(text: str) -> list[str]:
     return shares
 
 
+def named_or_none(text: str) -> Path | str:
+    """Parse ``--cameras``, ``--images`` and ``--masks``: a path, or the word none; ./none is a path."""
+    return text if text == NONE else Path(text)
+
+
 def number_or_text(text: str) -> int | str:
     """Parse ``--k``: a number, or a word such as "auto"."""
     return int(text) if text.isdecimal() else text
@@ -353,10 +358,11 @@ _TABLE = (
     panel(
         INPUT,
         option("cameras", Path, "Camera file or COLMAP folder: transforms.json, cameras.json, results.npz, ... "
-               "Default: beside the .ply."),
-        option("images", Path, "Folder of the input photos. Default: beside the .ply."),
+               "Default: beside the .ply; none: without.", parser=named_or_none),
+        option("images", Path, "Folder of the input photos. Default: beside the .ply; none: without.",
+               parser=named_or_none),
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
-               "beside the photos, and where these are transparent."),
+               "beside the photos, and where these are transparent; none: without.", parser=named_or_none),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "
@@ -389,7 +395,7 @@ _TABLE = (
         option("output", Path, "", "--output", "-o"),
         switch("overwrite", "Replace the output if it exists."),
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
-               "than the input does, by more than .5 dB."),
+               "than the input does, by more than .5 dB, or cameras or photos do not fit."),
         switch("dry_run", "Print what would be done; write nothing."),
         switch("json", "Print JSON on stdout."),
     ),

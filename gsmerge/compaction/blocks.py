@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from typing import Any, TypeVar
@@ -298,10 +297,7 @@ def free_scene(scene: Scene) -> None:
 def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptions:
     """Return options with the fit steps and the networks that were chosen for the whole scene."""
     checkpoint = options.checkpoint if choices.checkpoint != "none" else "none"
-    settings: dict[str, Any] = {"fit_steps": choices.fit.steps, "checkpoint": checkpoint}
-    if options.blocks.engine.engine != "local" and os.path.isfile(options.checkpoint):
-        settings["require_checkpoint"] = True  # a node without it would make other bytes
-    options = options.with_settings(settings)
+    options = options.with_settings({"fit_steps": choices.fit.steps, "checkpoint": checkpoint})
     return replace(options, fit=replace(options.fit, share=choices.limits.share))
 
 

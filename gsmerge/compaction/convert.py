@@ -43,12 +43,12 @@ from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.files import result_cameras, scene_title
+from gsmerge.scene.files import named_path, result_cameras, scene_title
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
-from gsmerge.types import Cameras, Gaussians, PicturedScene
+from gsmerge.types import Cameras, Gaussians, PicturedScene, StrPath
 
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
 
@@ -59,8 +59,8 @@ class ConvertOptions:
 
     inputs: Sequence[Path]  # several are joined in their order
     output: Path  # its name chooses the format
-    cameras: Path | None = None  # in the frame of the first input; None: those of a result, inside or beside it
-    images: Path | None = None  # photos of these cameras, which say where the sky is
+    cameras: StrPath | None = None  # in the frame of the first input; None: those of a result, inside or beside it
+    images: StrPath | None = None  # photos of these cameras, which say where the sky is
     opacity: OpacityChoice = "auto"
     clean: CleanOptions = field(default_factory=CleanOptions)
     placement: PlacementOptions = field(default_factory=PlacementOptions)
@@ -82,7 +82,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             report_progress(f"convert: {path.name}", len(files), steps)
             files.append(read_gaussians(path, opacity=options.opacity))
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
-        stored = _read_cameras(options)
+        stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         if cameras is None and ending == COLMAP.ending:
             problem = "expected cameras beside it for a COLMAP model, found none"
@@ -98,6 +98,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     infos = [file.info for file in files]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
+    notes += unread
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
@@ -129,14 +130,23 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
     return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, most) for part in parts])
 
 
-def _read_cameras(options: ConvertOptions) -> CameraFile | None:
-    path = options.cameras or result_cameras(options.inputs[0])
-    return None if path is None else read_cameras(path)
+def _read_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
+    """Read the cameras; those found beside the first input are left out, with a note, if they cannot be read."""
+    named, first = options.cameras, options.inputs[0]
+    path = result_cameras(first) if named is None else named_path(named)
+    try:
+        return None if path is None else read_cameras(path), []
+    except SceneError as error:
+        if named is not None or path == first:
+            raise
+        return None, [f"{path} is left out: {error.problem}; name what fits, or say none"]
 
 
 def _photo_folder(options: ConvertOptions, stored: CameraFile | None) -> Path | None:
     """Return the folder of the cameras' photos: the given one, or ``images`` beside their file."""
-    return options.images if stored is None or options.images else Path(stored.path).parent / "images"
+    if stored is None or options.images is not None:
+        return named_path(options.images)
+    return Path(stored.path).parent / "images"
 
 
 def _clean(
@@ -145,9 +155,10 @@ def _clean(
     """Crop the Gaussians and drop unwanted ones; return the rest, and the number dropped for each reason."""
     if "sky" not in options.clean.drops:
         return clean(gaussians, options.clean, None, lambda g: g)
-    if stored is None or options.images is None:
+    photos = named_path(options.images)
+    if stored is None or photos is None:
         raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --images")
-    images = read_images(options.images, stored.names)
+    images = read_images(photos, stored.names)
     cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
     scene = PicturedScene(gaussians, cameras, images, None, stored.names)
     frame = scene_frame(scene)

@@ -112,7 +112,7 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
         if settings.method == OURS and settings.checkpoint != "auto":  # which the run may refuse
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
-    paths = {name: path and str(path) for name, path in vars(load.files).items() if name != "more"}
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name not in ("more", "named")}
     return {
         **document_head(),
         "dry_run": True,

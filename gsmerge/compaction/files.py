@@ -86,7 +86,7 @@ def compact_files(
         result = _padded(result) if outputs.full_columns else result
         compacted, results = perf_counter(), (result, *result.coarser)
         comments = [RESULT_COMMENT, *load.comments]
-        views_named = result.cameras[views], name_photos(files.images, names), scene_title(files.ply)
+        views_named = result.cameras[views], name_photos(load.files.images, names), scene_title(files.ply)
         notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
         written = _write_results(add, outputs, first, results, comments, views_named)
         if cameras_path is not None:

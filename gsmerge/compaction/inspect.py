@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -136,15 +137,14 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto")),
         "coverage": [],
     }
-    camera_file = None
     try:
-        if files.cameras is not None:
-            camera_file = read_scene_cameras(ply, files)
-            assert camera_file is not None, "a file has cameras, or is refused"
-            facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
-        load = align_scene(ply, files, camera_file, hints=hints)
+        load = align_scene(ply, files, hints=hints)
     except SceneError as error:
+        with suppress(SceneError):
+            camera_file = None if files.cameras is None else read_scene_cameras(ply, files)
+            facts |= {} if camera_file is None else {"num_views": len(camera_file), "camera_format": camera_file.source}
         return facts | {"alignment_problem": str(error)}
+    facts |= {name: (path := getattr(load.files, name)) and str(path) for name in ("cameras", "images")}
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians

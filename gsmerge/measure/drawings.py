@@ -48,7 +48,7 @@ from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import place_camera_file
 from gsmerge.scene.read import Loaded, SceneViews, place_cameras_in_scene, read_gaussian_file
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, StrPath
 
 PANEL_VIEWS = 4  # rows of a panel
 SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
@@ -138,7 +138,7 @@ class DrawnScenes:
         return zip(*drawn, strict=True)
 
 
-def frame_files(files: SceneFiles, cameras: Path | None, images: Path | None) -> SceneFiles:
+def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
     """Find the files of the scene that gives the cameras' frame: what a scene was compacted from, or itself."""
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():

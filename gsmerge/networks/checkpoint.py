@@ -121,13 +121,13 @@ def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, li
     """Load a checkpoint by name, with notes for the user; None for the analytic stages.
 
     ``name`` is a file, ``"shipped"`` or ``"paper"`` in the package, or ``"none"``. If a checkpoint cannot be used, a
-    SceneError is raised if it is ``required``; otherwise a note is added, and the stages run without networks.
+    file or ``required`` one is refused by a SceneError; otherwise a note is added, and the stages run without networks.
     """
     if name == "none":
         return None, []
     try:
         return load_checkpoint(IN_PACKAGE.get(name, name)), []
     except SceneError as error:
-        if required:
+        if required or name not in IN_PACKAGE:
             raise
         return None, [f"no networks, analytic stages alone: {error}"]

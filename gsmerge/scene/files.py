@@ -5,9 +5,9 @@ from __future__ import annotations
 import filecmp
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from gsmerge.io.formats.table import DEPTHS, FRAMES, META, POSES, SEVERAL_USES, 
 from gsmerge.io.image_names import list_images
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.reading import NONE
 from gsmerge.types import StrPath
 
 _CHECK_SCENE_FILE = LazyFunction("gsmerge.scene.no_gaussians", "check_scene_file")
@@ -41,6 +42,7 @@ TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.
 SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
 IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
 MASK_PLACES = ("masks",)
+_PICTURES = ("images", "masks")  # of the files of a scene
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
@@ -71,11 +73,30 @@ class SceneFiles:
     more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
     num_copies: int = 0  # other files of the same bytes in the folder
+    named: frozenset[str] = frozenset()  # those of cameras, images and masks that were not searched
 
     @property
     def plys(self) -> tuple[Path, ...]:
         """Paths of the Gaussians, in the order of their rows."""
         return self.parts or (self.ply,)
+
+    def without_found(self, problem: str) -> Iterator[SceneFiles]:
+        """Yield copies without what was found and may not belong to the scene, if the file ``problem`` is unusable.
+
+        Images that the cameras' file holds go with it.
+        """
+        alone, place = self, Path(problem)
+        if any(name in self.named and place.is_relative_to(getattr(self, name) or os.devnull) for name in _PICTURES):
+            return
+        if "masks" not in self.named and self.masks is not None and place.is_relative_to(self.masks):
+            yield replace(self, masks=None)
+        if "images" not in self.named:
+            alone = replace(self, images=None, named=self.named | {"images"})
+            yield alone
+        if "cameras" not in self.named and self.cameras not in (None, self.ply):
+            if self.images is None or self.images != self.cameras:
+                yield replace(self, cameras=None)
+            yield replace(alone, cameras=None)
 
     @property
     def is_state(self) -> bool:
@@ -106,7 +127,7 @@ def find_scene_files(
     images: StrPath | None = None,
     masks: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files from its path; files that the caller names are not searched.
+    """Find a scene's files from its path; files that the caller names, or "none", are not searched.
 
     Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
     result, ``NAME.cameras.json``, over all others.
@@ -121,13 +142,17 @@ def find_scene_files(
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
             scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
-    path = Path(path)
+    path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
+    named = frozenset(name for name, value in given.items() if value is not None)
+    camera_path, image_path, mask_path = map(named_path, given.values())
+    if mask_path is not None and not mask_path.is_dir():
+        raise SceneError(mask_path, "expected a folder of masks, found a file")
     if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
         check_file(path)
-        own = path if _HOLDS_VIEWS(path) else None
-        photos = _named(images) or (own if cameras is None else None)
-        return SceneFiles(path, _named(cameras) or own, photos, _mask_folder(masks))
-    plys = find_plys(path, _named(cameras)) if os.path.isdir(path) else [path]
+        own = path if cameras is None and _HOLDS_VIEWS(path) else None
+        photos = image_path or (own if images is None else None)
+        return SceneFiles(path, camera_path or own, photos, mask_path, named=named)
+    plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
         problem = "expected the folder of all frames of DA3-Streaming, found one frame"
@@ -142,36 +167,28 @@ def find_scene_files(
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
-    places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-    camera_path = _named(cameras) or (_depths_cameras(ply) if ply.suffix == DEPTHS.ending else result_cameras(ply))
-    camera_path = camera_path or next((place for place in places if place is not None), None)
-    image_path = _named(images)
-    if image_path is None and is_frame(ply):
+    if cameras is None:
+        places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
+        camera_path = _depths_cameras(ply) if ply.suffix == DEPTHS.ending else result_cameras(ply)
+        camera_path = camera_path or next((place for place in places if place is not None), None)
+    if images is None and is_frame(ply):
         image_path = ply
-    if image_path is None and camera_path is not None:
+    elif images is None and camera_path is not None:
         has_images = camera_path.suffix in (CHUNK, SUFFIX) or (
             camera_path.suffix == ".npz" and holds_images(camera_path)
         )
         image_path = camera_path if has_images else None
-    if image_path is None:
+    if image_path is None and images is None:
         folders = [root / place for root in roots for place in IMAGE_PLACES]
         if folder.name == SCENES_PLACE:
             folders = [place / ply.stem for place in folders] + folders
         image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
-    mask_path = _mask_folder(masks)
-    if mask_path is None:
+    if masks is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
-    return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies)
-
-
-def _mask_folder(path: StrPath | None) -> Path | None:
-    named = _named(path)
-    if named is not None and not named.is_dir():
-        raise SceneError(named, "expected a folder of masks, found a file")
-    return named
+    return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies, named=named)
 
 
 def _depths_cameras(path: Path) -> Path:
@@ -191,8 +208,9 @@ def result_cameras(ply: Path) -> Path | None:
     return ply if holds_cameras(ply) else beside if beside.is_file() else None
 
 
-def _named(path: StrPath | None) -> Path | None:
-    if path is None:
+def named_path(path: StrPath | None) -> Path | None:
+    """Return the path that a caller named; None for None and "none", SceneError if it does not exist."""
+    if path is None or path == NONE:
         return None
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import (
+    MAY_BE_UNALIGNED,
     Alignment,
     AlignmentResult,
     Layout,
@@ -29,6 +31,7 @@ from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.read import CAMERA_PLACES, holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
+from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
@@ -53,7 +56,7 @@ from gsmerge.scene.views import (
     read_scene_cameras,
     stored_photos,
 )
-from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
 
 _PART = 1 << 20  # numbers that are compared at once
@@ -90,6 +93,7 @@ class Loaded:
     # how far each camera was moved to its Gaussians; empty where none was
     moves: Sequence[dict[str, Any]] = ()
     joined: Sequence[dict[str, Any]] = ()  # where each of several scenes lies; empty for one
+    left_out: str | None = None  # the note that names what was found beside the file and does not belong to it
 
     def pixel_scene(self) -> Scene:
         """Return the scene; SceneError with the reason if it has not one Gaussian per pixel."""
@@ -120,7 +124,7 @@ class Loaded:
             num_bytes = sum(os.stat(file["path"]).st_size for file in self.joined if file["joined"])
             facts |= {"files": list(self.joined), "bytes": num_bytes}
         facts |= {"layout": info.layout, "sh_degree": info.sh_degree, "opacity_encoding": info.opacity_encoding}
-        return facts | {"num_nonfinite": info.num_nonfinite}
+        return facts | {"num_nonfinite": info.num_nonfinite, "left_out": self.left_out}
 
 
 def read_scene(
@@ -139,10 +143,10 @@ def read_scene(
     Args:
         path: The ``.ply``, or a folder that has it.
         *more: Other scenes of the same place, which are joined with it in its frame (docs/guide/sharp.md).
-        cameras: Camera file or folder; None looks next to the ``.ply``.
-        images: Folder of images, or an ``.npz`` that holds them; None looks next to the ``.ply``.
-        masks: Folder of images named as the photos, dark where a photo does not count; None: ``masks`` beside the
-            photos, and where these are transparent.
+        cameras: Camera file or folder, or "none"; None looks next to the ``.ply``, and warns if they do not fit.
+        images: Folder of images, an ``.npz`` that holds them, or "none"; None: likewise.
+        masks: Folder of images named as the photos, dark where a photo does not count, or "none"; None: ``masks``
+            beside the photos, and where these are transparent.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
@@ -151,7 +155,7 @@ def read_scene(
         The scene; its ``pixel_ids`` are None where the rows belong to no pixels.
 
     Raises:
-        SceneError: If a file is missing or damaged, or the Gaussians are not those of the cameras' views.
+        SceneError: If a file is missing or damaged, or the Gaussians are not those of named cameras' views.
         ValueError: If an argument is none of the possible ones.
 
     Example:
@@ -159,7 +163,10 @@ def read_scene(
         >>> len(scene), scene.num_gaussians
         (5, 7680)
     """
-    return load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints).scene
+    load = load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints)
+    if load.left_out is not None:
+        warnings.warn(load.left_out, stacklevel=2)
+    return load.scene
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
@@ -217,6 +224,7 @@ def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
         alignment=check_alignment(scene.gaussians, scene.cameras, scene.stored),
         moves=[move for load in used for move in load.moves],
         joined=joined.facts,
+        left_out="; ".join(load.left_out for load in loads if load.left_out is not None) or None,
     )
 
 
@@ -228,20 +236,54 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     return read_parts(files.parts, opacity=opacity) if files.parts else read_gaussians(files.ply, opacity=opacity)
 
 
-def align_scene(
-    ply: GaussianFile,
-    files: SceneFiles,
-    camera_file: CameraFile | None = None,
-    *,
-    hints: ReadHints = AUTO,
-    photos: bool = True,
-) -> Loaded:
+def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO, photos: bool = True) -> Loaded:
     """Combine Gaussians, cameras and photos to a scene; find the pixel of every row if there is one.
 
-    Raises as :func:`read_scene`. ``camera_file`` has the cameras if they are read already; without ``photos`` no photos
-    are searched.
+    What was found beside the file is left out, with a note, if the scene can only be read without it. Raises as
+    :func:`read_scene`; without ``photos`` no photos are searched.
     """
-    camera_file = read_scene_cameras(ply, files) if camera_file is None else camera_file
+    try:
+        load = _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
+        strange = f"the photos in {files.images} are not used: they do not show"
+        return replace(load, left_out=next((text for text in load.notes if text.startswith(strange)), None))
+    except SceneError as error:
+        why = SceneError(error.path, error.problem, error.remedy)  # without what it holds in memory
+    of_photos = Path(why.path).suffix.lower() in IMAGE_SUFFIXES
+    of_photos |= files.images != files.cameras and why.path == str(files.images)
+    for fewer in files.without_found(why.path):
+        with suppress(SceneError):
+            load = _align(ply, fewer, read_scene_cameras(ply, fewer), hints=hints, photos=photos)
+            # without photos, cameras of another scene may see these Gaussians, too
+            is_sure = load.scene.aligned or of_photos or fewer.cameras != files.cameras or fewer.masks != files.masks
+            if is_sure and ("images" not in files.named or files.images is None or load.scene.images is not None):
+                return _leave_out(load, files, why)
+    if "cameras" not in files.named:
+        _check_hints(ply, hints)
+    left = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
+    remedy = "; ".join(filter(None, (why.remedy, f"{' and '.join(left)} reads the file alone" if left else "")))
+    raise SceneError(why.path, why.problem, remedy)
+
+
+def _leave_out(load: Loaded, files: SceneFiles, why: SceneError) -> Loaded:
+    """Add the note that what was found beside a file is not used, and why, to the scene that was read without it."""
+    names = [str(files.cameras)] if load.files.cameras != files.cameras else []
+    if load.files.masks != files.masks:
+        names.append(f"the masks in {files.masks}")
+    photos = f"the photos in {files.images or files.ply.parent}"
+    said = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
+    if said or (load.files.named != files.named and files.images not in (files.cameras, None)) or not names:
+        names.append(photos)
+    known = files.ply, files.ply.parent, files.cameras, files.images, files.masks
+    where = "" if why.path in map(str, known) else f"{why.path}: "
+    verb, remedy = "is" if names == [str(files.cameras)] else "are", why.remedy or "name what fits, or say none"
+    note = " ".join(f"{' and '.join(names)} {verb} left out: {where}{why.problem}; {remedy}".split())
+    return replace(load, notes=(*(text for text in load.notes if text not in said), note), left_out=note)
+
+
+def _align(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile | None, *, hints: ReadHints, photos: bool = True
+) -> Loaded:
+    """Combine Gaussians, cameras and photos as :func:`align_scene`, and raise a SceneError if anything is unusable."""
     if camera_file is None:
         return _without_cameras(ply, files, hints)
     exporter = find_exporter(hints.exporter)
@@ -263,6 +305,7 @@ def align_scene(
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
     notes += [*chosen, *cut, *smaller, *result.notes]
     if result.pixel_ids is None:
+        _check_hints(ply, hints)
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
@@ -279,11 +322,22 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
     """Make a scene without views, which are placed later; photos are not used, with a note."""
     option = find_cameras_of_model(ply.info)
     notes = [option] if option else []
+    _check_hints(ply, hints)
     if files.images is not None:
         places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        notes += [f"the photos in {files.images} are not used: no cameras that fit them (looked for {places})"]
+        where = "" if "cameras" in files.named else f" (looked for {places})"
+        notes += [f"the photos in {files.images} are not used: no cameras that fit them{where}"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
+
+
+def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
+    """Raise SceneError for rows that are no pixels if a hint says how they are."""
+    hinted = [] if hints.order in ("auto", *MAY_BE_UNALIGNED) else [f"order={hints.order}"]
+    hinted += [f"quats={hints.quats}"] if hints.quats in ("camera", "xyzw-root") else []
+    if hinted:
+        problem = f"expected rows that are pixels of views with --hint {hinted[0]}, found no such pixels"
+        raise SceneError(ply.info.path, problem, "leave the hint out, or give the cameras that fit with --cameras")
 
 
 def _make_load(
@@ -443,19 +497,26 @@ def _with_rotations(
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
 
-    ``photos`` that cannot be read raise an error; with False photos are left out. SceneError if cameras have no size.
+    ``photos`` that were named and cannot be read raise an error; with False photos are left out. SceneError if named
+    cameras have no size.
     """
-    camera_file = read_scene_cameras(ply, files)
-    if camera_file is None:
-        return _without_cameras(ply, files, hints)
-    for with_photos in (True,) if photos else (True, False):
-        with suppress(SceneError):
-            load = align_scene(ply, files, camera_file, hints=hints, photos=with_photos)
-            break
-    else:
-        pictures = stored_photos(files, camera_file) if photos else ()
-        cameras = to_cameras(camera_file, photo_size(pictures))
-        note = "the cameras do not fit the Gaussians and stay as their file has them"
-        as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-        load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
-    return load if load.scene.aligned else replace(load, notes=load.notes[:-1])  # without that there are no pixels
+    with suppress(SceneError):
+        camera_file = read_scene_cameras(ply, files)
+        if camera_file is None:
+            return _without_cameras(ply, files, hints)
+        for with_photos in (True,) if photos else (True, False):
+            with suppress(SceneError):
+                load = _align(ply, files, camera_file, hints=hints, photos=with_photos)
+                break
+        else:
+            pictures = stored_photos(files, camera_file) if photos else ()
+            cameras = to_cameras(camera_file, photo_size(pictures))
+            from gsmerge.alignment import check_cameras  # few scenes come here
+
+            if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
+                return align_scene(ply, files, hints=hints, photos=photos)
+            note = "the cameras do not fit the Gaussians and stay as their file has them"
+            as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
+            load = replace(_make_load(ply, files, hints, as_stored, [note]), cameras=None)
+        return load if load.scene.aligned else replace(load, notes=load.notes[:-1])  # without that there are no pixels
+    return align_scene(ply, files, hints=hints, photos=photos)  # without what cannot be read, if it was not named

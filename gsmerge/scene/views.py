@@ -45,7 +45,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.scene.files import MASK_PLACES, SceneFiles
+from gsmerge.scene.files import SceneFiles
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import Cameras, LargePhotos
 
@@ -73,7 +73,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
             return stored
     if stored is None and files.is_state:
         return None
-    sharp = read_sharp_camera(files.ply) if stored is None else None
+    sharp = read_sharp_camera(files.ply) if stored is None and "cameras" not in files.named else None
     if sharp is not None:
         return sharp
     from gsmerge.scene.estimate_cameras import estimate_cameras, estimate_focal, estimate_grid  # few files need it
@@ -81,7 +81,8 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     if stored is not None:
         return estimate_focal(ply, stored, stored_photos(files, stored))
     if files.images is None:
-        return estimate_grid(ply, files.ply, images_beside(files.ply), files.ply.parent)
+        beside = [] if "images" in files.named else images_beside(files.ply)
+        return estimate_grid(ply, files.ply, beside, files.ply.parent)
     return estimate_cameras(ply, files.ply, files.images) if files.images.is_dir() else estimate_grid(ply, files.ply)
 
 
@@ -173,6 +174,8 @@ def _turn_photos(photos: Photos, turns: int) -> Photos:
 def _photo_paths(files: SceneFiles, camera_file: CameraFile) -> list[Path]:
     """Find the photo file of every camera; empty where there are none, or they are inside another file."""
     if files.images is None:
+        if "images" in files.named:
+            return []
         place = Path(camera_file.path)
         folder = place if place.is_dir() and place.name not in _MODEL_FOLDERS else place.parent
         paths = [path for path in (find_image(folder, name) for name in camera_file.names) if path is not None]
@@ -232,7 +235,7 @@ def find_larger_and_masks(
         width, height = (part.stop - part.start for part in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
     names = [path.as_posix() for path in paths] or list(camera_file.names)
-    named, notes = _match_masks(files.masks, names)
+    named, notes = _match_masks(files, names)
     alphas: Sequence[Path | None] = paths or [None] * len(names)
 
     def read_parts(view: int) -> list[np.ndarray]:
@@ -245,14 +248,14 @@ def find_larger_and_masks(
     return large, _read_masks(read_parts, len(names), file_size, cameras, cut), notes
 
 
-def _match_masks(folder: Path | None, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
+def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
     """Find the masks of photos, with a note; in a folder that the user did not name, only by matching names."""
-    if folder is None:
+    if files.masks is None:
         return [None] * len(names), []
     try:
-        return match_masks(folder, names), []
+        return match_masks(files.masks, names), []
     except SceneError as error:
-        if folder.name not in MASK_PLACES:
+        if "masks" in files.named:
             raise
         return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
 
@@ -292,6 +295,8 @@ def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray
     if files.masks is None:
         return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
     problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    if "masks" not in files.named:
+        return None, [f"masks are not used: {files.masks}: {problem}; name them with --masks"]
     raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
 
 

@@ -12,6 +12,8 @@ OpacityChoice = Literal["auto", "logit", "raw"]
 QuatChoice = Literal["auto", "wxyz", "xyzw", "xyzw-root", "camera"]
 Order = Literal["auto", "view-major", "view-fastest", "layer-major", "column-major", "unordered", "none"]
 
+NONE = "none"  # in the place of cameras, photos or masks: the scene is read without; Path(NONE) is a file of that name
+
 
 @dataclass(frozen=True)
 class ReadHints(Settings):

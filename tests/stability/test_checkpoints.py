@@ -14,6 +14,7 @@ from unaligned_scenes import shuffled
 
 import gsmerge
 from gsmerge.kernels import elementary
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.networks.options import Bounds
 from gsmerge.types import SH_C0
 
@@ -71,17 +72,26 @@ def test_every_result_says_which_networks_it_is_from(tmp_path: Path, settings: d
     assert any("checkpoint" in note for note in rival.report.notes)
 
 
-def test_a_checkpoint_that_cannot_be_used_is_noted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["missing", "truncated"])
+def test_networks_of_the_package_that_cannot_be_used_are_noted(
+    tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = make_scene(room(), arc(2))
     path = tmp_path / "a.safetensors"
     plain = gsmerge.compact(scene, **PLAIN, checkpoint="none")
-    for damage in ("missing", "truncated"):
-        if damage == "truncated":
-            path.write_bytes(written(path, noisy()).read_bytes()[:-100])
-        fallen = gsmerge.compact(scene, **PLAIN, checkpoint=str(path))
-        assert identical(plain.gaussians, fallen.gaussians)
-        assert [note for note in fallen.report.notes if str(path) in note]
-        assert "networks" not in fallen.report.choices
+    if damage == "truncated":
+        path.write_bytes(written(path, noisy()).read_bytes()[:-100])
+    monkeypatch.setitem(IN_PACKAGE, "shipped", path)
+    fallen = gsmerge.compact(scene, **PLAIN, checkpoint="shipped")
+    assert identical(plain.gaussians, fallen.gaussians)
+    assert [note for note in fallen.report.notes if str(path) in note]
+    assert "networks" not in fallen.report.choices
+
+
+@sweep("options", [{}, {"method": "random", "budget": 40}], ids=str)
+def test_a_file_that_is_named_must_be_usable(tmp_path: Path, options: dict[str, object]) -> None:
+    with pytest.raises(gsmerge.SceneError, match="nosuch: expected a checkpoint, found no such file"):
+        gsmerge.compact(make_scene(room(), arc(2)), **PLAIN | options, checkpoint=str(tmp_path / "nosuch"))
 
 
 def test_a_checkpoint_that_is_required_must_be_usable(tmp_path: Path) -> None:

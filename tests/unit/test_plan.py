@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.plan import (
     EFFORTS,
     KEPT_LOSS,
@@ -123,9 +125,10 @@ def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
         assert any(name.startswith("refiner") for name in networks.arrays) is refines
 
 
-def test_a_missing_checkpoint_is_noted(scene: Scene) -> None:
+def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(IN_PACKAGE, "shipped", Path("missing.safetensors"))
     with record_run() as record:
-        plan = plan_of(scene, checkpoint="missing.safetensors")
+        plan = plan_of(scene, checkpoint="shipped")
     assert plan.networks is None
     assert "networks" in record.notes[0]
 

@@ -32,6 +32,7 @@ _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviation
 # The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
 # 2, linear scales that are taken for logarithms 10 to 1,000.
 _MAX_SPACINGS = 6.0
+_RAW_ROUNDING, _MAX_OUTSIDE = 0.01, 0.01  # by which opacities may exceed [0, 1], and the share of them that may be more
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         "Gaussian(s) with extreme scales or colours, clipped": info.num_clipped_scales,
         "Gaussian(s) with a zero quaternion, taken as the identity": info.num_zero_quats,
     }
-    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; opacity 'logit' says otherwise",)
+    raw = ("all opacities lie in [0, 1]: taken as activated, not as logits; --hint opacity=logit says otherwise",)
     notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     odd = (info.odd_scales,) if info.odd_scales else ()
     return (*info.adapted, *notes, *odd, *(f"{count:,} {what}" for what, count in counted.items() if count))
@@ -186,6 +187,8 @@ def convert_files(paths: Sequence[Path], parts: Sequence[StoredRows], opacity: O
         clipped, zero = _convert_file(name, part, {key: column[part_rows] for key, column in out.items()})
         num_clipped, num_zero_quats, first = num_clipped + clipped, num_zero_quats + zero, part_rows.stop
     declared_encoding = opacity if opacity != "auto" else _declared_encoding(paths, parts, out["opacities"])
+    if opacity == "raw":
+        _check_raw(path, out["opacities"])
     encoding = _activate(out["opacities"], out["valid"], declared_encoding)
     notes = _apply_filter(out) if arrays.FILTER in out else ()
     num_bad = clear_invalid(path, out)
@@ -394,6 +397,16 @@ def _apply_filter(out: dict[str, np.ndarray]) -> tuple[str]:
 
     parallel_map(widen, range(0, len(widths), FREED_ROWS))
     return (f"{arrays.FILTER} of Mip-Splatting is worked into the scales and opacities",)
+
+
+def _check_raw(path: Path, opacities: np.ndarray) -> None:
+    """Raise SceneError for logits that the caller says are opacities in [0, 1]."""
+    finite = np.isfinite(opacities)
+    outside = (np.abs(opacities - 0.5) > 0.5 + _RAW_ROUNDING) & finite
+    if outside.sum() > _MAX_OUTSIDE * finite.sum():
+        share = 100 * outside.sum() / finite.sum()
+        problem = f"expected opacities in [0, 1], as hinted, found {share:.2g} % outside, as logits are"
+        raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 
 def _guess_encoding(opacities: np.ndarray) -> str:

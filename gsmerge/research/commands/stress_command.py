@@ -40,7 +40,8 @@ def stress(args: opt.Args) -> None:
 
     settings, places = args.make(CompactOptions, StressFiles)
     found = {name: None if path is None else Path(path) for name, path in vars(places).items()}
-    args.cameras, args.images, args.hint = found["cameras"], found["images"], None
+    args.cameras, args.images = (None if p is None else opt.named_or_none(p) for p in (places.cameras, places.images))
+    args.hint = None
     load = args.load(args.files(args.scene))
     require_views(load)
     _, held_out, adapted = held_out_views(load, found["targets"], found["target_images"], None)

@@ -98,7 +98,7 @@ def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.M
         lambda *_: [same, replace(same, convention=("another", "way"))],
     )
     with refuses(SceneError, "transforms.json", "world-to-camera", "OpenCV", "another"):
-        load_scene(folder, order="view-major")
+        load_scene(folder, order="view-major", cameras=folder / "transforms.json")
 
 
 def test_rows_without_finite_positions_are_not_looked_at(tmp_path: Path, tiny: Tiny) -> None:
@@ -118,4 +118,4 @@ def test_poses_that_fit_in_no_reading(tmp_path: Path) -> None:
     away[:, :3, :3] = away[:, :3, :3] @ np.diag([-1.0, 1, -1])
     rewrite_poses(folder, replace(SMOOTH, c2w=away), C2W_OPENGL)
     with refuses(SceneError, "scene.ply", 3600, 2399, "0 %"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder / "transforms.json")

@@ -100,7 +100,7 @@ def test_a_file_with_other_intrinsics_is_refused_with_the_remedy(large: Tiny, tm
     large.save(tmp_path)
     write_transforms(tmp_path / "transforms.json", cameras, large.names)
     with refuses(SceneError, "transforms.json", "4.0 px", "-4.00"):
-        load_scene(tmp_path, order="view-major")
+        load_scene(tmp_path, order="view-major", cameras=tmp_path / "transforms.json")
 
 
 def test_far_off_is_too_far(large: Tiny) -> None:

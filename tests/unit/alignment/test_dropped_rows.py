@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import da3_rows, export_rows, save_export, smooth_scene
+from messages import refuses
 from sweeps import sweep
 
 from gsmerge.alignment.dropped_rows import find_dropped_grid
+from gsmerge.errors import SceneError
 from gsmerge.scene.read import load_scene
 
 
@@ -99,4 +101,6 @@ def test_a_scale_that_cannot_be_measured_is_not_guessed(tmp_path: Path) -> None:
     c2w[:, :3, 3] *= 1.5
     kept = np.flatnonzero(rng.random(len(means)) > 0.4)
     folder = save_export(tmp_path, replace(tiny, c2w=c2w), export_rows(tiny, kept))
-    assert not load_scene(folder, order="view-major").scene.aligned
+    assert not load_scene(folder).scene.aligned
+    with refuses(SceneError, "scene.ply", "--hint order=view-major"):
+        load_scene(folder, order="view-major")

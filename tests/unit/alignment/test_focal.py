@@ -111,7 +111,7 @@ def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:
     for path in (folder / "context").iterdir():
         path.unlink()
     with refuses(SceneError, "transforms.json", "intrinsics", "photos"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder / "transforms.json")
     frames = json.loads((folder / "transforms.json").read_text())
     save_json(folder / "transforms.json", [frame | {"w": 96, "h": 72} for frame in frames])
     assert load_scene(folder).scene.cameras.Ks[0, 0, 0] == pytest.approx(FOCAL, rel=0.005)
@@ -119,4 +119,4 @@ def test_what_shows_no_focal_length_is_refused(tmp_path: Path) -> None:
     other = replace(SCENE, images=noise)
     some = np.random.default_rng(0).permutation(ROWS.size)[:9000]
     with refuses(SceneError, "transforms.json", "intrinsics", "focal"):
-        load_scene(write(tmp_path / "b", other, export_rows(other, some), frame_list))
+        load_scene(write(tmp_path / "b", other, export_rows(other, some), frame_list), cameras=tmp_path / "b")

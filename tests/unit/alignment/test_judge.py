@@ -64,7 +64,8 @@ def test_colours_tell_views_from_one_place_apart(tmp_path: Path, twins: Smooth, 
 def test_where_neither_decides_nothing_is_taken(tmp_path: Path, twins: Smooth) -> None:
     strange = np.random.default_rng(7).integers(0, 256, twins.images.shape, np.uint8)
     with refuses(SceneError, "transforms.json", "several", "--hint order=NAME"):
-        load_scene(save(tmp_path, twins, export_rows(twins), strange), order="view-major")
+        folder = save(tmp_path, twins, export_rows(twins), strange)
+        load_scene(folder, order="view-major", cameras=folder, images=folder / "images")
 
 
 def test_readings_that_differ_in_nothing_need_no_decision(tmp_path: Path, twins: Smooth) -> None:

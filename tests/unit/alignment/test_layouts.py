@@ -301,6 +301,6 @@ def test_previews_are_refused(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path, images=False)
     write_photos(tmp_path, SMOOTH, [cv2.resize(image, (24, 18)) for image in SMOOTH.images])
     with refuses(SceneError, "transforms.json", "48 x 36", "24 x 18"):
-        load_scene(tmp_path)
+        load_scene(tmp_path, cameras=tmp_path, images=tmp_path / "images")
     write_photos(tmp_path, SMOOTH, [cv2.resize(image, (44, 33)) for image in SMOOTH.images])
     assert load_scene(tmp_path).pixel_scene().images.shape == (3, 36, 48, 3)

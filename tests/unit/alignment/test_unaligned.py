@@ -79,7 +79,7 @@ def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
     for photo in (folder / "images").rglob("*.png"):
         photo.unlink()
     with refuses(SceneError, "scene.ply", 6720, "cameras"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder)
 
 
 def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +88,7 @@ def test_no_other_frame_stands_against_the_foremost_colours(tmp_path: Path, monk
     folder = save_export(tmp_path, SMOOTH, voxels())
     monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
     with refuses(SceneError, "scene.ply", "somewhere else", "colours", "--hint exporter"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder)
 
 
 def test_hidden_gaussians_say_nothing_about_the_foremost() -> None:
@@ -145,4 +145,4 @@ def test_rows_that_are_all_padding_are_refused(tmp_path: Path) -> None:
         rows[name] = 0
     folder = save_export(tmp_path, SMOOTH, rows)
     with refuses(SceneError, "scene.ply", "the cameras see 0 % of the Gaussians"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder)

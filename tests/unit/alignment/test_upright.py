@@ -102,7 +102,7 @@ def test_without_photos_that_show_them_they_are_refused(tmp_path: Path, textured
         for photo in (folder / "images").rglob("*.png"):
             photo.unlink()
     with refuses(SceneError, "scene.ply", "upright", "photos", "far cut"):
-        load_scene(folder)
+        load_scene(folder, cameras=folder)
 
 
 def test_rows_scaled_and_shifted_again_show_their_pixels(tmp_path: Path, textured: Smooth) -> None:
@@ -118,4 +118,4 @@ def test_rows_scaled_and_shifted_again_show_their_pixels(tmp_path: Path, texture
 def test_too_few_rows_for_a_stretch(tmp_path: Path, textured: Smooth) -> None:
     rows, _, _ = upright(textured, export_rows(textured, far_cut(textured)[:100]))
     with refuses(SceneError, "scene.ply"):
-        load_scene(save_export(tmp_path, textured, rows))
+        load_scene(save_export(tmp_path, textured, rows), cameras=tmp_path)

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from batches import QUICK, InlinePool, one_job, records, results, statuses
 from messages import names, refuses, says
+from network_fixtures import noisy, untrained, written
 
 from gsmerge.batch import jobs as calls
 from gsmerge.batch import run as runs
@@ -148,15 +149,17 @@ def test_a_scene_that_moved_is_still_the_same_until_a_new_version(
 
 
 def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: Path) -> None:
-    networks = tmp_path / "networks.safetensors"
-    networks.write_bytes(b"no networks")  # which is a note, and the analytic stages go on
+    networks = written(tmp_path / "networks.safetensors", untrained())
     said = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(networks)}))
     assert run(scene, out, said)["status"] == DONE
     other = Path(shutil.copy(networks, tmp_path / "same.safetensors"))
     same = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(other)}))
     assert run(scene, out, same)["status"] == SKIPPED
-    other.write_bytes(b"no networks either")
+    written(other, noisy())
     assert run(scene, out, same)["status"] == DONE
+    other.unlink()
+    with refuses(SceneError, "same.safetensors", "no such file"):
+        run(scene, out, same)
 
 
 @pytest.mark.parametrize("ending", [".sog", pytest.param(".spz", marks=pytest.mark.slow)])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import depth_map_mask, export_rows, save_export, smooth_scene
-from messages import names
+from messages import names, noted
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_npz
 
@@ -51,9 +51,12 @@ def test_cameras_that_do_not_fit_are_reported(tiny_folder: Path, tiny: Tiny) -> 
     assert actual["alignment"] is None
     assert "pixel" in str(actual["alignment_problem"])
     (tiny_folder / "transforms.json").write_text("nonsense")
-    actual = inspect(tiny_folder)
+    actual = inspect(tiny_folder, cameras=tiny_folder / "transforms.json")
     assert actual["num_views"] == 0
     assert "expected JSON" in str(actual["alignment_problem"])
+    actual = inspect(tiny_folder)
+    assert (actual["cameras"], actual["num_views"]) == (None, 0)
+    assert noted(actual["notes"], "transforms.json", "and the photos in", "left out", "expected JSON")
 
 
 def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
@@ -153,10 +156,10 @@ SMOOTH = smooth_scene(48, 36)
 PIXELS = np.arange(3 * 36 * 48).reshape(3, 36 * 48)
 
 
-def said(path: Path) -> dict[str, str]:
+def said(path: Path, **options: Path) -> dict[str, str]:
     """The lines by their first word; notes and all lines of one word joined."""
     actual: dict[str, str] = {}
-    for line in inspection_lines(inspect(path)):
+    for line in inspection_lines(inspect(path, **options)):
         word, rest = line[:11].strip(), line[11:]
         actual[word] = f"{actual[word]}; {rest}" if word in actual else rest
     return actual
@@ -228,7 +231,7 @@ def test_no_cameras(tmp_path: Path) -> None:
 def test_what_compact_would_refuse(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     (tmp_path / "transforms.json").write_text("nonsense")
-    lines = said(tmp_path)
+    lines = said(tmp_path, cameras=tmp_path / "transforms.json")
     assert "refuse" in lines["compact"]
     assert lines["exporter"].startswith("not known")
 

@@ -245,6 +245,6 @@ def test_views_dumped_from_a_model(tmp_path: Path, smooth: Tiny, root: Path) -> 
 
 def test_a_damaged_dump(tmp_path: Path, smooth: Tiny, root: Path) -> None:
     with refuses(SceneError, "views.npz", "'order'", "magic"):
-        read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"))
+        read_scene(dump_of(smooth, tmp_path / "order", root, order="magic"), cameras=tmp_path / "order")
     with refuses(SceneError, "views.npz", "[v,4,4]", (3, 4, 4)):
-        read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K))
+        read_scene(dump_of(smooth, tmp_path / "K", root, K=smooth.K), cameras=tmp_path / "K")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from messages import names, refuses
+from messages import names, noted, refuses
 from tiny_scene import (
     Tiny,
     edited_json,
@@ -87,8 +87,10 @@ def test_photos_of_others_are_refused(name: str, tmp_path: Path, tiny: Tiny) -> 
     write_images(tmp_path / "other", tiny)
     places = [name.format(n, root=tmp_path) for n in tiny.names]
     name_photos(folder, places)
-    with refuses(SceneError, folder, tmp_path / "other" / tiny.names[0], "--images"):
-        read_scene(folder)
+    load = load_scene(folder)
+    assert load.scene.images is None
+    assert load.left_out in load.notes
+    assert noted([load.left_out], str(tmp_path / "other" / tiny.names[0]), "--images")
     assert np.array_equal((read_scene(folder, images=tmp_path / "other").images * 255).round(), tiny.images)
     shutil.rmtree(tmp_path / "other")
     assert read_scene(folder).images is None  # as on every machine but the one that trained it
@@ -169,17 +171,17 @@ def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
 def test_cameras_of_another_shape(tiny_folder: Path, tiny: Tiny) -> None:
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=30))
     with refuses(SceneError, "transforms.json", "20 x 14", "30 x 14", "crop"):
-        read_scene(tiny_folder, order="view-major")
+        read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
     rewrite(tiny_folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "14 x 20", "swapped"):
-        read_scene(tiny_folder, order="view-major")
+        read_scene(tiny_folder, order="view-major", cameras=tiny_folder, images=tiny_folder / "images")
 
 
 def test_swapped_sizes_without_images(tmp_path: Path, tiny: Tiny) -> None:
     folder = tiny.save(tmp_path, images=False)
     rewrite(folder / "transforms.json", lambda data: data.update(w=14, h=20))
     with refuses(SceneError, "transforms.json", "median", "swapped"):
-        read_scene(folder, order="view-major")
+        read_scene(folder, order="view-major", cameras=folder)
 
 
 def test_too_few_images_in_an_npz(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
@@ -194,7 +196,7 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     strange[:, :3, 3] += np.array([[0.3], [-0.2], [0.4]])
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
     with refuses(SceneError, "transforms.json", "median", "1.5 px", "100 %", "convention"):
-        read_scene(tiny_folder, order="view-major")
+        read_scene(tiny_folder, order="view-major", cameras=tiny_folder)
 
 
 def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -167,13 +167,13 @@ def test_no_photos_or_others_are_refused(tmp_path: Path) -> None:
     SMOOTH.save(tmp_path, cameras=False, images=False)
     as_transforms(tmp_path, SMOOTH, [0.1, 0, 0, 0])
     with refuses(SceneError, "transforms.json", "OPENCV", "--images"):
-        load_scene(tmp_path)
-    assert "no images" in inspect(tmp_path)["alignment_problem"]
+        load_scene(tmp_path, cameras=tmp_path)
+    assert "no images" in inspect(tmp_path, cameras=tmp_path)["alignment_problem"]
     with refuses(SceneError, "transforms.json: view images/a b/2.png", "OPENCV"):
         to_cameras(read_cameras(tmp_path))
     write_images(tmp_path / "images", replace(SMOOTH, images=SMOOTH.images[:, :, :40]))
     with refuses(SceneError, "transforms.json", "60 x 45", "OPENCV", "40 x 45"):
-        load_scene(tmp_path)
+        load_scene(tmp_path, cameras=tmp_path, images=tmp_path / "images")
 
 
 @pytest.mark.parametrize(

@@ -231,7 +231,7 @@ def test_without_it_the_cameras_do_not_see_the_gaussians(tmp_path: Path) -> None
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     (tmp_path / "dataparser_transforms.json").unlink()
     with refuses(SceneError, "scene.ply", 1296, 864):
-        load_scene(tmp_path)
+        load_scene(tmp_path, cameras=tmp_path / "sparse")
 
 
 @sweep(
@@ -250,7 +250,7 @@ def test_a_damaged_file(tmp_path: Path, text: str, found: object) -> None:
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     (tmp_path / "dataparser_transforms.json").write_text(text)
     with refuses(SceneError, "dataparser_transforms.json", found):
-        load_scene(tmp_path)
+        load_scene(tmp_path, cameras=tmp_path / "sparse")
 
 
 def test_poses_that_instantsplat_optimised(tmp_path: Path, tiny: Tiny) -> None:

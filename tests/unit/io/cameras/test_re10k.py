@@ -39,7 +39,7 @@ def test_the_scene_is_picked_by_the_name_of_the_ply(tmp_path: Path) -> None:
     assert np.abs(scene.images * 255 - SMOOTH.images).mean() < 2
     (tmp_path / "a.ply").rename(tmp_path / "c.ply")
     with refuses(SceneError, "000000.torch", "'c'", 2, "(b, a, ...)"):
-        load_scene(tmp_path)
+        load_scene(tmp_path, cameras=tmp_path / "000000.torch")
 
 
 def test_the_only_scene_needs_no_name(tmp_path: Path) -> None:

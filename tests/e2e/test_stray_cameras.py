@@ -1,0 +1,82 @@
+"""Cameras beside a file that belong to another one: a note, and with ``--strict`` a doubt."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from messages import ERROR, names
+
+from .conftest import Run, assert_refused
+
+FEW = ("--budget", "20%", "--fit", "none", "--effort", "draft", "--threads", 1)
+
+
+@pytest.fixture
+def stray(tmp_path: Path, smallest_scene: Path) -> Path:
+    """A scene beside a damaged camera file."""
+    folder = tmp_path / "room"
+    folder.mkdir()
+    shutil.copy(smallest_scene / "scene.ply", folder)
+    (folder / "transforms.json").write_text('{"frames": [')
+    return folder
+
+
+def test_a_note_and_with_strict_a_doubt(stray: Path, run: Run) -> None:
+    words = ("compact", stray, "-o", stray / "small.ply", "--overwrite", *FEW)
+    document = json.loads(run(*words, "--json", code=0).out)
+    note = document["input"]["left_out"]
+    assert names(note, stray / "transforms.json", "left out")
+    assert document["notes"].count(note) == 1
+    outcome = run(*words, "--strict", code=4)
+    assert outcome.err.count(note) == 1
+    assert outcome.err.endswith(f"{ERROR}{note}\n")
+    assert (stray / "small.ply").is_file()
+    assert note not in run(*words, "--cameras", "none", "--strict").err
+    assert_refused(run(*words, "--cameras", stray / "transforms.json"), 3, "transforms.json", "--cameras none")
+
+
+def test_a_batch_says_so_again_where_it_is_done(stray: Path, run: Run) -> None:
+    words = ("batch", stray, "-o", stray.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
+    for _ in range(2):
+        outcome = run(*words, code=0)
+        assert outcome.out.count("left out") == 1
+    outcome = run(*words, "--strict", code=4)
+    assert outcome.err.endswith(f"{ERROR}1 of 1 scenes are read without what does not belong to them\n")
+    assert "left out" not in run(*words, "--cameras", "none", "--strict").out
+
+
+@pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)
+def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stray: Path, run: Run) -> None:
+    small = stray / "small.ply"
+    shutil.copy(stray / "scene.ply", small)
+    (stray / "small.cameras.json").write_text("nonsense")
+    places = {
+        "SCENE": str(stray / "scene.ply"),
+        "SMALL": str(small),
+        "OUT.png": stray / "a.png",
+        "OUT.spz": stray / "a.spz",
+    }
+    parts: list[Any] = [places.get(word, word) for word in words]
+    assert "left out" in run(*parts, code=0).err
+    assert "left out" not in run(*parts, "--overwrite", "--cameras", "none", code=0).err
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "value"),
+    [
+        ("--hint opacity=raw", "scene.ply", "--hint opacity=raw"),
+        ("--set checkpoint=nosuch", "nosuch", "checkpoint"),
+    ],
+)
+def test_what_cannot_be_is_refused(words: str, place: str, value: str, smallest_copy: Path, run: Run) -> None:
+    assert_refused(run("compact", smallest_copy, *words.split()), 3, place, value)
+
+
+@pytest.mark.parametrize("command", ["compact A", "extend A.gsm A", "render A", "view A B", "batch A", "lab chart A"])
+def test_one_output(command: str, run: Run, tmp_path: Path) -> None:
+    assert_refused(run(*command.split(), "-o", tmp_path / "a.ply", "-o", tmp_path / "b.spz"), 2, "")
+    assert list(tmp_path.iterdir()) == []

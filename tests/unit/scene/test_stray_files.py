@@ -1,0 +1,159 @@
+"""Cameras, photos and masks beside a file that belong to something else, and ``none`` in their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from exports import export_rows, save_export, smooth_scene
+from messages import names, noted, refuses
+from sweeps import sweep
+from tiny_scene import Tiny, rotation, write_colmap_binary, write_images, write_inria, write_npz, write_transforms
+
+from gsmerge.errors import SceneError
+from gsmerge.scene.read import Loaded, load_scene, read_scene
+
+SMOOTH = smooth_scene(56, 40)
+ALL = np.arange(len(SMOOTH.gaussians))
+SOME = np.random.default_rng(0).permutation(ALL)[:4027]
+KINDS = {"grid": ALL, "voxels": SOME[np.lexsort(SMOOTH.gaussians.means[SOME].round(1).T)]}
+
+
+def another() -> Tiny:
+    """Cameras and photos of another capture, of four views."""
+    c2w = np.concatenate([SMOOTH.c2w, SMOOTH.c2w[:1]])
+    for pose, (x, y, z) in zip(c2w, np.random.default_rng(1).uniform(-1, 1, (4, 3)), strict=True):
+        pose[:3, :3], pose[:3, 3] = rotation(3 * x, 3 * y, z), (50 + x, y, 9 * z)
+    images = np.random.default_rng(0).integers(0, 256, (4, 40, 56, 3), np.uint8)
+    return replace(SMOOTH, c2w=c2w, images=images, names=("o/1.png", "o/2.png", "o/3.png", "o/4.png"))
+
+
+def with_photos(folder: Path) -> None:
+    write_transforms(folder / "transforms.json", another())
+    write_images(folder / "images", another())
+
+
+STRAY: dict[str, Callable[[Path], object]] = {
+    "transforms.json": lambda folder: write_transforms(folder / "transforms.json", another()),
+    "images": with_photos,
+    "cameras.json": lambda folder: write_inria(folder / "cameras.json", another()),
+    "colmap": lambda folder: write_colmap_binary(folder / "colmap", another()),
+    "results.npz": lambda folder: write_npz(folder / "results.npz", another()),
+    "views.npz": lambda folder: (folder / "views.npz").write_bytes(b"PK\3\4nothing"),
+    "damaged": lambda folder: (folder / "transforms.json").write_text('{"frames": ['),
+    "other": lambda folder: (folder / "cameras.json").write_text('{"camera": {"fov": 60}}'),
+}
+
+
+def save(folder: Path, kind: str, *, cameras: bool = False) -> Path:
+    return save_export(folder, SMOOTH, export_rows(SMOOTH, KINDS[kind]), cameras=cameras)
+
+
+def same(actual: Loaded, alone: Loaded) -> bool:
+    scenes = actual.scene, alone.scene
+    means = [scene.gaussians.means for scene in scenes]
+    return np.array_equal(*means) and len({(len(scene), scene.aligned, scene.images is None) for scene in scenes}) == 1
+
+
+@sweep("stray", STRAY, often=3)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_belongs_to_something_else_is_left_out(tmp_path: Path, kind: str, stray: str) -> None:
+    alone = load_scene(save(tmp_path / "alone", kind))
+    folder = save(tmp_path / "scene", kind)
+    STRAY[stray](folder)
+    actual = load_scene(folder)
+    assert same(actual, alone)
+    assert actual.left_out is not None
+    assert actual.files.cameras is None
+    others = [note for note in actual.notes if note != actual.left_out]
+    assert [note for note in others if "photos" not in note or kind == "voxels"] == list(alone.notes)
+    assert actual.recognised["left_out"] == actual.left_out
+    with pytest.warns(UserWarning, match="left out"):
+        read_scene(folder)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cameras_that_are_named_are_refused(tmp_path: Path, kind: str) -> None:
+    folder = save(tmp_path, kind)
+    write_transforms(folder / "transforms.json", another())
+    with refuses(SceneError, "scene.ply", "--cameras none"):
+        load_scene(folder, cameras=folder / "transforms.json")
+    alone = load_scene(folder, cameras="none")
+    assert alone.left_out is None
+    assert alone.files.cameras is None
+
+
+def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> None:
+    folder = save(tmp_path, "grid")
+    write_transforms(folder / "transforms.json", SMOOTH)
+    write_images(folder / "images", another())
+    actual = load_scene(folder)
+    assert names(str(actual.left_out), "the photos in", folder / "images", "3 images", 4)
+    assert np.allclose(actual.scene.cameras.viewmats, SMOOTH.w2c)
+    assert actual.scene.images is None
+    with refuses(SceneError, "images", "3 images", "--images none"):
+        load_scene(folder, images=folder / "images")
+
+
+def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
+    folder = save(tmp_path, "grid")
+    write_images(folder / "images", another())
+    assert names(str(load_scene(folder).left_out), "the photos in", folder / "images", "not used")
+
+
+def test_a_damaged_photo(tmp_path: Path) -> None:
+    folder = save(tmp_path, "grid", cameras=True)
+    (folder / "images" / SMOOTH.names[0]).write_bytes(b"\x89PNG nothing")
+    actual = load_scene(folder)
+    assert names(str(actual.left_out), "the photos in", SMOOTH.names[0], "image")
+    assert len(actual.scene) == 3
+
+
+def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:
+    folder = save(tmp_path, "grid")
+    for number in range(3):
+        (folder / f"{number}.png").write_bytes(b"\x89PNG nothing")
+    assert names(str(load_scene(folder).left_out), "the photos in", folder, "0.png")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_none(tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of that name has a path."""
+    folder = save(tmp_path, kind, cameras=True)
+    write_images(folder / "masks", replace(SMOOTH, images=np.full_like(SMOOTH.images, 255)))
+    assert load_scene(folder, images="none").scene.images is None
+    assert len(load_scene(folder, images="none").scene) == 3
+    assert load_scene(folder, masks="none").files.masks is None
+    alone = load_scene(folder, cameras="none", images="none")
+    assert len(alone.scene) == (3 if kind == "grid" else 0)
+    assert alone.left_out is None
+    (folder / "none").mkdir()
+    (folder / "transforms.json").rename(folder / "none" / "transforms.json")
+    monkeypatch.chdir(folder)
+    assert load_scene(folder, cameras=Path("none")).files.cameras == Path("none")
+    assert load_scene(folder, cameras="./none").files.cameras == Path("none")
+
+
+def test_masks_that_nothing_names(tmp_path: Path) -> None:
+    """Dark nearly everywhere, or damaged."""
+    folder = save(tmp_path, "grid", cameras=True)
+    write_images(folder / "masks", replace(SMOOTH, images=np.zeros_like(SMOOTH.images)))
+    assert noted(load_scene(folder).notes, "masks are not used", "100 %")
+    with refuses(SceneError, "masks", "100 %"):
+        load_scene(folder, masks=folder / "masks")
+    (folder / "masks" / SMOOTH.names[1]).write_bytes(b"\x89PNG nothing")
+    actual = load_scene(folder)
+    assert names(str(actual.left_out), "the masks in", SMOOTH.names[1])
+    assert actual.scene.images is not None
+
+
+@pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "column-major"}, {"quats": "camera"}], ids=str)
+def test_hints_on_pixels_for_rows_that_have_none(tmp_path: Path, hints: dict[str, str]) -> None:
+    ((name, value),) = hints.items()
+    for cameras in (False, True):
+        folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
+        with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):
+            load_scene(folder, **hints)
