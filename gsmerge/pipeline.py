@@ -35,7 +35,8 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
     long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
-    if not long or not prepared.reference.of_views:  # what placed views see is all there is
+    whole = prepared.scene.empty is None
+    if not long or not whole or not prepared.reference.of_views:  # what placed views see is all there is
         return fitted
     return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras))
 

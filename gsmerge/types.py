@@ -370,9 +370,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class PicturedScene(Scene):
-    """A scene that has a picture of every view: its photo, or what stands in for it."""
+    """A scene that has a picture of every view: its photo, or what stands in for it.
+
+    Pictures are black, and do not count for scores, where ``empty [v,h,w]``: nothing may be there; None: nowhere.
+    """
 
     images: np.ndarray
+    empty: np.ndarray | None = None
 
     @staticmethod
     def of(scene: Scene, images: np.ndarray, masks: np.ndarray | None) -> PicturedScene:

@@ -210,8 +210,8 @@ class Totals:
         lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 6, 4, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        told = ((UNUSED[:-2], self.unused), ("worse", self.worse), ("note", self.left_out), (FAILED, self.failed))
-        for status, reasons in told:
+        kinds = ((UNUSED[:-2], self.unused), ("worse", self.worse), ("note", self.left_out), (FAILED, self.failed))
+        for status, reasons in kinds:
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
         counts = [f"{self.counts[x]:,} {x}" for x in (DONE, SKIPPED, FAILED) if self.counts[x] or x == DONE]

@@ -129,9 +129,11 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     cut = slice(None), slice(0, height * step), slice(0, width * step)
     images = [cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA) for photo in scene.images[cut]]
     middle = slice(None), slice(step // 2, height * step, step), slice(step // 2, width * step, step)
-    masks, missing = (None if mask is None else mask[middle] for mask in (scene.masks, scene.missing))
+    masks, missing, empty = (
+        None if mask is None else mask[middle] for mask in (scene.masks, scene.missing, scene.empty)
+    )
     small = replace(
-        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=np.stack(images), masks=masks,
+        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=np.stack(images), masks=masks, empty=empty,
         gaussians=scene.gaussians[:0], pixel_ids=None, missing=None,
         large_photos=None,
     )  # fmt: skip

@@ -201,7 +201,9 @@ def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
     """Score the input's own Gaussians, over the pixels that have a row if rows have pixels."""
     if not prepared.reference.of_views:
         return None
-    scene = prepared.input_scene
+    scene, shown = prepared.input_scene, prepared.scene
+    if shown.empty is not None:  # where a result may show nothing, the input is not compared either
+        scene = replace(scene, masks=prepared.result_views().masks)
     covered = None if scene.missing is None else list(scene.stored[list(plan.scored_views)])
     return _score_photos("input", scene.file_gaussians, scene, prepared, plan, covered)
 

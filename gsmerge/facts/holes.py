@@ -10,11 +10,13 @@ them, and what is empty there continues the farther side of the surfaces around,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.row_colors import fill_gaps
 from gsmerge.geometry import nearest_views, project, rgb_to_sh0
@@ -30,6 +32,8 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
+NOTHING = 0.1  # the same below which it shows nothing
+LARGE, RIM = 1 / 12, 2  # of the longer side: squares in large parts that stay empty; pixels beside them that do not
 MOST = 0.5  # share of empty pixels from which on rows without pixels may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
@@ -54,28 +58,38 @@ REACH = 2  # pixels: standing so far beside a picture, a Gaussian still reaches 
 FRONT = 0.98  # of the depth of a surface, in front of which a camera would see a Gaussian
 
 
-def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
-    """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers; add a note.
+def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
+    """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, or leave large parts empty; add notes.
 
     ``shown [v,h,w]``: pixels whose picture says what is there. Where rows belong to pixels, only pixels without a row
     get a Gaussian, which takes their row. Elsewhere the new Gaussians follow the others, and none is added where most
-    pixels are empty: the scene may be a part of what the photos show.
+    pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view without
+    Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
     """
-    free = shown & ~scene.valid if scene.aligned else shown
-    if not free.any():
+    bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > FAINT) if scene.aligned else ~shown
+    bare, free = ~bare, shown & ~scene.valid if scene.aligned else shown
+    if not (free.any() or (scene.aligned and not everywhere and any(map(_any_large, bare)))):
         return scene
-    holes, parts = np.zeros_like(free), dict[int, Gaussians]()
+    holes, empty, parts = np.zeros_like(free), np.zeros_like(free), dict[int, Gaussians]()
 
     def fill(view: int, tiled: TiledView) -> None:
         depths, left = _blend_depths(tiled)
         covered = left <= 1 - EMPTY
-        holes[view] = free[view] & ~covered
+        if not everywhere:
+            empty[view] = large_parts(left > 1 - NOTHING)
+        holes[view] = free[view] & ~covered & ~empty[view]
         if covered.any() and holes[view].any():
             parts[view] = _fill_view(scene, view, holes[view], covered, depths)
 
     tile_views(scene, fill)
-    if not parts or not (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
-        return scene
+    filled = scene
+    if parts and (scene.aligned or np.count_nonzero(holes) < MOST * np.count_nonzero(shown)):
+        filled = _add_holes(scene, holes, parts)
+    return _leave_empty(filled, empty)
+
+
+def _add_holes(scene: PicturedScene, holes: np.ndarray, parts: Mapping[int, Gaussians]) -> PicturedScene:
+    """Add the Gaussians ``parts`` of each view's ``holes [v,h,w]`` to a scene, with a note."""
     added = Gaussians.concat([parts[view] for view in sorted(parts)])
     note(f"{len(added):,} pixels that no Gaussian covers are filled with the colours of their pictures")
     if not scene.aligned:
@@ -85,6 +99,38 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray) -> PicturedScene:
     for name, values in vars(added).items():
         columns[name][holes.reshape(-1)] = values
     return replace(scene, gaussians=Gaussians(**columns), pixel_ids=grid_ids(scene.valid | holes))
+
+
+def _any_large(empty: np.ndarray) -> bool:
+    return bool(empty.any()) and bool(large_parts(empty).any())
+
+
+def large_parts(empty: np.ndarray) -> np.ndarray:
+    """Return the connected parts of a mask ``[h,w]`` that hold a large square, less a rim of some pixels.
+
+    Borders that exporters leave out, and gaps, are narrower.
+    """
+    side = 2 * round(LARGE * max(empty.shape) / 2) + 1
+    square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)
+    _, labels = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
+    kept = np.isin(labels, labels[cv2.erode(empty.astype(np.uint8), square) > 0])
+    return np.asarray(cv2.erode(kept.astype(np.uint8), rim) > 0)
+
+
+def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
+    """Make pictures black and of no account for scores where they are to stay ``empty [v,h,w]``, with a note."""
+    if not empty.any():
+        return scene
+    views, share = int(empty.any((1, 2)).sum()), 100 * float(empty.mean())
+    note(
+        f"the scene shows nothing in {share:.0f} % of the pixels of its views, in large parts of {views} of {len(empty)}:"
+        " they stay empty, and photos do not count there; --set extent=photos fills them"
+    )
+    images = np.where(empty[..., None], np.float32(0), scene.images)
+    masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
+    if large is not None:
+        large = change_large(large, [PhotoChange(cover=mask, colors=np.zeros((*mask.shape, 3), np.float32)) for mask in empty])
+    return replace(scene, images=images, masks=masks, large_photos=large, empty=empty)
 
 
 def _blend_depths(tiled: TiledView) -> tuple[np.ndarray, np.ndarray]:

@@ -208,17 +208,21 @@ def prepare(
         if agreement.doubt:
             note(agreement.doubt)
         prepared = replace(prepared, agreement=agreement)
-    return _without_holes(prepared) if fill and prepared.reference.of_views else prepared
+    return _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
 
 
-def _without_holes(prepared: Prepared) -> Prepared:
-    """Return a copy with Gaussians also where the photos show something and no Gaussian is."""
-    scene, views = prepared.scene, list(prepared.reference.score_views)  # whose photos show the scene
+def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
+    """Return a copy with Gaussians also where the photos show something and no Gaussian is, but in large parts."""
+    scene, views = prepared.scene, prepared.reference.score_views  # whose photos show the scene
     shown = np.zeros(scene.images.shape[:3], bool)
     by_rows = prepared.reference.name == ROW_COLORS  # the gaps in their pictures have the colours beside
-    shown[views] = True if by_rows or scene.masks is None else scene.masks[views]
-    filled = fill_holes(scene, shown)
-    return replace(prepared, scene=filled)
+    shown[list(views)] = True if by_rows or scene.masks is None else scene.masks[list(views)]
+    filled = fill_holes(scene, shown, everywhere=options.extent == "photos")
+    reference = prepared.reference
+    if filled.empty is not None and filled.masks is not None:
+        seen = tuple(view for view in views if filled.masks[view].any())
+        reference = replace(reference, score_views=seen or views, fit_views=seen or reference.fit_views)
+    return replace(prepared, scene=filled, reference=reference)
 
 
 def _prepare_pixels(

@@ -88,6 +88,8 @@ def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
     names = tuple(scene.names[i] for i in ids)
     large = None if scene.large_photos is None else scene.large_photos[ids]
     masks = None if scene.masks is None else scene.masks[ids]
+    empty = getattr(scene, "empty", None)
+    scene = scene if empty is None else replace(scene, empty=empty[ids])  # type: ignore[call-arg]  # of PicturedScene
     if not scene.aligned:
         return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large, masks=masks)
     size = scene.pixels_per_view

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from gsmerge.raster.photos import EPS2D, Photos, pixel_weights, scene_photos
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Scene
+from gsmerge.types import PicturedScene, Scene
 
 AUTO_SCALE = 2.0  # most that "auto" looks at: steps cost as many pixels, and photos beyond that are rarely sharp
 MIN_AUTO_SCALE = 1.25  # below it "auto" leaves it at the views' size
@@ -22,14 +23,14 @@ PATCH = 32  # pixels, at most
 HIDDEN = np.float32(1e-9)  # a weight that is neither that of a held-out pixel nor one that counts
 
 
-def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
+def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
     """Return the photos at full and half size, and larger if ``photo_scale`` is above 1, which goes into the record."""
     views = range(len(scene)) if views is None else views
-    photos = scene_photos(scene)[views], scene_photos(scene, 2)[views]
+    photos = _with_empty(scene_photos(scene), scene)[views], _with_empty(scene_photos(scene, 2), scene)[views]
     scale = 1.0 if options.photo_scale == "auto" else options.photo_scale
     if scale == 1:
         return photos
-    large = large_photos(scene, scale)[views]
+    large = _with_empty(large_photos(scene, scale), scene)[views]
     size = f"{large.width} x {large.height}"
     choose(photo_scale=round(scale, 4))
     note(
@@ -37,6 +38,17 @@ def fit_photos(scene: Scene, options: FitOptions, views: Sequence[int] | None = 
         f" {size} as well, which takes time; --set photo_scale=1 does without"
     )
     return *photos, large
+
+
+def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
+    """Return the photos with the pixels that show the background, which count in a fit."""
+    if scene.empty is None:
+        return photos
+    size = photos.width, photos.height
+    shares = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in scene.empty]
+    empty = np.stack(shares) / np.float32(255)
+    weights = None if photos.weights is None else np.maximum(photos.weights, empty)
+    return replace(photos, weights=weights, empty=empty)
 
 
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:

@@ -97,7 +97,7 @@ class Optimiser:
         image, transmittance = blend(drawn, colors, step.background)
         rates = self.run.job.options.tuning
         weights = loss_weights(rates, step.progress)
-        gradient, error = image_gradient(image, photos.image(step.view), weight, *weights)
+        gradient, error = image_gradient(image, photos.image(step.view, step.background), weight, *weights)
         with_viewmat = self.poses is not None
         g = gradients_of(drawn, colors, image, transmittance, gradient, None, with_viewmat=with_viewmat)
         if self.poses is not None and g.viewmat is not None:  # that harmonics change with the camera is left out
@@ -124,9 +124,8 @@ class Optimiser:
                 "loss_weights": np.array(loss_weights(rates, step.progress), np.float32),
             }
             drawn = state.splats.opacities if opacities is None else opacities
-            return tables.take(
-                step.number, np.ascontiguousarray(photos.image(step.view), np.float32), weight, drawn, numbers
-            )
+            photo = np.ascontiguousarray(photos.image(step.view, step.background), np.float32)
+            return tables.take(step.number, photo, weight, drawn, numbers)
 
     def _constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
         """Return the optimiser's constants at a step."""

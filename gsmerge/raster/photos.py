@@ -60,6 +60,7 @@ class Photos:
     # against the filter that they will be rendered with
     eps2d: float
     weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
+    empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
 
     def __len__(self) -> int:
         return len(self.images)
@@ -70,7 +71,8 @@ class Photos:
         if ids == list(range(len(self))):
             return self
         weights = None if self.weights is None else self.weights[ids]
-        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, weights)
+        empty = None if self.empty is None else self.empty[ids]
+        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, weights, empty)
 
     @property
     def height(self) -> int:
@@ -82,10 +84,13 @@ class Photos:
         """Number of columns."""
         return self.images.shape[2]
 
-    def image(self, view: int) -> np.ndarray:
-        """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1]."""
+    def image(self, view: int, background: np.ndarray | None = None) -> np.ndarray:
+        """Return the photo of a view ``[h,w,3]``, sRGB in [0, 1], before a ``background [3]``; None: black."""
         image = self.images[view]
-        return np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
+        image = np.multiply(image, np.float32(1 / 255), dtype=np.float32) if image.dtype == np.uint8 else image
+        if self.empty is None or background is None:
+            return image
+        return np.asarray(image + self.empty[view][..., None] * background, np.float32)
 
     def camera(self, view: int) -> dict[str, Any]:
         """Return the arguments of :func:`gsmerge.raster.tile_view` for rendering into a photo."""

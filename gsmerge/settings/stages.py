@@ -13,6 +13,7 @@ from gsmerge.settings.setting import Settings, setting
 Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
 Unseen = Literal["drop", "keep"]
+Source = Literal["auto", "photos"]
 Method = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
@@ -31,7 +32,7 @@ DROPS = ("floaters", "sky", "transparent")
 
 @dataclass(frozen=True)
 class PrepareOptions(Settings):
-    """Settings of the preparation: poses, exposure and unseen Gaussians."""
+    """Settings of the preparation: poses, exposure, unseen Gaussians, and what photos may change."""
 
     poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
         "`free`: views are moved to where their photos agree, and the fit moves the cameras on; `auto`: where some "
@@ -42,6 +43,10 @@ class PrepareOptions(Settings):
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
         "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
         "others.")  # fmt: skip
+    look: Source = setting("auto", "Whose colours a result has where the scene has another look than its photos: auto: "
+        "the scene's own; photos: theirs.")  # fmt: skip
+    extent: Source = setting("auto", "What large parts of a photo become in which the scene shows nothing: auto: empty, "
+        "as of a scene that was cut out or has no sky; photos: filled with what they show.")  # fmt: skip
 
 
 @dataclass(frozen=True)
