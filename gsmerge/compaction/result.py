@@ -282,8 +282,7 @@ def make_result(
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
     new_views = None
     if trial is not None and before is not None and main.psnr_after is not None:
-        own = (covered[0].before, covered[0].after) if covered[0] else (before, main.psnr_after)
-        new_views = trial.predict(*own, prepared.agreement)
+        new_views = trial.predict(before, main.psnr_after, prepared.agreement)
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"], new_views=new_views)
     coarser = tuple(
         CompactResult(

@@ -36,7 +36,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import PrepareOptions
+from gsmerge.settings.stages import PrepareOptions, Source
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
@@ -229,7 +229,7 @@ def _prepare_pixels(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
     """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
-    scene, views = _with_pictures(canonical, add_row_colors)
+    scene, views = _with_pictures(canonical, add_row_colors, options.look)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, every, views) if views else Reference(ROW_COLORS, every, every)
     given = _with_photos(given, scene, repeated)
@@ -242,15 +242,12 @@ def _prepare_pixels(
 def _prepare_others(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
-    """Prepare a scene whose rows belong to no pixels: without photos renders of it replace them.
-
-    Where photos are given and none shows the scene, nothing is fitted to the renders.
-    """
-    scene, views = _with_pictures(canonical, blank_pictures)
+    """Prepare a scene whose rows belong to no pixels: without photos that show it renders of it replace them."""
+    scene, views = _with_pictures(canonical, blank_pictures, options.look)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, views, views)
     if not views:
-        reference = Reference(RENDERS, every if given.images is None else (), every)
+        reference = Reference(RENDERS, every, every)
     unseen = scene.gaussians[:0]
     if options.unseen == "keep":
         scene, unseen = _split_unseen(scene)
@@ -264,13 +261,15 @@ def _prepare_others(
     return Prepared(given, scene, frame, reference, repeated, moved=False, unseen=unseen)
 
 
-def _with_pictures(scene: Scene, stand_in: Callable[[Scene], PicturedScene]) -> tuple[PicturedScene, tuple[int, ...]]:
+def _with_pictures(
+    scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Source
+) -> tuple[PicturedScene, tuple[int, ...]]:
     """Return a scene with a picture of every view, and the views whose photos a fit may use.
 
     If no photo shows the scene, its pictures are made by ``stand_in``, and there are no such views.
     """
     if scene.images is not None:
-        pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks))
+        pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks), look)
         if views:
             return pictured, views
     return stand_in(replace(scene, images=None, large_photos=None, masks=None)), ()
