@@ -14,12 +14,14 @@ from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
+from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.coverage import TRANSPARENT, coverage, extents
+from gsmerge.plan import describe_share
 from gsmerge.report import finite
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
@@ -30,7 +32,6 @@ from gsmerge.scene.read import align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.stages.encode import measured_share
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
 
@@ -74,7 +75,9 @@ def inspect(
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
-        ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``. ``compact``: the estimate
+        ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
+        shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
+        ``contradicted``, ``alone``). ``compact``: the estimate
         of a run, None where it would refuse the scene; ``auto``: ``share``, ``num_gaussians`` and ``why`` of
         ``--budget auto``. ``notes``: warnings.
 
@@ -120,10 +123,16 @@ def _photo_notes(scene: Scene) -> list[str]:
     return record.notes
 
 
-def _describe_auto(scene: Scene) -> dict[str, Any] | None:
+def _measure_agreement(scene: Scene) -> Agreement | None:
+    return confirm_depths(canonicalise(scene)[0]) if scene.aligned and scene.valid.any() else None
+
+
+def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
     """Describe the number that an automatic budget takes by the depths of several views; None for other scenes."""
-    share, why = measured_share(canonicalise(scene)[0]) if scene.aligned else (None, "")
-    return None if share is None else {"share": share, "num_gaussians": int(share * scene.num_gaussians), "why": why}
+    if agreement is None:
+        return None
+    count = int(agreement.share * scene.num_gaussians)
+    return {"share": agreement.share, "num_gaussians": count, "why": describe_share(agreement)[1]}
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
@@ -134,7 +143,9 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "exporter": _OWN if is_result else "not known before the cameras fit",
         "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
-        **dict.fromkeys(("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto")),
+        **dict.fromkeys(
+            ("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement")
+        ),
         "coverage": [],
     }
     try:
@@ -156,7 +167,9 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
-    facts |= {"auto": _describe_auto(scene)}
+    agreement = _measure_agreement(scene)
+    facts |= {"auto": _describe_auto(scene, agreement), "agreement": agreement and agreement.to_dict()}
+    facts["notes"] += [agreement.doubt] if agreement is not None and agreement.doubt else []
     if not is_result:
         facts["exporter"] = exporter_names(load.exporters)
     if shows_nothing(scene):
@@ -197,6 +210,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"images     {scene['images'] or 'none found'}",
         *_alignment_lines(scene),
         *_coverage_lines(scene),
+        *_agreement_lines(scene),
     ]
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
@@ -259,3 +273,15 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     if low != high:
         each = f"{low} to {high} % of the {what} per view, least in {views[shares.index(min(shares))]['name']}"
     return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"]
+
+
+def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
+    """Describe how far views confirm each other's depth."""
+    agreement = scene["agreement"]
+    if agreement is None:
+        return []
+    confirmed, contradicted, alone = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
+    return [
+        f"depth      {confirmed} of the pixels confirmed by other views, {contradicted} contradicted, {alone} seen by no"
+        " other"
+    ]

@@ -29,14 +29,14 @@ from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
 SIDE = 120  # pixels of the longer side, at least
-STEPS = 160  # of the fit, at most
+STEPS = 150  # of the fit, at most
 PART, MOST = 6, 3  # one of so many views is left out in each of two rounds, at most so many
 CANDIDATES = 24  # views among which they are chosen
 COARSE = 4  # times a small pixel: what others see is measured by
 LEAST_SEEN = 0.02  # share of a left-out photo that the others must cover
-# Share of what the result's own photos gain that new views gain at most, where depth is not known to be confirmed. On ten
-# training captures it is .1 to .95, at most .07 above the share of confirmed depth; small pictures alone say more where
-# detail is finer than they show.
+# Share of what the result's own photos gain that new views gain at most, where depth is not known to be confirmed. On
+# ten training captures it is .1 to .95, at most .07 above the share of confirmed depth; small pictures alone say more
+# where detail is finer than they show.
 MOST_KEPT = 0.85
 # What a run of these settings decides by work on the whole scene, or leaves out of the result
 LEFT_TO_RUN: dict[str, Any] = {
@@ -133,9 +133,8 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
         None if mask is None else mask[middle] for mask in (scene.masks, scene.missing, scene.empty)
     )
     small = replace(
-        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=np.stack(images), masks=masks, empty=empty,
-        gaussians=scene.gaussians[:0], pixel_ids=None, missing=None,
-        large_photos=None,
+        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=np.stack(images), masks=masks,
+        empty=empty, gaussians=scene.gaussians[:0], pixel_ids=None, missing=None, large_photos=None,
     )  # fmt: skip
     if not scene.aligned:
         return replace(small, gaussians=scene.gaussians)

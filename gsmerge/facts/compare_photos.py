@@ -59,8 +59,8 @@ OTHER_LOOK = "the scene has another look than its photos"
 # Correlation of edges, chosen on twelve looks of three captures: .57 to .99, or with colours by depth .13 to .41 and .1
 # above that with other views; that is -.05 to .33
 LOOK_SIDE, OWN_EDGES, MORE_EDGES = 96, 0.5, 0.1
-# Errors of a linear map as a share of those of tones, in the median and in the root mean square: one or the other is .86
-# or more with photos of 15 captures and with mild grades, both are .17 to .76 with styles
+# Errors of a linear map as a share of those of tones, in the median and in the root mean square: one or the other is
+# .86 or more with photos of 15 captures and with mild grades, both are .17 to .76 with styles
 COARSE_SIDE, OPAQUE, RECOLORED = 12, 0.7, 0.8
 
 
@@ -377,7 +377,9 @@ def _shrink(pictures: np.ndarray, side: int) -> np.ndarray:
     """Average pictures ``[v,h,w,...]`` to at most ``side`` pixels of the longer side."""
     level = max(1.0, max(pictures.shape[1:3]) / side)
     size = max(1, round(pictures.shape[2] / level)), max(1, round(pictures.shape[1] / level))
-    return np.stack([cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA) for picture in pictures])
+    return np.stack(
+        [cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA) for picture in pictures]
+    )
 
 
 def odd_photos(shown: Shown) -> list[int]:

@@ -1,6 +1,6 @@
 """Aligned scene -> how much of its depth other views confirm: what says before a fit whether it can succeed.
 
-Each pixel's Gaussian is looked up in the other views, and the Gaussian found there is drawn back: the depth is confirmed
+Each pixel's Gaussian is looked up in the other views, and the Gaussian there is projected back: the depth is confirmed
 where the two agree, and contradicted where more views see through it than confirm it. Where no other view looks, it is
 alone.
 """
@@ -23,8 +23,8 @@ SAME = 0.05  # logarithm of two depths of one surface
 TINY = 1e-9  # canonical units, least depth
 # Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
 POOR, LONELY = 0.5, 0.2
-# Gaussians per pixel that a scene bears: most, down to a share of confirmed pixels, then falling to the fewest at another
-# one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
+# Gaussians per pixel that a scene bears: most, down to a share of confirmed pixels, then falling to the fewest at
+# another one. More repeat what is wrong, and are learned by heart (docs/guide/how-many.md).
 MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.75, 0.6
 
 

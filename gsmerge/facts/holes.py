@@ -123,13 +123,14 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
         return scene
     views, share = int(empty.any((1, 2)).sum()), 100 * float(empty.mean())
     note(
-        f"the scene shows nothing in {share:.0f} % of the pixels of its views, in large parts of {views} of {len(empty)}:"
-        " they stay empty, and photos do not count there; --set extent=photos fills them"
+        f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels: they stay"
+        " empty, and photos do not count there; --set extent=photos fills them"
     )
     images = np.where(empty[..., None], np.float32(0), scene.images)
     masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
     if large is not None:
-        large = change_large(large, [PhotoChange(cover=mask, colors=np.zeros((*mask.shape, 3), np.float32)) for mask in empty])
+        black = np.zeros((*empty.shape[1:], 3), np.float32)
+        large = change_large(large, [PhotoChange(cover=mask, colors=black) for mask in empty])
     return replace(scene, images=images, masks=masks, large_photos=large, empty=empty)
 
 

@@ -43,10 +43,10 @@ class PrepareOptions(Settings):
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
         "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
         "others.")  # fmt: skip
-    look: Source = setting("auto", "Whose colours a result has where the scene has another look than its photos: auto: "
-        "the scene's own; photos: theirs.")  # fmt: skip
-    extent: Source = setting("auto", "What large parts of a photo become in which the scene shows nothing: auto: empty, "
-        "as of a scene that was cut out or has no sky; photos: filled with what they show.")  # fmt: skip
+    look: Source = setting("auto", "Colours of a scene that has another look than its photos: auto: its own; photos: "
+        "theirs.")  # fmt: skip
+    extent: Source = setting("auto", "Large parts of photos in which the scene shows nothing, as one that was cut out "
+        "or has no sky: auto: they stay empty; photos: they are filled.")  # fmt: skip
 
 
 @dataclass(frozen=True)
