@@ -206,8 +206,8 @@ class Totals:
         from gsmerge.io.formats.columns import UNUSED
         from gsmerge.report import text_table
 
-        header = ("result", "Gaussians", "of", "kept", "dB before", "dB after", "seconds")
-        lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 6, 4, 3)) if self.rows else []
+        header = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
+        lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
         kinds = ((UNUSED[:-2], self.unused), ("worse", self.worse), ("note", self.left_out), (FAILED, self.failed))
@@ -230,8 +230,9 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     quality = ["" if psnr[name] is None else f"{psnr[name]:.2f}" for name in ("before", "after")]
     if judged := report["choices"].get("fidelity"):
         quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
-    counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
-    return output, *counts, f"{100 * report['ratio']:.2f} %", *quality, f"{report['total_seconds']:.1f}"
+    counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
+    gain = "" if new is None else f"{new['after'] - new['before']:+.1f} dB"
+    return output, *counts, f"{100 * report['ratio']:.2f} %", gain, *quality, f"{report['total_seconds']:.1f}"
 
 
 def print_plan(

@@ -163,7 +163,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:
-        say_warning(f"{document['worse']}; {MORE}", quiet=args.silent)
+        scored = document["psnr_input_views"]["after"] is not None or "fidelity" in document["choices"]
+        say_warning(f"{document['worse']}; {MORE}" if scored else document["worse"], quiet=args.silent)
     if any(problems):
         raise TargetError("; ".join(filter(None, problems)))
 

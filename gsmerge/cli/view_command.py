@@ -35,6 +35,7 @@ def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""
     from gsmerge.pages.data import collect
     from gsmerge.pages.page import headline, speed, speed_words, view_page
+    from gsmerge.pages.view import file_gains
     from gsmerge.report import document_head
 
     args.after = args.after or []
@@ -50,10 +51,11 @@ def view(args: opt.Args) -> None:
         pair = read_before_after(args, files)
         say_notes(pair.notes, quiet=args.silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
-        results, cameras, more = _compact_sizes(pair, args.sizes or (), progress)
+        results, cameras, gains, more = _compact_sizes(pair, args.sizes or (), progress)
         data = collect(
             pair.title, pair.scene, pair.gaussians | results, [*sizes, *more], pair.held_out,
-            cameras=pair.cameras | cameras, light=args.light, progress=progress,
+            cameras=pair.cameras | cameras, new_gains=file_gains(pair.plys) | gains, light=args.light,
+            progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, overwrite=True)
@@ -68,8 +70,8 @@ def view(args: opt.Args) -> None:
 
 def _compact_sizes(
     pair: BeforeAfter, shares: Sequence[str], progress: Progress
-) -> tuple[dict[str, Gaussians], dict[str, Cameras], list[int]]:
-    """Compact the scene to ``shares`` such as "2%"; return Gaussians and cameras by name, and bytes as a .ply.
+) -> tuple[dict[str, Gaussians], dict[str, Cameras], dict[str, float], list[int]]:
+    """Compact the scene to ``shares`` such as "2%"; return Gaussians, cameras and expected gains by name, and bytes.
 
     Without files AFTER the one nearest the default comes first, for the page opens on it.
     """
@@ -81,6 +83,7 @@ def _compact_sizes(
 
     results: dict[str, Gaussians] = {}
     cameras: dict[str, Cameras] = {}
+    gains: dict[str, float] = {}
     nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
     opened = None if pair.plys else nearest
     for share in sorted(shares, key=lambda share: (share != opened, parse_share(share))):
@@ -88,9 +91,11 @@ def _compact_sizes(
         progress(f"compact to {name}", 0, 0)
         result = compact(pair.load.scene, budget=share)
         results[name] = result.gaussians
+        if result.report.new_views is not None:
+            gains[name] = result.report.new_views.gain
         if pair.scene.aligned and len(result.cameras) == len(pair.scene):
             cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
-    return results, cameras, [measure_bytes(gaussians, PLY) for gaussians in results.values()]
+    return results, cameras, gains, [measure_bytes(gaussians, PLY) for gaussians in results.values()]
 
 
 def _open(page: Path) -> bool:

@@ -30,7 +30,7 @@ from gsmerge.facts.partition import (
     partition_views,
 )
 from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
-from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.pipeline import start
@@ -356,7 +356,8 @@ def join_reports(
     covered = _join_covered(parts, scores, sizes)
     reference = None if before is None else parts[0].prepared.reference.name
     compared = (covered.before, covered.after) if covered else (before, after)
-    worse = describe_loss("the result", *compared) if reference == PHOTOS else None
+    pictures = OWN_PHOTOS if reference == PHOTOS else reference
+    worse = None if pictures is None else describe_loss("the result", *compared, pictures)
     notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,

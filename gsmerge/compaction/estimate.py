@@ -11,6 +11,7 @@ import numpy as np
 
 from gsmerge.compaction.files import Outputs, check_colmap, sized
 from gsmerge.compaction.methods import check_method
+from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.facts.scene_size import measure_size
@@ -45,7 +46,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """
     size = measure_size(scene)
     if options.budget.auto and scene.aligned:
-        options = resolve_budget(options, canonicalise(scene)[0])
+        options = resolve_budget(options, confirm_depths(canonicalise(scene)[0]))
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)

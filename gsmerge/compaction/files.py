@@ -17,7 +17,7 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.arrays import RESULT_COMMENT
+from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
@@ -85,7 +85,9 @@ def compact_files(
             raise nothing_left(files.ply)
         result = _padded(result) if outputs.full_columns else result
         compacted, results = perf_counter(), (result, *result.coarser)
-        comments = [RESULT_COMMENT, *load.comments]
+        comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
+        if expected is not None and not settings.budget.in_bytes:  # which leaves no room for it
+            comments.append(new_views_comment(expected.before, expected.after))
         views_named = result.cameras[views], name_photos(load.files.images, names), scene_title(files.ply)
         notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
         written = _write_results(add, outputs, first, results, comments, views_named)

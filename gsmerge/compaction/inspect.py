@@ -16,7 +16,9 @@ from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import canonicalise, missing_notes
+from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.io import GaussianFile, file_notes
+from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read import degree_notes
 from gsmerge.io.photo_files import photo_array
@@ -77,7 +79,8 @@ def inspect(
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
         ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
         shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
-        ``contradicted``, ``alone``). ``compact``: the estimate
+        ``contradicted``, ``alone``), ``new_views``: ``before`` and ``after`` of a result, see the report of a run.
+        ``compact``: the estimate
         of a run, None where it would refuse the scene; ``auto``: ``share``, ``num_gaussians`` and ``why`` of
         ``--budget auto``. ``notes``: warnings.
 
@@ -136,7 +139,7 @@ def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] 
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
-    is_result = is_from_gsmerge(ply.info.comments)
+    is_result, expected = is_from_gsmerge(ply.info.comments), read_new_views(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
@@ -147,6 +150,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
             ("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement")
         ),
         "coverage": [],
+        "new_views": None if expected is None else dict(zip(("before", "after"), expected, strict=True)),
     }
     try:
         load = align_scene(ply, files, hints=hints)
@@ -169,6 +173,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
     agreement = _measure_agreement(scene)
     facts |= {"auto": _describe_auto(scene, agreement), "agreement": agreement and agreement.to_dict()}
+    odd = unlike_captures(scene.finite_gaussians)
+    facts["notes"] += [] if odd is None else [odd]
     facts["notes"] += [agreement.doubt] if agreement is not None and agreement.doubt else []
     if not is_result:
         facts["exporter"] = exporter_names(load.exporters)
@@ -211,6 +217,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         *_alignment_lines(scene),
         *_coverage_lines(scene),
         *_agreement_lines(scene),
+        *_new_views_lines(scene),
     ]
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
@@ -281,7 +288,12 @@ def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
     if agreement is None:
         return []
     confirmed, contradicted, alone = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
-    return [
-        f"depth      {confirmed} of the pixels confirmed by other views, {contradicted} contradicted, {alone} seen by no"
-        " other"
-    ]
+    return [f"depth      other views confirm {confirmed} of the pixels, contradict {contradicted}, do not see {alone}"]
+
+
+def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
+    """Describe what new views of a result are expected to gain."""
+    expected = scene["new_views"]
+    if expected is None:
+        return []
+    return [f"new views  {expected['before']:.1f} dB from its input, {expected['after']:.1f} dB from it, as expected"]

@@ -1,8 +1,8 @@
 """What a new viewpoint gains: photos that a short fit of small pictures did not see, before and after.
 
-Scores of the photos that a fit has seen say how well it remembers them. So some views, those that the others see most of,
-are left out with their rows, the rest is compacted at a quarter of the size, and its rows and its result are compared with
-the photos that were left out, where the rows cover them.
+Scores of the photos that a fit has seen say how well it remembers them. So some views, those that the others see most
+of, are left out with their rows, the rest is compacted at a quarter of the size, and its rows and its result are
+compared with the photos that were left out, where the rows cover them.
 """
 
 from __future__ import annotations
@@ -104,7 +104,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     seen = shares > LEAST_SEEN
     if not seen.any():
         return None
-    return Trial(*(float(np.average(score[seen], weights=shares[seen])) for score in scores), int(seen.sum()))
+    own, before, after = (float(np.average(score[seen], weights=shares[seen])) for score in scores)
+    return Trial(own, before, after, int(seen.sum()))
 
 
 def _leave_out(

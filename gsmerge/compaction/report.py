@@ -49,6 +49,8 @@ class CompactReport:
         psnr_before: Mean PSNR (dB) of the input views rendered from the input, of many views some, and in a fixed
             quarter of each unless a quality was asked for; None where neither photos nor pixels are known.
             :func:`gsmerge.evaluate` is exact.
+        new_views: What new views are expected to have, from photos that a short fit left out; None with fewer than four
+            photos, in drafts, and in blocks.
         psnr_after: The same from the result; where a file is written and rounds positions visibly, from the file.
         choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). Where there are no photos
             and the rows belong to no pixels, ``fidelity`` is the ``psnr`` (dB) against renders of the input, in so many
@@ -97,8 +99,10 @@ class CompactReport:
         """List what a reader wants first, by name."""
         share = 100 * self.num_output / max(1, self.num_input)
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
+        if new := self.new_views:
+            facts += [("PSNR of new views, expected", f"{new.before:.1f} -> {new.after:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
-            facts += [("PSNR of the input views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
+            facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
         if judged := self.choices.get("fidelity"):
             facts += [("PSNR", f"{judged['psnr']:.1f} dB {_judged_by(judged)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -129,6 +133,8 @@ def report_document(
 
     Returns:
         ``schema_version`` 1, within which keys are only ever added. ``unmet``: why a target is not met, or null.
+        ``new_views``: ``before`` and ``after``, the PSNR that new views are expected to have, estimated on so many
+        ``views`` that a short fit left out; null with fewer than four photos, or where it was not asked for.
         ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or that the
@@ -189,9 +195,12 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         ("Gaussians", f"{before['num_gaussians']:,}", f"{after['num_gaussians']:,}", ratio),
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
+    if new := document["new_views"]:
+        source = f"expected, from {new['views']} photos that a short fit left out"
+        rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", source)]
     if psnr["before"] is not None and psnr["after"] is not None:
-        views = f"in {document['choices']['scored_views']} of the input views{_against(document)}"
-        rows += [("PSNR", f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
+        views = f"in {document['choices']['scored_views']} of its views"
+        rows += [(_own(document), f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
         rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
@@ -218,7 +227,7 @@ def level_lines(document: Mapping[str, Any]) -> list[str]:
     """Return one line of text for each coarser level of detail."""
     return [
         f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (f"; input views {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
+        + (f"; {_own(document)} {level['psnr_input_views']:.2f} dB" if level["psnr_input_views"] is not None else "")
         + f"; {level['seconds']:.1f} s"
         for level in document["levels"]
     ]
@@ -248,14 +257,11 @@ def summary_line(document: Mapping[str, Any]) -> str:
     psnr, path = document["psnr_input_views"], document.get("viewer_cameras")
     cameras = f"; cameras for viewers in {os.path.basename(path)}" if path else ""
     judged = document["choices"].get("fidelity")
-    quality = (
-        f"; input views {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
-        if psnr["before"] is not None and psnr["after"] is not None
-        else f"; {judged['psnr']:.1f} dB {_judged_by(judged)}"
-        if judged
-        else ""
-    )
-    quality += _against(document)
+    quality = f"; {judged['psnr']:.1f} dB {_judged_by(judged)}" if judged else ""
+    if psnr["before"] is not None and psnr["after"] is not None:
+        quality = f"; {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
+    if new := document["new_views"]:
+        quality = f"; new views {new['after'] - new['before']:+.1f} dB, as expected{quality}"
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
@@ -266,7 +272,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     )
 
 
-def _against(document: Mapping[str, Any]) -> str:
-    """Return what PSNR is measured against, unless that is photos."""
+def _own(document: Mapping[str, Any]) -> str:
+    """Name the pictures that a result was fitted to."""
     reference = document.get("psnr_reference")
-    return "" if reference in (None, "photos") else f" against {reference}"
+    return "its own photos" if reference in (None, "photos") else str(reference)

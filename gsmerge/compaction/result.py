@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.compaction.new_views import Trial
 from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
-from gsmerge.facts.row_colors import PHOTOS, RENDERS
+from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.fit import Fitted
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.io.formats.rounding import as_written
@@ -255,7 +255,8 @@ def make_result(
     input_score = measure_input(prepared, plan) if plan.before is None else plan.before
     before = None if input_score is None else input_score.psnr
     rendered = prepared.reference.name == RENDERS
-    comparable = prepared.reference.fit_views and prepared.reference.name == PHOTOS and not plan.clean.hides
+    comparable = prepared.reference.of_views and not plan.clean.hides
+    pictures = OWN_PHOTOS if prepared.reference.name == PHOTOS else prepared.reference.name
     covered = [
         measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
@@ -268,8 +269,12 @@ def make_result(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered, psnr_reference=None if before is None else prepared.reference.name,
         )  # fmt: skip
+        if prepared.doubt is not None:
+            choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
+            made = replace(made, psnr_before=None, psnr_after=None, covered=None, choices=choices)
+            return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
         compared = (covered.before, covered.after) if covered else (before, shown)
-        worse = describe_loss(name, *compared) if comparable else None
+        worse = describe_loss(name, *compared, pictures) if comparable else None
         if rendered and candidate is best and not plan.clean.hides:  # coarser levels are meant to differ
             worse = describe_distance(candidate.psnr)
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)

@@ -7,7 +7,7 @@ alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -28,18 +28,17 @@ POOR, LONELY = 0.5, 0.2
 MOST, FEWEST, SOUND, WRONG = 0.1, 0.015, 0.75, 0.6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Agreement:
     """Shares of the pixels of a scene by what other views say of their depth."""
 
     confirmed: float  # by at least one view, and by no fewer than see through it
     contradicted: float  # more views see through it than confirm it
     alone: float  # no other view looks there
-    confirmed_by_view: tuple[float, ...]  # the first, of each view
 
     def to_dict(self) -> dict[str, float]:
         """Return the shares of the scene, for reports."""
-        return {name: round(getattr(self, name), 4) for name in ("confirmed", "contradicted", "alone")}
+        return {name: round(share, 4) for name, share in asdict(self).items()}
 
     @property
     def share(self) -> float:
@@ -92,5 +91,5 @@ def confirm_depths(scene: Scene) -> Agreement | None:
         return np.array([len(rows), confirmed.sum(), (through > same).sum(), (~inside.any(0)).sum()])
 
     counts = np.stack(parallel_map(count, range(views)))
-    shares = counts[:, 1:].sum(0) / counts[:, 0].sum()
-    return Agreement(*map(float, shares), tuple((counts[:, 1] / np.maximum(counts[:, 0], 1)).tolist()))
+    confirmed, contradicted, alone = counts[:, 1:].sum(0) / counts[:, 0].sum()
+    return Agreement(float(confirmed), float(contradicted), float(alone))

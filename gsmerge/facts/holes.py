@@ -123,8 +123,8 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
         return scene
     views, share = int(empty.any((1, 2)).sum()), 100 * float(empty.mean())
     note(
-        f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels: they stay"
-        " empty, and photos do not count there; --set extent=photos fills them"
+        f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels: they"
+        " stay empty, and photos do not count there; --set extent=photos fills them"
     )
     images = np.where(empty[..., None], np.float32(0), scene.images)
     masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos

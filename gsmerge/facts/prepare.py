@@ -29,7 +29,7 @@ from gsmerge.facts.place_cameras import (
     keep_finite,
 )
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
-from gsmerge.facts.scene_size import SceneSize, measure_size
+from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.facts.views import distinct_views, subset
 from gsmerge.geometry import camera_depths, lower_median, project
 from gsmerge.kernels.matrices import matmul
@@ -41,6 +41,7 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
+FLAT = 2 / 255  # range of the colours of a picture that shows one
 MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
 
 
@@ -161,6 +162,14 @@ class Prepared:
         size = measure_size(measured, "photos" if reference.of_views else "renders" if reference.fit_views else "none")
         # Gaussians that fill holes are not the file's
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
+
+    @cached_property
+    def doubt(self) -> str | None:
+        """Why no score of the scene or of a result says anything, in one sentence; None where scores do."""
+        views = list(self.reference.score_views)
+        flat = self.reference.name == RENDERS and all(np.ptp(self.scene.images[view]) < FLAT for view in views)
+        one = "the views show one flat colour, so nothing says how near a result is to it"
+        return unlike_captures(self.scene.finite_gaussians) or (one if flat and views else None)
 
     @cached_property
     def scene_around(self) -> PicturedScene:

@@ -20,6 +20,7 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
+OWN_PHOTOS = "the scene's own photos"  # that a fit has seen, in messages
 PHOTOS = "photos"  # what results are fitted to and measured against, in messages
 ROW_COLORS = "the model's own pixels"  # the same where there are none
 RENDERS = "renders of the input"  # and where the rows belong to no pixels either

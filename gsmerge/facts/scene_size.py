@@ -5,9 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from gsmerge.facts.views import camera_kinds
-from gsmerge.types import Scene
+import numpy as np
 
+from gsmerge.facts.views import camera_kinds
+from gsmerge.types import Gaussians, Scene
+
+# Of Gaussians that captures have: median largest scale as a share of the diagonal of the box that holds most, and
+# median coefficient of the base colours; of fewer nothing is said
+TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
+SAMPLES = 65536  # Gaussians that these are measured on
 Pictures = Literal["photos", "renders", "none"]  # photos or what stands in for them; drawings of the scene itself
 
 
@@ -50,3 +56,24 @@ def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
         num_cameras=1 + int(camera_kinds(cameras).max()) if len(scene) else 0,
         sh_degree=scene.gaussians.sh_degree,
     )  # fmt: skip
+
+
+def unlike_captures(gaussians: Gaussians) -> str | None:
+    """Say in which way finite Gaussians are as those of no capture, in one sentence; None where nothing is odd.
+
+    Bounds are in docs/reference/conventions.md.
+    """
+    if len(gaussians) < FEWEST:
+        return None
+    sample = gaussians[:: max(1, len(gaussians) // SAMPLES)]
+    low, high = np.percentile(sample.means.astype(np.float64), (1, 99), axis=0)
+    diagonal = float(np.sqrt(((high - low) ** 2).sum()))
+    size, color = float(np.median(sample.scales.max(1))), float(np.median(np.abs(sample.sh0)))
+    if TINY * diagonal <= size <= LARGE * diagonal and color <= BRIGHT:
+        return None
+    problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
+    if size < TINY * diagonal:
+        problem = f"half of the Gaussians are at most {size / diagonal:.2g} times as large as the scene"
+    if color > BRIGHT:
+        problem = f"half of the base colours have coefficients beyond {color:.3g}"
+    return f"{problem}, as in no capture: are they stored otherwise? nothing is scored"

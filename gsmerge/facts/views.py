@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import Cameras, Scene, grid_ids
+from gsmerge.types import Cameras, Scene, SceneT, grid_ids
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
@@ -81,7 +81,7 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
     return all(np.array_equal(a[name], b[name]) for name in a)
 
 
-def subset(scene: Scene, view_ids: Sequence[int]) -> Scene:
+def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     """Return the scene with only the views ``view_ids`` and their Gaussians; unaligned Gaussians all stay."""
     ids = list(view_ids)
     images = None if scene.images is None else scene.images[ids]

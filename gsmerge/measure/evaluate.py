@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame, with_row_colors
-from gsmerge.facts.row_colors import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
@@ -262,7 +262,7 @@ def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultSc
     mended = photos and not photos_count_as_they_are(scene)
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
-        yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr) for name, psnr in psnrs.items()))
+        yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items()))
     yield from filter(None, (describe_fog(score.name, score.fog[ALL]) for score in scores if score.fog))
     if "target" not in splits:
         yield "no held-out views were given: input views flatter what was fitted to them"

@@ -9,6 +9,7 @@ from pathlib import PurePosixPath
 import cv2
 import numpy as np
 
+from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
@@ -64,6 +65,7 @@ class Side:
     covered: Quality  # over those
     seconds: float  # that drawing a view took, on this processor
     dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
+    new_gain: float | None = None  # dB that new views are expected to gain; None: not known
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class ViewData:
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     num_superpixels: tuple[int, int] | None = None  # least and most of a photo; None without outlines
     lacks_pixels: bool = False  # whether the scene itself covers less than the input views
+    agreement: Agreement | None = None  # how far the views confirm each other's depth
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -131,14 +134,15 @@ def collect(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
+    new_gains: Mapping[str, float] | None = None,
     light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
     """Draw and score a scene with at least one view, and its results, if any, in all views.
 
     ``results`` are Gaussians by name in the scene's world, ``file_bytes`` the file sizes of the scene and the results.
-    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own. ``light``: the scene
-    itself as stills alone.
+    Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`), 3D uses the scene's own. ``new_gains``: dB that
+    new views of results are expected to gain. ``light``: the scene itself as stills alone.
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
@@ -150,7 +154,8 @@ def collect(
     with use_threads():
         data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
     progress("done", 0, 0)
-    return data
+    gains = new_gains or {}
+    return replace(data, sides=tuple(replace(side, new_gain=gains.get(side.name)) for side in data.sides))
 
 
 def still_keeper(stills: Stills) -> OnImage:
@@ -207,7 +212,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels,
+        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=cameras)),
     )  # fmt: skip
 
 

@@ -89,6 +89,7 @@ def view_page(data: ViewData) -> str:
         },
         stills=stills,
         speed_words=speed_words(results[0]["speed"]),
+        agreement=agreement_words(data),
         outlines=[view.outlines and data_uri(view.outlines, "image/webp") for view in data.shown],
         drops=[
             [None] * photos + [one and data_uri(one, "image/png") for one in view.drops or [None] * len(data.sides)]
@@ -110,12 +111,25 @@ def headline(data: ViewData, place: int = 1) -> str:
     old, new = before.mean.psnr, after.mean.psnr
     share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
+    if after.new_gain is not None and not data.held_out:
+        return f"{said}, new views {_nearer(after.new_gain)}, as expected"
     if new is None or old is None or not np.isfinite(new):
         return said
     if not np.isfinite(old):  # the input itself is the reference
         return f"{said}, {new:.1f} dB from the input's own renders"
-    words = ROW_COLORS if reference == ROW_COLORS else "the photos"
-    return f"{said}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {words}"
+    words = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
+    return f"{said}, {_nearer(new - old)} {'to' if new >= old else 'from'} {words}"
+
+
+def _nearer(gain: float) -> str:
+    return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
+
+
+def agreement_words(data: ViewData) -> str:
+    """Describe how far the views confirm each other's depth, and what would help where that is little."""
+    if data.agreement is None:
+        return ""
+    return data.agreement.doubt or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
 
 
 def speed(data: ViewData, place: int = 1) -> float | None:
@@ -158,7 +172,7 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", False),
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
     ]
-    views = "held-out photos" if data.held_out else "input photos" if data.reference == PHOTOS else data.reference
+    views = "held-out photos" if data.held_out else "its own photos" if data.reference == PHOTOS else data.reference
     qualities = [
         (f"PSNR, {views}", "psnr", before.mean, after.mean),
         (f"SSIM, {views}", "ssim", before.mean, after.mean),

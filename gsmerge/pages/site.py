@@ -10,6 +10,7 @@ from gsmerge.facts.place_cameras import place_cameras
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
+from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import SITE, SITE_SCENE
 from gsmerge.measure.camera_path import median_camera
@@ -45,7 +46,7 @@ def add_site(
 
 def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> dict[str, bytes]:
     """Make the files of a web site, by name."""
-    scene = sog_bytes(gaussians, comments)
+    scene, expected = sog_bytes(gaussians, comments), read_new_views(comments)
     is_free = len(cameras) == 0
     shown = place_cameras(gaussians.numpy()) if is_free else cameras.numpy()
     middle = 0 if is_free else median_camera(shown)  # of placed ones the first shows the most
@@ -53,6 +54,7 @@ def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: 
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
     page = render_template(
         "site.html", policy=POLICY, title=title, count=len(gaussians), size=len(scene), names=NAMES,
+        gain=None if expected is None else expected[1] - expected[0],
         download=f"{title}.sog",
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(middle),

@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Protocol
+from typing import Any, Protocol
 
 from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
+from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.read import read_gaussians
+from gsmerge.io.formats.read import GaussianFile, read_gaussians
 from gsmerge.pages.data import collect
 from gsmerge.pages.page import headline, view_page
 from gsmerge.runtime.memory import human_bytes
@@ -91,7 +92,13 @@ def view(
         read = as_scene(scene).numpy()
         shown = read if read.aligned else add_views(read)
     given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
-    gaussians = {name: _gaussians_of(value) for name, value in given.items()}
+    files = {name: read_gaussians(value) for name, value in given.items() if isinstance(value, str | PathLike)}
+    gaussians = {name: _gaussians_of(files[name] if name in files else given[name]) for name in given}
+    gains = file_gains(files) | {
+        name: expected.gain
+        for name, value in given.items()
+        if (expected := getattr(getattr(value, "report", None), "new_views", None)) is not None
+    }
     cameras = {
         name: replace(shown.cameras, viewmats=moved.numpy().viewmats)
         for name, value in given.items()
@@ -101,15 +108,19 @@ def view(
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
         [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
-        light=is_light, progress=progress or (lambda *_: None),
+        new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data), headline(data))
 
 
-def _gaussians_of(result: Result | Gaussians | StrPath) -> Gaussians:
-    if isinstance(result, str | PathLike):
-        return read_gaussians(result).gaussians
-    return result if isinstance(result, Gaussians) else result.gaussians
+def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
+    """Return what new views are expected to gain, dB, by the names of results whose files say it."""
+    known = {name: read_new_views(file.info.comments) for name, file in files.items()}
+    return {name: after - before for name, scores in known.items() if scores for before, after in [scores]}
+
+
+def _gaussians_of(result: Any) -> Gaussians:
+    return result if isinstance(result, Gaussians) else result.gaussians  # type: ignore[no-any-return]
 
 
 def _num_bytes(value: Scene | Result | Gaussians | StrPath) -> int:

@@ -10,7 +10,7 @@ from gsmerge.types import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
-MAX_LOSS = 0.5  # dB that a result may show the photos worse than its input without a word about it
+MAX_LOSS = 0.5  # dB that a result may show its own photos worse than its input without a word about it
 POOR = 30.0  # dB from its input below which the views of a result look different, where there are no photos
 
 
@@ -50,16 +50,15 @@ def decibels(error: float) -> float:
     return -10 * float(log10(max(error, 1e-12)))
 
 
-def describe_loss(name: str, before: float | None, after: float | None) -> str | None:
-    """Describe that a result shows the scene's own photos worse than the input does; None up to ``MAX_LOSS``.
+def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
+    """Describe that a result shows the scene's own ``pictures`` worse than the input does; None up to ``MAX_LOSS``.
 
-    ``before``, ``after``: PSNR (dB) of the photos from the input and from the result; None without
-    photos.
+    ``before``, ``after``: PSNR (dB) of the pictures from the input and from the result; None without any.
     """
     if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
         return None
     loss = f"{after:.2f} dB, {before:.2f} dB before"
-    return f"{name} shows the scene's own photos worse than the input does: {loss}"
+    return f"{name} shows {pictures} worse than the input does: {loss}"
 
 
 def describe_distance(psnr: float | None) -> str | None:

@@ -72,7 +72,8 @@ def extend(
     Raises:
         ValueError: If a setting is impossible for the scene.
     """
-    options = replace(options, prepare=replace(options.prepare, poses="fixed", exposure="fixed"))
+    prepare_options = replace(options.prepare, poses="fixed", exposure="fixed")
+    options = replace(options, prepare=prepare_options, new_views=False)
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -17,6 +18,7 @@ MAX_LOG_SCALE = 30.0  # exp(30) squared and exp(-30) squared are still normal fl
 LOGIT_COMMENT = "opacity: logit"  # so that our own files are never guessed at
 RESULT_COMMENT = "gsmerge result"  # in its place in results of commands; as long, so that sizes stay the same
 RENDER_COMMENT = "SplatRenderMode"  # brush writes it: plain, or mip for Gaussians with a filter of their own
+NEW_VIEWS_COMMENT = "gsmerge new views"  # and the PSNR that new views of the input and of the result have, dB
 MAX_COPIED, MAX_COPIED_LINES = 100, 10  # characters of a comment that is copied to other files, and such comments
 MIP_COMMENT = f"{RENDER_COMMENT}: mip"
 
@@ -43,6 +45,19 @@ def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     lines = (line for line in comments if isinstance(line, str) and len(line) <= MAX_COPIED)
     kept = (line for line in lines if line.startswith(RENDER_COMMENT) and line.isascii() and line.isprintable())
     return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
+
+
+def new_views_comment(before: float, after: float) -> str:
+    """Return the header comment of a result that says what new views are expected to gain, dB."""
+    return f"{NEW_VIEWS_COMMENT}: {before:.2f} to {after:.2f} dB"
+
+
+def read_new_views(comments: Sequence[object]) -> tuple[float, float] | None:
+    """Read what new views of the input and of a result are expected to have, dB, from header comments; None without."""
+    pattern = re.compile(re.escape(NEW_VIEWS_COMMENT) + r": (-?\d{1,3}\.\d\d) to (-?\d{1,3}\.\d\d) dB")
+    found = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
+    match = next(filter(None, found), None)
+    return None if match is None else (float(match[1]), float(match[2]))
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
