@@ -69,7 +69,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
     def count(view: int) -> np.ndarray:
         rows = np.flatnonzero(valid[view])
-        rows = rows[len(rows) // (2 * SAMPLES) :: max(1, len(rows) // SAMPLES)]
+        rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLES))]
         points, pixels = means[view, rows].astype(np.float64), np.stack([rows % width, rows // width], 1) + 0.5
         others = nearest_views(centres, view)[:NEIGHBORS]
         places, depths = project(points, cameras[others])

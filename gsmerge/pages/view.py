@@ -120,7 +120,7 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
 
 
 def _gaussians_of(result: Any) -> Gaussians:
-    return result if isinstance(result, Gaussians) else result.gaussians  # type: ignore[no-any-return]
+    return result if isinstance(result, Gaussians) else result.gaussians
 
 
 def _num_bytes(value: Scene | Result | Gaussians | StrPath) -> int:

@@ -16,7 +16,7 @@ from gsmerge.plan import make_plan
 from gsmerge.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.encode import contradicted_share, encode, weaken_contradicted
+from gsmerge.stages.encode import encode, weaken_contradicted
 from gsmerge.types import Groups, grid_ids
 
 AUTO = CompactOptions().with_settings({"superpixels": "auto"})
