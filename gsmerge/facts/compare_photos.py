@@ -95,8 +95,9 @@ def compare_photos(scene: PicturedScene, look: Source = "auto") -> tuple[Picture
         odd = [view for view in range(len(scene)) if _is_other(scene.images[view], covers[view])]
         restyled = 2 * len(odd) > len(scene) and share_edges(small)
     else:
-        covers, pictures, restyled = np.zeros(scene.images.shape[:3], bool), None, is_recolored(small)
-        odd = [] if restyled else odd_photos(_mend_small(small, changes))
+        mended = _mend_small(small, changes)
+        covers, pictures, restyled = np.zeros(scene.images.shape[:3], bool), None, is_recolored(mended)
+        odd = [] if restyled else odd_photos(mended)
     if restyled:
         note(f"{OTHER_LOOK}: its own colours are kept; --set look=photos gives it that of the photos")
         return scene, ()

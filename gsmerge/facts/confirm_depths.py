@@ -18,7 +18,7 @@ from gsmerge.types import Scene
 
 SAMPLES = 1200  # pixels of a view
 NEIGHBORS = 16  # nearest other views in which they are looked up
-REACH = 1 / 120  # of the longer side: distance to which a pixel is found again
+REACH, PIXELS = 1 / 120, 1.5  # of the longer side, and pixels at least: distance to which a pixel is found again
 SAME = 0.05  # logarithm of two depths of one surface
 TINY = 1e-9  # canonical units, least depth
 # Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
@@ -65,7 +65,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     means, centres = scene.gaussians.means.reshape(views, -1, 3), scene.cameras.centres
     cameras, valid = scene.cameras, scene.valid.reshape(views, -1)
     width, height = cameras.width, cameras.height
-    reach = REACH * max(width, height)
+    reach = max(PIXELS, REACH * max(width, height))
 
     def count(view: int) -> np.ndarray:
         rows = np.flatnonzero(valid[view])
