@@ -296,4 +296,4 @@ def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
     expected = scene["new_views"]
     if expected is None:
         return []
-    return [f"new views  {expected['before']:.1f} dB from its input, {expected['after']:.1f} dB from it, as expected"]
+    return [f"new views  {expected['before']:.1f} dB from its input, {expected['after']:.1f} dB from it, expected"]

@@ -113,6 +113,8 @@ def _leave_out(
 ) -> np.ndarray:
     """Leave out views and compact the others: share covered, and PSNR from all rows, before and after, ``[4,n]``."""
     rest = subset(small, [view for view in range(len(small)) if view not in views])
+    if len(_file_rows(rest)) == 0 or not views:
+        return np.zeros((4, len(views)))
     left_out, compacted = subset(small, views), _compact_rest(rest, prepared, plan, build, share)
     photos, covered = scene_photos(left_out), _covered(rest, left_out)
     scores = [
@@ -188,6 +190,10 @@ def _compact_rest(rest: PicturedScene, prepared: Prepared, plan: Plan, build: Bu
         unseen=rest.gaussians[:0], agreement=None,
     )  # fmt: skip
     steps = min(STEPS, plan.fit.steps)
-    settings = plan.settings | LEFT_TO_RUN | {"superpixels": f"{100 * share:.6f}%", "k": 1, "fit_steps": steps}
+    settings = (
+        plan.settings
+        | LEFT_TO_RUN
+        | {"superpixels": max(1, round(share * rest.pixels_per_view)), "k": 1, "fit_steps": steps}
+    )
     settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
     return build(part, make_plan(part, CompactOptions().with_settings(settings), plan.checkpoint), None).gaussians

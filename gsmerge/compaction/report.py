@@ -261,7 +261,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if psnr["before"] is not None and psnr["after"] is not None:
         quality = f"; {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
     if new := document["new_views"]:
-        quality = f"; new views {new['after'] - new['before']:+.1f} dB, as expected{quality}"
+        quality = f"; new views {new['after'] - new['before']:+.1f} dB expected{quality}"
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"

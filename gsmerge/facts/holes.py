@@ -32,8 +32,9 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
-NOTHING = 0.1  # the same below which it shows nothing
+NOTHING, SPARSE = 0.5, 0.25  # the same below which it shows nothing, and below which there is nothing around it
 LARGE, RIM = 1 / 12, 2  # of the longer side: squares in large parts that stay empty; pixels beside them that do not
+GAP = 9  # pixels: of a part that is left out only narrower gaps in what is covered are filled
 MOST = 0.5  # share of empty pixels from which on rows without pixels may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
@@ -76,8 +77,12 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         depths, left = _blend_depths(tiled)
         covered = left <= 1 - EMPTY
         if not everywhere:
-            empty[view] = large_parts(left > 1 - NOTHING)
+            sparse = cv2.blur(left, (GAP, GAP)) > 1 - SPARSE  # single Gaussians at the edges of what was cut out
+            empty[view] = large_parts((left > 1 - NOTHING) & sparse)
         holes[view] = free[view] & ~covered & ~empty[view]
+        if empty[view].any():  # the edges of what was cut out are no holes
+            around = np.ones((GAP, GAP), np.uint8)
+            holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
         if covered.any() and holes[view].any():
             parts[view] = _fill_view(scene, view, holes[view], covered, depths)
 
@@ -119,7 +124,7 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     """Make pictures black and of no account for scores where they are to stay ``empty [v,h,w]``, with a note."""
-    if not empty.any():
+    if not empty.any() or empty.all():
         return scene
     views, share = int(empty.any((1, 2)).sum()), 100 * float(empty.mean())
     note(

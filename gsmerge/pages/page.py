@@ -112,7 +112,7 @@ def headline(data: ViewData, place: int = 1) -> str:
     share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
     if after.new_gain is not None and not data.held_out:
-        return f"{said}, new views {_nearer(after.new_gain)}, as expected"
+        return f"{said}, new views expected {_nearer(after.new_gain)}"
     if new is None or old is None or not np.isfinite(new):
         return said
     if not np.isfinite(old):  # the input itself is the reference
