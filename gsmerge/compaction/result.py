@@ -288,6 +288,8 @@ def make_result(
     new_views = None
     if trial is not None and before is not None and main.psnr_after is not None:
         new_views = trial.predict(before, main.psnr_after, prepared.agreement)
+        if not prepared.scene.aligned and new_views.gain < 0:  # the input was made from the photos that the fit lacked
+            new_views = None
     if new_views is not None and main.worse is None and new_views.gain < -MAX_LOSS:
         worse = f"new views of the result are expected to be {-new_views.gain:.1f} dB worse than those of the input"
         main, notes = replace(main, worse=worse), [*notes, worse]
