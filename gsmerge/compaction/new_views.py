@@ -29,7 +29,7 @@ from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
 SIDE = 120  # pixels of the longer side, at least
-STEPS = 150  # of the fit, at most
+STEPS = 120  # of the fit, at most
 PART, MOST = 6, 3  # one of so many views is left out in each of two rounds, at most so many
 CANDIDATES = 24  # views among which they are chosen
 COARSE = 4  # times a small pixel: what others see is measured by

@@ -169,7 +169,7 @@ class Prepared:
         views = list(self.reference.score_views)
         flat = self.reference.name == RENDERS and all(np.ptp(self.scene.images[view]) < FLAT for view in views)
         one = "the views show one flat colour, so nothing says how near a result is to it"
-        return unlike_captures(self.scene.finite_gaussians) or (one if flat and views else None)
+        return unlike_captures(self.scene.gaussians[_sample_rows(self.scene)]) or (one if flat and views else None)
 
     @cached_property
     def scene_around(self) -> PicturedScene:
