@@ -173,7 +173,7 @@ def test_a_plain_export(tmp_path: Path) -> None:
     assert lines["coverage"].startswith("100 % ")
     assert names(lines["depth"], "confirm", "contradict", "do not see")
     assert names(lines["note"], "only", "confirms")
-    assert "; " not in lines["note"].removesuffix("; more photos between these would help most")
+    assert names(lines["note"], "the depth is wrong")  # each view has one of its own
 
 
 def test_several_gaussians_per_pixel(tmp_path: Path) -> None:
@@ -218,9 +218,7 @@ def test_rows_in_no_order(tmp_path: Path) -> None:
     some = np.random.default_rng(0).permutation(PIXELS.size)[:3000]
     lines = said(save_export(tmp_path, SMOOTH, export_rows(SMOOTH, some)))
     assert names(lines["alignment"], "not", "3 x 36 x 48 = 5184", 3000)
-    assert names(lines["depth"], "confirm", "contradict", "do not see")
-    assert names(lines["note"], "only", "confirms")
-    assert "; " not in lines["note"].removesuffix("; more photos between these would help most")
+    assert "note" not in lines
     assert "rows" not in lines
 
 
