@@ -61,7 +61,7 @@ def without_pixels(scene: PicturedScene) -> PicturedScene:
 
 def filled_everywhere(scene: PicturedScene) -> PicturedScene:
     """The scene filled where its pictures show something: everywhere."""
-    return fill_holes(scene, np.ones(scene.images.shape[:3], bool))
+    return fill_holes(scene, np.ones(scene.images.shape[:3], bool), everywhere=True)
 
 
 def depths_of(scene: PicturedScene) -> np.ndarray:
@@ -128,7 +128,7 @@ def test_only_pixels_that_are_shown_are_filled() -> None:
     scene = scene_of()
     shown = np.zeros_like(scene.valid)
     shown[1, 4:12] = True
-    new = fill_holes(scene, shown).valid & scene.missing
+    new = fill_holes(scene, shown, everywhere=True).valid & scene.missing
     assert new.any()
     assert not (new & ~shown).any()
 
