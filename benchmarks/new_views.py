@@ -61,4 +61,5 @@ if __name__ == "__main__":
     errors = np.array([row[0] - row[1] for row in rows])
     errors = errors[np.isfinite(errors)]
     if len(errors):
-        print(f"mean error {np.abs(errors).mean():.2f} dB, most too much {errors.max():.2f}, too little {-errors.min():.2f}")
+        ends = f"most too much {errors.max():.2f}, too little {-errors.min():.2f}"
+        print(f"mean error {np.abs(errors).mean():.2f} dB, {ends}")

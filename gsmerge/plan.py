@@ -154,7 +154,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         asked, options = options, resolve_budget(options, agreement)
         segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])
         clean_options = options.clean
-        if "sky" in clean_options.drops and not reference.fit_views:
+        if "sky" in clean_options.drops and reference.name == RENDERS:
             note("drop sky: no photo is used that could say where the sky is, so it stays")
             left = ",".join(name for name in clean_options.drops if name != "sky")
             clean_options = replace(clean_options, drop=left or None)

@@ -196,7 +196,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
     if new := document["new_views"]:
-        source = f"expected, from {new['views']} photos that a short fit left out"
+        source = f"expected, from {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", source)]
     if psnr["before"] is not None and psnr["after"] is not None:
         views = f"in {document['choices']['scored_views']} of its views"

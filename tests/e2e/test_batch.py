@@ -121,7 +121,7 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     totals = Totals(1000)
     report = {
         "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
-        "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None,
+        "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None, "new_views": None,
         "choices": {}, "notes": ["of no weight"],
     }  # fmt: skip
     for number in range(300):
@@ -130,13 +130,17 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
         totals.add(record("skipped", f"{number}", f"{number}.ply"))
     totals.add(record("done", "x", "x.ply", report={**report, "unmet": "too few", "notes": ["not used: t (time)"]}))
     *table, last = totals.lines()
-    assert table[0].split() == ["result", "Gaussians", "of", "kept", "dB", "before", "dB", "after", "seconds"]
+    header = ["result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds"]
+    assert table[0].split() == " ".join(header).split()
     assert len(table) == 1 + 20 + 1 + 1 + 20 + 1
     assert "not used: x: t (time)" in table
     assert [line for line in table if "more" in line] == ["... and 281 more", "... and 280 more failed"]
     counts = "1,000 scenes: 301 done, 300 skipped, 300 failed, 99 left; 30,100 -> 1,204 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
+    new = Totals(1)
+    new.add(record("done", "z", "z.ply", report={**report, "new_views": {"before": 17.0, "after": 21.2, "views": 4}}))
+    assert new.lines()[1].split()[-4:] == ["+4.2", "dB", "20.00", "1.5"]
     alone = Totals(1)
     alone.add(record("done", "y", "y.ply", report={**report, "choices": {"fidelity": {"psnr": 32.8}}}))
     assert alone.lines()[1].split()[-4:] == ["the", "input", "32.80", "1.5"]

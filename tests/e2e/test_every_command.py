@@ -128,7 +128,7 @@ def test_a_dry_run_knows_budgets(wish: tuple[str, ...], most: int, small_scene: 
 def test_a_file_that_is_no_scene_is_refused_and_nothing_is_written(command: str, small_copy: Path, run: Run) -> None:
     (small_copy / "scene.ply").write_text("These are notes, not Gaussians.\n")
     before = listing(small_copy)
-    assert_refused(run(*call(command, small_copy)), 3, "scene.ply", "PLY")
+    assert_refused(run(*call(command, small_copy)), 3, "scene.ply", ".ply file", "text")
     assert listing(small_copy) == before
 
 

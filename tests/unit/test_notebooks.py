@@ -80,7 +80,7 @@ def test_a_result_shows_its_scene_beside_it(
     scene: gsmerge.Scene, result: gsmerge.CompactResult, tmp_path: Path
 ) -> None:
     page = result.show()
-    assert re.match(r"Page\(4.3 % of the Gaussians, \d.\d dB closer to the photos, \d", repr(page))
+    assert re.match(r"Page\(4.3 % of the Gaussians, \d.\d dB closer to its own photos, \d", repr(page))
     shown = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*" allowfullscreen></iframe>', page._repr_html_())
     assert shown is not None
     assert html.unescape(shown[1]) == page.text

@@ -28,7 +28,8 @@ def test_a_scene_that_fits(tiny_folder: Path, tiny: Tiny) -> None:
     assert actual["images"] == str(tiny_folder / "images")
     assert actual["alignment"]["ok"]
     assert actual["alignment_problem"] is None
-    assert actual["notes"] == []
+    (note,) = actual["notes"]  # each view has a depth of its own
+    assert names(note, f"{100 * actual['agreement']['confirmed']:.0f} %", "confirms", "depth")
     low, high = (np.quantile(tiny.gaussians.means, q, axis=0).tolist() for q in (0.01, 0.99))
     assert actual["extents"]["box_low"] == pytest.approx(low, abs=1e-4)
     assert actual["extents"]["box_high"] == pytest.approx(high, abs=1e-4)
@@ -75,7 +76,7 @@ def test_odd_values_are_counted(tiny_folder: Path, tiny: Tiny) -> None:
     actual = inspect(tiny_folder)
     assert (actual["num_nonfinite"], actual["num_zero_quats"], actual["num_clipped_scales"]) == (1, 1, 1)
     assert (actual["num_opaque"], actual["num_transparent"]) == (3, 5)
-    assert len(actual["notes"]) == 3
+    assert len(actual["notes"]) == 4
     assert actual["alignment"] is not None
 
 
@@ -170,7 +171,9 @@ def test_a_plain_export(tmp_path: Path) -> None:
     assert names(lines["rows"], "every", "view-major")
     assert names(lines["alignment"], "one Gaussian", "3 x 36 x 48", "median")
     assert lines["coverage"].startswith("100 % ")
-    assert "note" not in lines
+    assert names(lines["depth"], "confirm", "contradict", "do not see")
+    assert names(lines["note"], "only", "confirms")
+    assert names(lines["note"], "the depth is wrong")  # each view has one of its own
 
 
 def test_several_gaussians_per_pixel(tmp_path: Path) -> None:

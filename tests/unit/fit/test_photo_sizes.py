@@ -21,12 +21,12 @@ from gsmerge.geometry import project
 from gsmerge.raster.photos import EPS2D, MASKED, score_photos
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.types import LargePhotos
+from gsmerge.types import LargePhotos, PicturedScene
 
 LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 
-def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Scene:
+def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> PicturedScene:
     """The scene with enlarged photos of its own; ``read`` gets the number of every photo that is read."""
     width, height = (round(scale * side) for side in (scene.cameras.width, scene.cameras.height))
     images = [cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC) for image in scene.images]
@@ -39,7 +39,7 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Sce
 
     shape = np.array([[width / scene.cameras.width], [height / scene.cameras.height], [1.0]])
     large = LargePhotos(scene.cameras.Ks * shape, width, height, tuple(range(len(scene))), one)
-    return replace(scene, large_photos=large)
+    return PicturedScene.of(replace(scene, large_photos=large), scene.images, scene.masks)
 
 
 # which size

@@ -77,7 +77,8 @@ def test_what_stands_in_the_place_of_cameras_and_photos(tmp_path: Path) -> None:
     ("name", "content"),
     [
         ("a.json", b'{"frames": []}'), ("a.txt", b""), ("a.html", PAGE), ("a.ply", b"ply\r\nformat ascii 1.0\r\n"),
-        ("a.sog", zipped()), ("a.npz", zipped()), ("a.spz", gzip.compress(b"a", mtime=0)), ("a.ppm", b"P3\n1 1\n255\n0 0 0\n"),
+        ("a.sog", zipped()), ("a.npz", zipped()), ("a.spz", gzip.compress(b"a", mtime=0)),
+        ("a.ppm", b"P3\n1 1\n255\n0 0 0\n"),
     ],
 )  # fmt: skip
 def test_right_files_are_let_through(name: str, content: bytes, tmp_path: Path) -> None:

@@ -285,8 +285,8 @@ def test_halves_of_characters_become_question_marks(data: ViewData) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        (20.0, 25.04, "5.0 dB closer to the photos"),
-        (20.0, 19.0, "1.0 dB farther from the photos"),
+        (20.0, 25.04, "5.0 dB closer to its own photos"),
+        (20.0, 19.0, "1.0 dB farther from its own photos"),
         (float("inf"), 30.0, "30.0 dB from the input's own renders"),
         (None, None, "Gaussians"),
         (float("inf"), float("inf"), "Gaussians"),

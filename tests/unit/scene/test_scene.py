@@ -160,8 +160,9 @@ def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
     swapped = replace(tiny, images=tiny.images[::-1])
     write_images(tiny_folder / "images", swapped)
     assert load_scene(tiny_folder).notes == ()
-    (note,) = inspect(tiny_folder)["notes"]
-    assert names(note, "2 of 3", "photos")
+    photos, depth = inspect(tiny_folder)["notes"]
+    assert names(photos, "2 of 3", "photos")
+    assert names(depth, "confirms")
 
 
 # What does not fit

@@ -108,7 +108,7 @@ def test_a_damaged_photo(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid", cameras=True)
     (folder / "images" / SMOOTH.names[0]).write_bytes(b"\x89PNG nothing")
     actual = load_scene(folder)
-    assert names(str(actual.left_out), "the photos in", SMOOTH.names[0], "image")
+    assert names(str(actual.left_out), "the photos in", SMOOTH.names[0], ".png file")
     assert len(actual.scene) == 3
 
 

@@ -11,13 +11,14 @@ import unaligned_scenes
 
 import gsmerge
 from gsmerge import Scene
+from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.plan import make_plan
 from gsmerge.pooling import scene_members
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode, weaken_contradicted
-from gsmerge.types import Groups, grid_ids
+from gsmerge.types import Groups
 
 AUTO = CompactOptions().with_settings({"superpixels": "auto"})
 
@@ -51,25 +52,19 @@ def test_what_other_views_see_through_begins_fainter(wall: Scene) -> None:
     np.testing.assert_array_equal(thin.means, features.means)
 
 
-def test_share_that_other_views_see_through(wall: Scene) -> None:
-    one, two = (contradicted_share(some, scene_members(some)) for some in (wall, with_nearer_half(wall, [1])))
-    assert one < 0.02
-    assert two == pytest.approx(1 / 8, abs=0.03)
-    nothing = replace(wall, pixel_ids=grid_ids(np.zeros_like(wall.valid)))
-    assert contradicted_share(nothing, scene_members(nothing)) == 0
-
-
 def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
     shares = []
     for scene in (wall, with_nearer_half(wall, [1]), with_nearer_half(wall, [0, 2])):
         with record_run() as log:
             plan = make_plan(prepare(scene), AUTO)
         shares.append(plan.superpixels.options.share)
-        assert log.choices["agreement"]["share"] == pytest.approx(shares[-1], rel=0.05)
+        agreement = confirm_depths(scene)
+        assert log.choices["agreement"] == agreement.to_dict()
+        assert shares[-1] == pytest.approx(agreement.share, rel=0.05)
         assert len(log.notes) == 1
-        assert "through" in log.notes[0]
+        assert f"other views confirm {100 * agreement.confirmed:.0f} %" in log.notes[0]
     assert shares[0] == shares[1] == 0.1  # an eighth of the pixels is contradicted, then a quarter
-    assert 0.015 <= shares[2] < 0.09
+    assert 0.015 <= shares[2] < 0.1
 
 
 @pytest.mark.slow
@@ -78,8 +73,8 @@ def test_an_automatic_budget_is_the_share_that_the_depths_bear(wall: Scene) -> N
     for scene in (wall, with_nearer_half(wall, [0, 2])):
         with record_run() as log:
             plan = make_plan(prepare(scene), auto)
-        assert plan.limits.count == pytest.approx(log.choices["agreement"]["share"] * len(scene.gaussians), rel=0.05)
-        assert any(note.startswith("budget: ") and "through" in note for note in log.notes)
+        assert plan.limits.count == pytest.approx(confirm_depths(scene).share * len(scene.gaussians), rel=0.05)
+        assert any(note.startswith("budget: ") and "confirm" in note for note in log.notes)
         assert not plan.auto_count
         assert plan.settings["budget"] == "auto"
     without_fit = make_plan(prepare(wall), auto.with_settings({"fit": "none"}))

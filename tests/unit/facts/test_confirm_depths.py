@@ -1,0 +1,143 @@
+"""How far the views of a scene confirm each other's depth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+import unaligned_scenes
+
+from gsmerge import Cameras, Scene
+from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
+from gsmerge.geometry import project
+from gsmerge.runtime.threads import use_threads
+from gsmerge.types import grid_ids
+
+VIEWS, WIDTH, HEIGHT = 4, 48, 36
+
+
+@pytest.fixture(scope="module")
+def wall() -> Scene:
+    return scenes.make_scene(scenes.wall(), scenes.arc(VIEWS, WIDTH, HEIGHT))
+
+
+def with_nearer_half(scene: Scene, views: list[int]) -> Scene:
+    """The right half of some views stands at six tenths of its depth."""
+    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3).copy()
+    for view in views:
+        eye = scene.cameras.centres[view]
+        means[view, :, WIDTH // 2 :] = eye + 0.6 * (means[view, :, WIDTH // 2 :] - eye)
+    return replace(scene, gaussians=replace(scene.gaussians, means=means.reshape(-1, 3)))
+
+
+def turned_away(scene: Scene, view: int) -> Scene:
+    """One view with all that it sees turned half around the vertical axis through its eye."""
+    eye, half = scene.cameras.centres[view], np.diag([-1.0, 1.0, -1.0])
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[view, :3, :3] = viewmats[view, :3, :3] @ half
+    viewmats[view, :3, 3] = -viewmats[view, :3, :3] @ eye
+    means = scene.gaussians.means.reshape(VIEWS, -1, 3).copy()
+    means[view] = eye + (means[view] - eye) @ half
+    gaussians = replace(scene.gaussians, means=means.reshape(-1, 3))
+    return replace(scene, gaussians=gaussians, cameras=replace(scene.cameras, viewmats=viewmats))
+
+
+def confirm_slowly(scene: Scene) -> Agreement:
+    """Look up each pixel in each other view, one after the other, in the words of the definition."""
+    means = scene.gaussians.means.reshape(VIEWS, HEIGHT, WIDTH, 3)
+    reach = max(PIXELS, REACH * WIDTH)
+    counts = [0, 0, 0]
+    for view in range(VIEWS):
+        for row in range(HEIGHT):
+            for column in range(WIDTH):
+                same, through, seen = 0, 0, False
+                for other in {*range(VIEWS)} - {view}:
+                    (((x, y),),), ((depth,),) = project(means[view, row, column][None], scene.cameras[[other]])
+                    if depth <= 0 or not (0 < x < WIDTH and 0 < y < HEIGHT):
+                        continue
+                    seen = True
+                    surface = means[other, int(y), int(x)][None]
+                    (((back_x, back_y),),), ((ahead,),) = project(surface, scene.cameras[[view]])
+                    there = project(surface, scene.cameras[[other]])[1].item()
+                    away = math.hypot(back_x - column - 0.5, back_y - row - 0.5) / reach if ahead > 0 else math.inf
+                    behind = math.log(depth / there)
+                    if away < 1 and abs(behind) < SAME:
+                        same += 1
+                    elif behind < -2 * SAME or (behind < 0 and away > 2):
+                        through += 1
+                counts[0] += same > 0 and same >= through
+                counts[1] += through > same
+                counts[2] += not seen
+    return Agreement(*(count / (VIEWS * HEIGHT * WIDTH) for count in counts))
+
+
+def test_a_wall_that_all_views_see_is_confirmed(wall: Scene) -> None:
+    agreement = confirm_depths(wall)
+    assert agreement.confirmed > 0.97
+    assert agreement.contradicted < 0.01
+    assert agreement.doubt is None
+    assert agreement.share == MOST
+
+
+def test_what_stands_nearer_is_contradicted(wall: Scene) -> None:
+    """A half of one view, then of two: an eighth and a quarter of all pixels."""
+    one, two = (confirm_depths(with_nearer_half(wall, views)) for views in ([1], [0, 2]))
+    assert one.contradicted == pytest.approx(1 / 8, abs=0.05)
+    assert two.contradicted == pytest.approx(1 / 4, abs=0.08)
+    assert two.confirmed < one.confirmed < confirm_depths(wall).confirmed
+
+
+def test_views_that_look_elsewhere_are_alone(wall: Scene) -> None:
+    agreement = confirm_depths(turned_away(wall, 2))
+    assert agreement.alone == pytest.approx(1 / VIEWS + confirm_depths(wall).alone, abs=0.05)
+    assert agreement.confirmed > 0.7
+
+
+@pytest.mark.parametrize("spoilt", [[], [1], [0, 2]], ids=str)
+def test_shares_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> None:
+    """But for the pixels that are drawn."""
+    scene = with_nearer_half(wall, spoilt)
+    actual, expected = confirm_depths(scene).to_dict(), confirm_slowly(scene).to_dict()
+    assert actual == pytest.approx(expected, abs=0.03)
+
+
+def test_pixels_without_a_gaussian_do_not_count(wall: Scene) -> None:
+    valid = wall.valid.copy()
+    valid[:, :, WIDTH // 2 :] = False
+    half = replace(with_nearer_half(wall, [0, 1, 2, 3]), pixel_ids=grid_ids(valid))
+    assert confirm_depths(half).contradicted < 0.02
+    assert confirm_depths(replace(wall, pixel_ids=grid_ids(np.zeros_like(wall.valid)))) is None
+
+
+def test_scenes_in_which_nothing_can_be_compared_have_none(wall: Scene) -> None:
+    assert confirm_depths(scenes.take_views(wall, [0])) is None
+    assert confirm_depths(unaligned_scenes.without_order(wall)) is None
+    none = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+    assert confirm_depths(Scene(wall.gaussians[:0], none, None, grid_ids(np.empty((0, 1, 1), bool)), ())) is None
+
+
+def test_threads_change_nothing(wall: Scene) -> None:
+    scene, actual = with_nearer_half(wall, [0, 2]), []
+    for threads in (1, 2):
+        with use_threads(threads):
+            actual.append(confirm_depths(scene))
+    assert actual[0] == actual[1]
+
+
+def test_what_a_scene_bears_falls_with_the_share() -> None:
+    shares = [Agreement(confirmed, 0, 0).share for confirmed in (1, 0.75, 0.7, 0.65, 0.6, 0.1)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] == shares[1] == MOST
+    assert shares[1] > shares[2] > shares[3] > shares[4] == shares[5] == FEWEST
+
+
+def test_a_poor_scene_says_why() -> None:
+    assert Agreement(0.5, 0.5, 0.0).doubt is None
+    lonely, wrong = Agreement(0.24, 0.14, 0.34).doubt, Agreement(0.34, 0.41, 0.07).doubt
+    assert lonely is not None
+    assert all(word in lonely for word in ("24 %", "34 %", "too few or too far apart"))
+    assert wrong is not None
+    assert all(word in wrong for word in ("34 %", "depth is wrong"))

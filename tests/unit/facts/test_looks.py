@@ -1,0 +1,86 @@
+"""Scenes that have another look than their photos: which of the two a result has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from messages import noted
+
+from gsmerge import CompactResult, Scene, compact, render
+from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+
+Colors = np.ndarray
+FIT = {"superpixels": 200, "fit_steps": 30, "checkpoint": "none", "poses": "fixed", "new_views": False}
+
+
+def grey(colors: Colors) -> Colors:
+    return np.repeat((colors @ np.array([0.3, 0.59, 0.11]))[..., None], 3, -1)
+
+
+def false_colors(colors: Colors) -> Colors:
+    return np.stack([1 - colors[..., 2], colors[..., 0], (2 * colors[..., 1]) % 1], -1)
+
+
+def styled(colors: Colors) -> Colors:
+    """Green inks on pale paper."""
+    light = grey(colors)[..., 0]
+    return np.stack([1 - 0.9 * light, 0.9 - 0.4 * light**2, 0.3 + 0.6 * np.abs(2 * light - 1)], -1).clip(0, 1)
+
+
+def mildly_graded(colors: Colors) -> Colors:
+    return 0.95 * colors**0.93 + 0.01
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4, 96, 72))
+
+
+def with_look(scene: Scene, look: Callable[[Colors], Colors]) -> Scene:
+    """Other colours of the Gaussians beside the same photos."""
+    colors = look(sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1).astype(np.float64))
+    return replace(scene, gaussians=replace(scene.gaussians, sh0=rgb_to_sh0(colors.astype(np.float32))[:, None]))
+
+
+def distances(result: CompactResult, scene: Scene) -> tuple[float, float]:
+    """Mean difference of colours from the scene's own Gaussians and from its photos."""
+    shown, own = (render(each, scene.cameras).images for each in (result.gaussians, scene.gaussians))
+    return float(np.abs(shown - own).mean()), float(np.abs(shown - scene.images).mean())
+
+
+@pytest.mark.parametrize("look", [grey, false_colors, styled])
+def test_a_scene_keeps_its_look(look: Callable[[Colors], Colors], room: Scene) -> None:
+    scene = with_look(room, look)
+    result = compact(scene, **FIT)
+    assert result.report.psnr_reference == ROW_COLORS
+    assert len([note for note in result.report.notes if "--set look=photos" in note]) == 1
+    own, photos = distances(result, scene)
+    assert own < 0.6 * photos
+
+
+@pytest.mark.parametrize("look", [grey, false_colors, styled])
+def test_photos_are_followed_where_it_is_asked_for(look: Callable[[Colors], Colors], room: Scene) -> None:
+    scene = with_look(room, look)
+    result = compact(scene, **FIT, look="photos")
+    assert result.report.psnr_reference == PHOTOS
+    assert not noted(result.report.notes, "look")
+    own, photos = distances(result, scene)
+    assert photos < 0.6 * own
+
+
+def test_photos_of_another_scene_are_no_look(room: Scene) -> None:
+    other = scenes.make_scene(scenes.wall(9), scenes.arc(4, 96, 72)).images
+    notes = compact(replace(room, images=other), **FIT).report.notes
+    assert noted(notes, "4 of 4", "do not show what the Gaussians show")
+    assert not [note for note in notes if "look=photos" in note]
+
+
+def test_a_mild_grade_is_followed(room: Scene) -> None:
+    result = compact(with_look(room, mildly_graded), **FIT)
+    assert result.report.psnr_reference == PHOTOS
+    assert not [note for note in result.report.notes if "look" in note]
