@@ -24,7 +24,7 @@ from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import render
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures
-from gsmerge.runtime.record import choose, note, record_part
+from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Source
 from gsmerge.types import PicturedScene, Scene
@@ -89,7 +89,8 @@ def compare_photos(scene: PicturedScene, look: Source = "auto") -> tuple[Picture
     if look == "photos":
         return scene, tuple(range(len(scene)))
     small, names = show_photos(scene), scene.names
-    changes = find_tones(small, names)
+    with record_part(silent=True) as tones:
+        changes = find_tones(small, names)
     if scene.aligned:
         covers, pictures = _find_covers(scene, changes)
         odd = [view for view in range(len(scene)) if _is_other(scene.images[view], covers[view])]
@@ -101,6 +102,7 @@ def compare_photos(scene: PicturedScene, look: Source = "auto") -> tuple[Picture
     if restyled:
         note(f"{OTHER_LOOK}: its own colours are kept; --set look=photos gives it that of the photos")
         return scene, ()
+    adopt(tones)
     covered = [view for view in range(len(scene)) if covers[view].any() and view not in odd]
     changed = sorted({*covered, *(view for view, change in enumerate(changes) if change)} - {*odd})
     if changed:
