@@ -151,7 +151,9 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
     from gsmerge.io.formats.table import PLY, SITE
 
+    odd = document["choices"].get("photos_left_out")
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
+    doubts += [f"photos do not show what the Gaussians show: {len(odd)}"] if odd and args.strict else []
     say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
@@ -159,7 +161,8 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
         look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
-    if args.strict and document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]:
+    unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
+    if args.strict and unchecked and not document["worse"]:
         say_notes(["--strict: there is no photo to compare with, so nothing was checked"], quiet=args.silent)
     problems = [document["unmet"], *(doubts if args.strict else [])]
     if document["worse"] and not args.strict:

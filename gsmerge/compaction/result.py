@@ -11,7 +11,7 @@ from weakref import ReferenceType
 
 import numpy as np
 
-from gsmerge.compaction.new_views import Trial
+from gsmerge.compaction.new_views import SIDE, Trial
 from gsmerge.compaction.report import CompactReport, Covered
 from gsmerge.facts.prepare import Prepared, scene_depth
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
@@ -231,7 +231,7 @@ def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: P
 
     ``before`` is the score of the input.
     """
-    if before is None or covers_all(before):
+    if before is None or covers_all(before) or prepared.scene.empty is not None:  # whose photos count where it covers
         return None
     after = measure_result(gaussians, prepared, plan, before.covered)
     return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
@@ -290,7 +290,8 @@ def make_result(
         new_views = trial.predict(before, main.psnr_after, prepared.agreement)
         if not prepared.scene.aligned and new_views.gain < 0:  # the input was made from the photos that the fit lacked
             new_views = None
-    if new_views is not None and main.worse is None and new_views.gain < -MAX_LOSS:
+    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
+    if new_views is not None and is_large and main.worse is None and new_views.gain < -MAX_LOSS:
         worse = f"new views of the result are expected to be {-new_views.gain:.1f} dB worse than those of the input"
         main, notes = replace(main, worse=worse), [*notes, worse]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"], new_views=new_views)

@@ -26,7 +26,7 @@ from gsmerge.raster import render
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import Source
+from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene, Scene
 
 # Differences are of colours in [0, 1]. Of 15 captures the photos differ from their pixels' own colours by 0.003 in the
@@ -62,6 +62,8 @@ LOOK_SIDE, OWN_EDGES, MORE_EDGES = 96, 0.5, 0.1
 # Errors of a linear map as a share of those of tones, in the median and in the root mean square: one or the other is
 # .86 or more with photos of 15 captures and with mild grades, both are .17 to .76 with styles
 COARSE_SIDE, OPAQUE, RECOLORED = 12, 0.7, 0.8
+UNEXPLAINED = 0.6  # error of the map, of the spread of colours: more with photos of another scene
+ALIKE = 0.015  # root mean square error of tones up to which nothing is to be explained
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,25 +81,25 @@ class Shown:
         return self.photos[views][counts], self.pictures[views][counts]
 
 
-def compare_photos(scene: PicturedScene, look: Source = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
+def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
     """Mend the photos of a canonical scene, and replace what does not show it.
 
     Returns the scene and the views whose photos show it; there are none if most photos do not, or have another look.
-    With ``look`` "photos" all count as they are. The record gets notes and the choices ``photos_changed`` and
-    ``photos_left_out``.
+    With ``look`` "photos" all count as they are, with "scene" none. The record gets notes and the choices
+    ``photos_changed`` and ``photos_left_out``.
     """
-    if look == "photos":
-        return scene, tuple(range(len(scene)))
+    if look != "auto":
+        return scene, tuple(range(len(scene))) if look == "photos" else ()
     small, names = show_photos(scene), scene.names
     with record_part(silent=True) as tones:
         changes = find_tones(small, names)
     if scene.aligned:
         covers, pictures = _find_covers(scene, changes)
         odd = [view for view in range(len(scene)) if _is_other(scene.images[view], covers[view])]
-        restyled = 2 * len(odd) > len(scene) and share_edges(small)
+        restyled = is_recolored(small) or (2 * len(odd) > len(scene) and share_edges(small))
     else:
         mended = _mend_small(small, changes)
-        covers, pictures, restyled = np.zeros(scene.images.shape[:3], bool), None, is_recolored(mended)
+        covers, pictures, restyled = np.zeros(scene.images.shape[:3], bool), None, is_recolored(small)
         odd = [] if restyled else odd_photos(mended)
     if restyled:
         note(f"{OTHER_LOOK}: its own colours are kept; --set look=photos gives it that of the photos")
@@ -111,8 +113,8 @@ def compare_photos(scene: PicturedScene, look: Source = "auto") -> tuple[Picture
         most = 100 * max(float(covers[view].mean()) for view in covered)
         note(
             f"{len(covered)} of {len(scene)} photos show in part what their Gaussians do not (up to {most:.0f} % of a"
-            " photo: a mask, a mark, a finger, another look or camera?): the Gaussians' colours take its place:"
-            f" {list_names(names, covered)}"
+            " photo: a mask, a mark, a finger, another look or camera?): the Gaussians' colours take its place,"
+            f" --set look=scene everywhere: {list_names(names, covered)}"
         )
     if odd and not _leave_out(scene, odd):
         return scene, ()
@@ -358,22 +360,25 @@ def _edges(picture: np.ndarray) -> np.ndarray:
 def is_recolored(shown: Shown) -> bool:
     """Return whether a linear map of colours explains drawn Gaussians by their photos much better than tones do.
 
-    Pictures are so small that wrong depth displaces nothing.
+    Drawings are compared so small that wrong depth displaces nothing.
     """
-    weights = _shrink(shown.weights, COARSE_SIDE)
-    counts = weights > OPAQUE
+    if _is_reversed(shown, range(len(shown.photos))):  # which is mended
+        shown = replace(shown, photos=shown.photos[..., ::-1])
+    side = COARSE_SIDE if shown.drawn else SIDE
+    weights = _shrink(shown.weights, side)
+    counts = weights > (OPAQUE if shown.drawn else FAINT)
     if counts.sum() < MIN_PIXELS:
         return False
-    drawn = _shrink(shown.pictures, COARSE_SIDE)[counts] / weights[counts][:, None]
-    photos = _shrink(shown.photos * shown.weights[..., None], COARSE_SIDE)[counts] / weights[counts][:, None]
+    drawn = _shrink(shown.pictures, side)[counts]
+    photos = _shrink(shown.photos * shown.weights[..., None], side)[counts] / weights[counts][:, None]
+    drawn = drawn / weights[counts][:, None] if shown.drawn else drawn
     tones = np.stack([_join_quantiles(photos[:, channel], drawn[:, channel]) for channel in range(3)])
     columns = np.concatenate([photos, np.ones((len(photos), 1))], 1).astype(np.float64)
     matrix = solve(matmul(columns.T, columns) + 1e-6 * np.eye(4), matmul(columns.T, drawn.astype(np.float64)))
-    by_tones, by_matrix = look_up(tones, photos), matmul(columns, matrix)
-    means = [float(np.square(colors - drawn).mean()) for colors in (by_tones, by_matrix)]
-    return means[1] < RECOLORED**2 * means[0] and (
-        _difference(by_matrix, drawn) < RECOLORED * _difference(by_tones, drawn)
-    )
+    by_tones, by_matrix, middle = look_up(tones, photos), matmul(columns, matrix), drawn.mean(0)
+    left, best, every = (float(np.square(colors - drawn).mean()) for colors in (by_tones, by_matrix, middle))
+    nearer = _difference(by_matrix, drawn) < RECOLORED * _difference(by_tones, drawn)
+    return nearer and left > ALIKE**2 and best < RECOLORED**2 * left and best < UNEXPLAINED**2 * every
 
 
 def _shrink(pictures: np.ndarray, side: int) -> np.ndarray:

@@ -34,7 +34,7 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
 NOTHING, SPARSE = 0.5, 0.25  # the same below which it shows nothing, and below which there is nothing around it
 LARGE, RIM = 1 / 12, 2  # of the longer side: squares in large parts that stay empty; pixels beside them that do not
-GAP = 9  # pixels: of a part that is left out only narrower gaps in what is covered are filled
+GAP = 1 / 53  # of the longer side: beside large empty parts only narrower gaps in what is covered are filled
 MOST = 0.5  # share of empty pixels from which on rows without pixels may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
 FARTHEST = 0.99  # quantile of the depths that counts as the farthest
@@ -72,16 +72,17 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     if not (free.any() or (scene.aligned and not everywhere and any(map(_any_large, bare)))):
         return scene
     holes, empty, parts = np.zeros_like(free), np.zeros_like(free), dict[int, Gaussians]()
+    gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
 
     def fill(view: int, tiled: TiledView) -> None:
         depths, left = _blend_depths(tiled)
         covered = left <= 1 - EMPTY
         if not everywhere:
-            sparse = cv2.blur(left, (GAP, GAP)) > 1 - SPARSE  # single Gaussians at the edges of what was cut out
+            sparse = blur(left, gap / 4) > 1 - SPARSE  # single Gaussians at the edges of what was cut out
             empty[view] = large_parts((left > 1 - NOTHING) & sparse)
         holes[view] = free[view] & ~covered & ~empty[view]
         if empty[view].any():  # the edges of what was cut out are no holes
-            around = np.ones((GAP, GAP), np.uint8)
+            around = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, around) > 0
         if covered.any() and holes[view].any():
             parts[view] = _fill_view(scene, view, holes[view], covered, depths)

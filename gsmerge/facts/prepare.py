@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import PrepareOptions, Source
+from gsmerge.settings.stages import Look, PrepareOptions
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
 
 SAMPLES = 65536  # Gaussians that the frame is measured on
@@ -238,7 +238,8 @@ def _prepare_pixels(
     given: Scene, canonical: Scene, frame: Frame, repeated: tuple[int, ...], options: PrepareOptions
 ) -> Prepared:
     """Prepare a scene whose rows belong to pixels: without photos the rows' own colours replace them."""
-    scene, views = _with_pictures(canonical, add_row_colors, options.look)
+    add_colors = partial(add_row_colors, given=canonical.images is not None)
+    scene, views = _with_pictures(canonical, add_colors, options.look)
     every = tuple(range(len(scene)))
     reference = Reference(PHOTOS, every, views) if views else Reference(ROW_COLORS, every, every)
     given = _with_photos(given, scene, repeated)
@@ -263,7 +264,8 @@ def _prepare_others(
     if views:
         given = _with_photos(given, scene, repeated)
     else:
-        note("no photos: views rendered from the scene itself stand in for them")
+        none = "no photos" if given.images is None else "photos do not count"
+        note(f"{none}: views rendered from the scene itself stand in for them")
         scene = draw_pictures(scene)
         shown = tuple(view for view in every if scene.images[view].any())  # any result looks like an empty view
         reference = replace(reference, score_views=shown or every)
@@ -271,7 +273,7 @@ def _prepare_others(
 
 
 def _with_pictures(
-    scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Source
+    scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Look
 ) -> tuple[PicturedScene, tuple[int, ...]]:
     """Return a scene with a picture of every view, and the views whose photos a fit may use.
 
@@ -297,11 +299,17 @@ def _lacks_photos(scene: Scene) -> bool:
 
 
 def with_row_colors(scene: Scene) -> Scene:
-    """Return a scene with its rows' own colours as photos if it has pixels and no photos, as :func:`prepare` does."""
-    if not _lacks_photos(scene):
+    """Return a scene with its rows' own colours as photos if it has pixels and no photos, as :func:`prepare` does.
+
+    So it is with photos that have another look, or do not show it.
+    """
+    if not (_lacks_photos(scene) or (scene.aligned and len(scene) and scene.valid.any())):
         return scene
     with record_part(silent=True):
-        colored = add_row_colors(canonicalise(scene)[0])
+        canonical = canonicalise(scene)[0]
+        if scene.images is not None and compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))[1]:
+            return scene
+        colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks)
 
 

@@ -32,8 +32,11 @@ BLUR = 8.0  # standard deviation, pixels
 DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, from which on the drawing is taken
 
 
-def add_row_colors(scene: Scene) -> PicturedScene:
-    """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note."""
+def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
+    """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
+
+    ``given``: whether there are photos, which do not count.
+    """
     kinds, shape = camera_kinds(scene.cameras), scene.valid.shape
     images, masks, num_drawn = np.zeros((*shape, 3), np.float32), np.full(shape, False), 0
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]  # the layers of a view have one camera
@@ -42,7 +45,7 @@ def add_row_colors(scene: Scene) -> PicturedScene:
         num_drawn += len(views) * int(drawn.sum())
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
-    note(NO_PHOTOS + detail)
+    note((f"photos do not count: {ROW_COLORS} stand in for them" if given else NO_PHOTOS) + detail)
     return PicturedScene.of(scene, images, None if masks.all() else masks)
 
 

@@ -13,6 +13,7 @@ from gsmerge.types import Gaussians, Scene
 # Of Gaussians that captures have: median largest scale as a share of the diagonal of the box that holds most, and
 # median coefficient of the base colours; of fewer nothing is said
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
+FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
 SAMPLES = 65536  # Gaussians that these are measured on
 Pictures = Literal["photos", "renders", "none"]  # photos or what stands in for them; drawings of the scene itself
 
@@ -69,11 +70,15 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     low, high = np.percentile(sample.means.astype(np.float64), (1, 99), axis=0)
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
     size, color = float(np.median(sample.scales.max(1))), float(np.median(np.abs(sample.sh0)))
-    if TINY * diagonal <= size <= LARGE * diagonal and color <= BRIGHT:
+    low_color, high_color = np.percentile(sample.sh0[:, 0], (1, 99), axis=0)
+    flat, faint = float((high_color - low_color).max()) < FLAT, float(np.median(sample.opacities)) < FAINT
+    if TINY * diagonal <= size <= LARGE * diagonal and color <= BRIGHT and not (flat or faint):
         return None
     problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
     if size < TINY * diagonal:
         problem = f"half of the Gaussians are at most {size / diagonal:.2g} times as large as the scene"
+    if flat or faint:
+        problem = "the Gaussians have one flat colour" if flat else f"half of the opacities are below {FAINT:.2g}"
     if color > BRIGHT:
         problem = f"half of the base colours have coefficients beyond {color:.3g}"
     return f"{problem}, as in no capture: are they stored otherwise? nothing is scored"

@@ -13,7 +13,8 @@ from gsmerge.settings.setting import Settings, setting
 Poses = Literal["auto", "fixed", "free"]
 Exposure = Literal["auto", "fixed", "per-photo"]
 Unseen = Literal["drop", "keep"]
-Source = Literal["auto", "photos"]
+Look = Literal["auto", "scene", "photos"]
+Extent = Literal["auto", "photos"]
 Method = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
@@ -43,9 +44,9 @@ class PrepareOptions(Settings):
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
         "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
         "others.")  # fmt: skip
-    look: Source = setting("auto", "Colours of a scene that has another look than its photos: auto: its own; photos: "
-        "theirs.")  # fmt: skip
-    extent: Source = setting("auto", "Large parts of photos in which the scene shows nothing, as one that was cut out "
+    look: Look = setting("auto", "Whose colours count: auto: those of the photos, but its own of a scene with another "
+        "look; scene: its own; photos: theirs as they are.")  # fmt: skip
+    extent: Extent = setting("auto", "Large parts of photos in which the scene shows nothing, as one that was cut out "
         "or has no sky: auto: they stay empty; photos: they are filled.")  # fmt: skip
 
 

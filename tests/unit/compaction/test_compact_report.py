@@ -88,7 +88,7 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     document = make_document(files, new_views=NewViews(17.25, 21.5, 3))
     assert document["new_views"] == {"before": 17.25, "after": 21.5, "views": 3}
     line = report.summary_line(document)
-    assert line.index("new views +4.2 dB, as expected") < line.index("its own photos 20.00 -> 24.50 dB")
+    assert line.index("new views +4.2 dB expected") < line.index("its own photos 20.00 -> 24.50 dB")
     table = [" ".join(row.split()) for row in report.result_table(document)]
     (place,) = (i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB expected, from 3 photos"))
     assert table[place + 1].startswith("its own photos")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ import unaligned_scenes
 from gsmerge import Cameras, Scene
 from gsmerge.facts.confirm_depths import FEWEST, MOST, PIXELS, REACH, SAME, Agreement, confirm_depths
 from gsmerge.geometry import project
+from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import grid_ids
 
@@ -62,8 +62,12 @@ def confirm_slowly(scene: Scene) -> Agreement:
                     surface = means[other, int(y), int(x)][None]
                     (((back_x, back_y),),), ((ahead,),) = project(surface, scene.cameras[[view]])
                     there = project(surface, scene.cameras[[other]])[1].item()
-                    away = math.hypot(back_x - column - 0.5, back_y - row - 0.5) / reach if ahead > 0 else math.inf
-                    behind = math.log(depth / there)
+                    away = (
+                        ((back_x - column - 0.5) ** 2 + (back_y - row - 0.5) ** 2) ** 0.5 / reach
+                        if ahead > 0
+                        else np.inf
+                    )
+                    behind = float(log(depth / there))
                     if away < 1 and abs(behind) < SAME:
                         same += 1
                     elif behind < -2 * SAME or (behind < 0 and away > 2):

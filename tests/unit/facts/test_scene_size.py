@@ -40,9 +40,17 @@ def test_sizes_have_bounds(share: float, words: str | None, room: Scene) -> None
 
 @pytest.mark.parametrize(("value", "is_odd"), [(0.9 * BRIGHT, False), (1.1 * BRIGHT, True), (-1.1 * BRIGHT, True)])
 def test_colours_have_a_bound(value: float, is_odd: bool, room: Scene) -> None:
-    odd = unlike_captures(replace(room.gaussians, sh0=np.full_like(room.gaussians.sh0, value)))
+    colors = value * (1 + 0.01 * np.random.default_rng(0).random(room.gaussians.sh0.shape, np.float32))
+    odd = unlike_captures(replace(room.gaussians, sh0=colors))
     assert (odd is not None) == is_odd
-    assert odd is None or ("colours" in odd and f"{1.1 * BRIGHT:.3g}" in odd)
+    assert odd is None or "base colours have coefficients beyond 11" in odd
+
+
+def test_one_colour_and_faint_ones_are_odd(room: Scene) -> None:
+    flat = replace(room.gaussians, sh0=np.full_like(room.gaussians.sh0, 0.3))
+    faint = replace(room.gaussians, opacities=np.full_like(room.gaussians.opacities, 0.001))
+    assert noted([unlike_captures(flat) or ""], "one flat colour")
+    assert noted([unlike_captures(faint) or ""], "opacities")
 
 
 def test_some_odd_ones_and_few_are_none(room: Scene) -> None:
