@@ -33,7 +33,8 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
 NOTHING, SPARSE = 0.5, 0.25  # the same below which it shows nothing, and below which there is nothing around it
-LARGE, RIM = 1 / 12, 2  # of the longer side: squares in large parts that stay empty; pixels beside them that do not
+LARGE, PART, RIM = 1 / 12, 0.12, 2  # of the longer side: squares in large parts that stay empty; their share
+# of the picture, at least; pixels beside them that do not
 GAP = 1 / 53  # of the longer side: beside large empty parts only narrower gaps in what is covered are filled
 MOST = 0.5  # share of empty pixels from which on rows without pixels may be a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # of the depth of a view's farthest surface: depths that are tried
@@ -114,12 +115,16 @@ def _any_large(empty: np.ndarray) -> bool:
 def large_parts(empty: np.ndarray) -> np.ndarray:
     """Return the connected parts of a mask ``[h,w]`` that hold a large square, less a rim of some pixels.
 
-    Borders that exporters leave out, and gaps, are narrower.
+    There are none where such squares cover little of the picture. Borders that exporters leave out, and gaps, are
+    narrower, and the farthest tenth that Depth Anything 3 leaves out is less.
     """
     side = 2 * round(LARGE * max(empty.shape) / 2) + 1
     square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM + 1,) * 2, np.uint8)
+    opened = cv2.morphologyEx(empty.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    if opened.mean() < PART:
+        return np.zeros_like(empty)
     _, labels = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
-    kept = np.isin(labels, labels[cv2.erode(empty.astype(np.uint8), square) > 0])
+    kept = np.isin(labels, labels[opened & empty])
     return np.asarray(cv2.erode(kept.astype(np.uint8), rim) > 0)
 
 
