@@ -45,7 +45,8 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
         num_drawn += len(views) * int(drawn.sum())
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
-    note((f"photos do not count: {ROW_COLORS} stand in for them" if given else NO_PHOTOS) + detail)
+    if detail or not given:  # else a note has said it
+        note((f"photos do not count: {ROW_COLORS} stand in for them" if given else NO_PHOTOS) + detail)
     return PicturedScene.of(scene, images, None if masks.all() else masks)
 
 
