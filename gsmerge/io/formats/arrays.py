@@ -55,8 +55,8 @@ def new_views_comment(before: float, after: float) -> str:
 def read_new_views(comments: Sequence[object]) -> tuple[float, float] | None:
     """Read what new views of the input and of a result are expected to have, dB, from header comments; None without."""
     pattern = re.compile(re.escape(NEW_VIEWS_COMMENT) + r": (-?\d{1,3}\.\d\d) to (-?\d{1,3}\.\d\d) dB")
-    found = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
-    match = next(filter(None, found), None)
+    matches = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
+    match = next(filter(None, matches), None)
     return None if match is None else (float(match[1]), float(match[2]))
 
 

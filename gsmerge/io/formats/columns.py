@@ -75,20 +75,20 @@ def check_columns(path: Path, row: np.dtype[np.void], layers: Sequence[str]) -> 
     numbers in the place of floats.
     """
     _check_types(path, row)
-    found: dict[ColumnKind | None, list[str]] = {}
+    by_kind: dict[ColumnKind | None, list[str]] = {}
     for name in row.names or ():
         if name in arrays.REQUIRED or name.startswith("f_rest_") or name == arrays.FILTER:
             continue
         kinds = (kind for kind, names in zip(COLUMN_KINDS, _PATTERNS, strict=True) if names.fullmatch(name))
         kind = next(kinds, None)
         if kind is not None or row[name].kind == "f":
-            found.setdefault(kind, []).append(name)
-    for kind, names in found.items():
+            by_kind.setdefault(kind, []).append(name)
+    for kind, names in by_kind.items():
         if kind is not None and kind.remedy:
             problem = f"expected Gaussians to be drawn as they are stored, found {_list(names)}: {kind.what}"
             raise SceneError(path, problem, kind.remedy)
-    parts = [f"{_list(names)} ({kind.what}: {kind.effect})" for kind, names in found.items() if kind and kind.what]
-    parts += [f"{_list(found[None])} (unknown)"] if None in found else []
+    parts = [f"{_list(names)} ({kind.what}: {kind.effect})" for kind, names in by_kind.items() if kind and kind.what]
+    parts += [f"{_list(by_kind[None])} (unknown)"] if None in by_kind else []
     parts += [f"{_list(layers)} (more Gaussians)"] if layers else []
     return (UNUSED + "; ".join(parts),) if parts else ()
 
