@@ -396,7 +396,7 @@ def odd_photos(shown: Shown) -> list[int]:
     level = max(1.0, max(width, height) / EDGES_SIDE)
     if min(height, width) < 2 or height * width / level**2 < MIN_PIXELS:
         return []
-    scores, judged = _correlate_gradients(shown, (max(1, round(width / level)), max(1, round(height / level))))
+    scores, judged = _correlate_gradients(shown)
     correlations, near = np.diag(scores).copy(), scores.clip(-CLOSEST, CLOSEST)
     z_scores = 0.5 * log((1 + near) / (1 - near))  # inverse hyperbolic tangents
     own = np.diag(z_scores).copy()
@@ -407,18 +407,14 @@ def odd_photos(shown: Shown) -> list[int]:
     return np.flatnonzero(judged & ((correlations < least) | (gains > GAIN))).tolist()
 
 
-def _correlate_gradients(shown: Shown, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _correlate_gradients(shown: Shown) -> tuple[np.ndarray, np.ndarray]:
     """Correlate the image gradients of each view's Gaussians with those of every photo: ``[v,v]``, -1 to 1.
 
     Exposure does not change the correlation. Also returns a mask ``[v]`` of views with enough structure.
     """
-
-    def shrink(images: np.ndarray) -> list[np.ndarray]:
-        return [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images.astype(np.float32)]
-
-    a = np.stack([_gradients(image) for image in shrink(shown.pictures)])
-    b = np.stack([_gradients(image) for image in shrink(shown.photos)])
-    w = np.stack([_gradient_weights(weight) for weight in shrink(shown.weights)])
+    a = np.stack([_gradients(image) for image in _shrink(shown.pictures, EDGES_SIDE)])
+    b = np.stack([_gradients(image) for image in _shrink(shown.photos, EDGES_SIDE)])
+    w = np.stack([_gradient_weights(weight) for weight in _shrink(shown.weights, EDGES_SIDE)])
     weighted, squares = w * a, (w * a * a).sum(1)
     sizes = squares[:, None] * matmul(w, (b * b).T)
     scores = np.divide(matmul(weighted, b.T), np.sqrt(sizes), out=np.zeros_like(sizes), where=sizes > 0)
