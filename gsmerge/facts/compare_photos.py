@@ -55,7 +55,6 @@ LEAST, SHARE = 0.06, 0.25  # least correlation of a photo that shows the scene, 
 GAIN = 0.4  # of the inverse hyperbolic tangent of the correlation: more with another view, and the photo is of that one
 CLOSEST = 0.995  # correlation above which photos are equally good
 NAMED = 4  # views that a note names
-OTHER_LOOK = "the scene has another look than its photos"
 # Correlation of edges, chosen on twelve looks of three captures: .57 to .99, or with colours by depth .13 to .41 and .1
 # above that with other views; that is -.05 to .33
 LOOK_SIDE, OWN_EDGES, MORE_EDGES = 96, 0.5, 0.1
@@ -91,19 +90,18 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto":
         return scene, tuple(range(len(scene))) if look == "photos" else ()
     small, names = show_photos(scene), scene.names
+    if is_recolored(small):
+        return _keep_look(scene)
     with record_part(silent=True) as tones:
         changes = find_tones(small, names)
     if scene.aligned:
         covers, pictures = _find_covers(scene, changes)
         odd = [view for view in range(len(scene)) if _is_other(scene.images[view], covers[view])]
-        restyled = is_recolored(small) or (2 * len(odd) > len(scene) and share_edges(small))
+        if 2 * len(odd) > len(scene) and share_edges(small):
+            return _keep_look(scene)
     else:
-        mended = _mend_small(small, changes)
-        covers, pictures, restyled = np.zeros(scene.images.shape[:3], bool), None, is_recolored(small)
-        odd = [] if restyled else odd_photos(mended)
-    if restyled:
-        note(f"{OTHER_LOOK}: its own colours are kept; --set look=photos gives it that of the photos")
-        return scene, ()
+        covers, pictures = np.zeros(scene.images.shape[:3], bool), None
+        odd = odd_photos(_mend_small(small, changes))
     adopt(tones)
     covered = [view for view in range(len(scene)) if covers[view].any() and view not in odd]
     changed = sorted({*covered, *(view for view, change in enumerate(changes) if change)} - {*odd})
@@ -122,6 +120,13 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if scene.masks is not None:
         covers |= ~scene.masks
     return _change(scene, changes, covers, pictures), tuple(view for view in range(len(scene)) if view not in odd)
+
+
+def _keep_look(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
+    """Note that no photo counts, since the scene has another look; return what :func:`compare_photos` does then."""
+    problem = "the scene has another look than its photos: its own colours are kept"
+    note(f"{problem}; --set look=photos gives it that of the photos")
+    return scene, ()
 
 
 def _is_other(photo: np.ndarray, cover: np.ndarray) -> bool:

@@ -72,13 +72,16 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     size, color = float(np.median(sample.scales.max(1))), float(np.median(np.abs(sample.sh0)))
     low_color, high_color = np.percentile(sample.sh0[:, 0], (1, 99), axis=0)
     flat, faint = float((high_color - low_color).max()) < FLAT, float(np.median(sample.opacities)) < FAINT
-    if TINY * diagonal <= size <= LARGE * diagonal and color <= BRIGHT and not (flat or faint):
-        return None
-    problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
-    if size < TINY * diagonal:
-        problem = f"half of the Gaussians are at most {size / diagonal:.2g} times as large as the scene"
-    if flat or faint:
-        problem = "the Gaussians have one flat colour" if flat else f"half of the opacities are below {FAINT:.2g}"
     if color > BRIGHT:
         problem = f"half of the base colours have coefficients beyond {color:.3g}"
+    elif flat:
+        problem = "the Gaussians have one flat colour"
+    elif faint:
+        problem = f"half of the opacities are below {FAINT:.2g}"
+    elif size < TINY * diagonal:
+        problem = f"half of the Gaussians are at most {size / diagonal:.2g} times as large as the scene"
+    elif size > LARGE * diagonal:
+        problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
+    else:
+        return None
     return f"{problem}, as in no capture: are they stored otherwise? nothing is scored"
