@@ -6,7 +6,7 @@ python benchmarks/quality.py fox,fern --set k=2 superpixels=1% match=none
 python benchmarks/quality.py eval --set method=greedy budget=4.4%   # another method in the place of ours
 python benchmarks/quality.py eval --unmerged-fit        # the input after the same fit: equal steps, and equal time
 
-Figures are PSNR and SSIM over the visible pixels, LPIPS if asked for, and of results near fog, far fog and holes.
+Figures are PSNR and SSIM over the visible pixels, LPIPS if asked for, and of results fog, holes and veils.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def score(gaussians: Gaussians, targets: Targets, perceptual: bool = False) -> t
 
 
 def score_outside(scene: Scene, results: Mapping[str, Gaussians]) -> dict[str, tuple[float, ...]]:
-    """Near fog, far fog and holes of results by name; NaN where there is nothing to measure on."""
+    """Fog, holes and veils of results by name; NaN where there is nothing to measure on."""
     fog = measure_fog(scene.file_gaussians, results, scene.cameras, near_plane(scene))
     return {name: tuple(math.nan if v is None else v for v in vars(one[ALL]).values()) for name, one in fog.items()}
 

@@ -38,7 +38,7 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     whole = prepared.scene.empty is None
     if not long or not whole or not prepared.reference.of_views:  # what placed views see is all there is
         return fitted
-    return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras))
+    return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras, fitted.outside))
 
 
 def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:

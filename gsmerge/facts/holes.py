@@ -19,6 +19,7 @@ import numpy as np
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.row_colors import fill_gaps
+from gsmerge.fit.outside import Outside
 from gsmerge.geometry import nearest_views, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
@@ -215,11 +216,12 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
     return chosen
 
 
-def fill_between(fitted: Gaussians, cameras: Cameras) -> Gaussians:
+def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -> Gaussians:
     """Put Gaussians where cameras between and just beside those of the photos see nothing; faint ones make room.
 
     At most ``SHARE`` of the Gaussians are replaced, for what half-way cameras see first. The new ones continue the
-    farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against them.
+    farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against them,
+    nor does a view from ``outside``.
     Scenes of more than ``MOST_VIEWS`` views stay as they are: photos show nearly all that lies between them.
     """
     if not 1 < len(cameras) <= MOST_VIEWS:
@@ -232,7 +234,7 @@ def fill_between(fitted: Gaussians, cameras: Cameras) -> Gaussians:
     for view in range(len(between)):
         if len(filled) >= full:
             break
-        more = _continue_surfaces(filled, between[[view]], seen)
+        more = _continue_surfaces(filled, between[[view]], seen, outside)
         filled = Gaussians.concat([filled, more[: full - len(filled)]])
     faintest = order[: len(filled) - len(fitted)]
     return filled[np.delete(np.arange(len(filled)), faintest)]
@@ -294,7 +296,9 @@ def _see(gaussians: Gaussians, cameras: Cameras) -> Seen:
     return Seen(cameras, depths, clear)
 
 
-def _continue_surfaces(gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, ...]) -> Gaussians:
+def _continue_surfaces(
+    gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, ...], outside: Outside | None
+) -> Gaussians:
     """Make Gaussians for the clear pixels of a camera that continue the farther side of the surfaces beside.
 
     Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
@@ -315,7 +319,10 @@ def _continue_surfaces(gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, 
     eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
     tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
     points = (eye + tried[..., None] * rays).reshape(-1, 3)
-    hidden = ~np.logical_or(*(some.contradict(points) for some in seen)).reshape(tried.shape)
+    wrong = np.logical_or(*(some.contradict(points) for some in seen))
+    if outside is not None:
+        wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
+    hidden = ~wrong.reshape(tried.shape)
     rows = np.flatnonzero(hidden.any(0))
     chosen = tried[hidden.argmax(0)[rows], rows]
     colors = sums[rows, 1:4] / sums[rows, 4:]

@@ -58,7 +58,7 @@ def fit_full(
         step += 1
         outside_view = run.outside_view(step, part)
         if outside_view is not None:
-            optimiser.clear_fog(state, drawn, outside_view)
+            optimiser.clear_veils(state, drawn, outside_view)
         if step > steps * (1 - options.tuning.average_share):
             tail.add(state.x)
         if options.time_budget is not None and step == PROBE:

@@ -1,70 +1,108 @@
-"""Views from outside of the capture, in which a fit keeps empty what its start shows as empty.
+"""Views from outside of the capture, in which a fit puts nothing where its input shows nothing or something behind.
 
-Photos say nothing of what hangs in gaps between them, and a fit fills these gaps with large Gaussians: fog, to whoever
-steps back. So after a third of a run some steps look from behind and beside, above and below, at opacities alone.
+Photos say nothing of what hangs in gaps between them or before other cameras, and a fit fills these gaps with large
+Gaussians: fog and veils, to whoever steps back. So after a third of a run some steps look from behind and beside, above
+and below, at opacities and depths alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from gsmerge.geometry import middle_depth, step_outside
+from gsmerge.geometry import middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.raster import Splats, tile_view
+from gsmerge.raster import Splats, prepare, tile_view
 from gsmerge.raster.composite import blend
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import TiledView
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras
+from gsmerge.types import Cameras, Gaussians, Scene
 
 # Least and largest step back, as a share of the depth of what a view sees, and turns about its middle to the sides, and
 # up or down, degrees. Cameras that turn without a step back see what new views see, and would cost them their fill
 LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 24  # views outside, at most, or as many as there are photos
+PLACES = 36  # views outside, at most, or as many as there are photos
 SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
-EMPTY = 0.05  # opacity of the start below which a pixel is empty
-# Distance from what the start shows, as a share of the width, within which nothing is asked: what stands beside the
+ROWS = 4000  # Gaussians of the input for each photo that stand for all, made as much larger as they are fewer
+NEAREST = 0.25  # of the depth of what a view sees: nearer to a camera nothing is looked at
+EMPTY, SOLID = 0.15, 0.9  # opacities of the input: below it a pixel is empty, above it shows a surface
+# Distance from what the input shows, as a share of the width, within which nothing is asked: what stands beside the
 # outline fills what the foreground uncovers in new views
-RIM = 0.08
+RIM = 0.04
+# Share of the way to a surface that the mean depth of a pixel may lack before it counts as veiled
+MARGIN = 0.15
 # Gaussians of the start for each photo from which on fog weighs as much as errors of the photos: fewer and larger ones
-# reach from the borders of photos into what is empty, and would leave both. LIGHT is the least weight
-MANY, LIGHT = 1000, 0.15
+# reach from the borders of photos into what is empty, and would leave both. LIGHT is the least weight; veils weigh more
+MANY, LIGHT, VEIL = 1000, 0.15, 30
 LEAST_WIDTH = 64  # pixels of the pictures
-LEAST = 0.005  # share of a picture that must be empty for it to count
+LEAST = 0.005  # share of a picture that must be empty or solid for it to count
 TOUCHED = 1e-9  # gradient of the opacity from which on a Gaussian takes part in a step
 SCORED = 12  # views, at most, that the fog of a result is measured in
 
 
-def outside_views(start: Splats, photos: Photos, options: FitOptions) -> Photos | None:
-    """Place views outside the capture for a fit; only pixels where the start shows nothing have weights above 0.
+@dataclass(frozen=True, eq=False)
+class Outside:
+    """Views from outside, and how far each of their pixels sees."""
 
-    Cameras step back from those of ``photos``. Pictures are black and half as large, at least ``LEAST_WIDTH`` wide.
-    None if the start fills all of them.
+    views: Photos  # black; weights [v,h,w] of the pixels of which something is asked
+    limits: np.ndarray  # [v,h,w] camera z before which nothing is to stand: infinite where nothing is to be at all
+    near: np.ndarray  # [v] camera z from which on a view looks
+
+    def contradict(self, points: np.ndarray, share: float) -> np.ndarray:
+        """Return a mask ``[n]`` of points ``[n,3]`` that some view sees before a ``share`` of its limit."""
+        width, height = self.views.width, self.views.height
+        pixels, z = project(points, Cameras(self.views.viewmats, self.views.Ks, width, height))
+        inside = (z > self.near[:, None]) & ((pixels >= 0) & (pixels < (width, height))).all(2)
+        view, point = np.nonzero(inside)
+        column, row = pixels[inside].astype(np.int64).T
+        wrong = z[inside] < share * self.limits[view, row, column]
+        return np.bincount(point[wrong], minlength=len(points)) > 0
+
+
+def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
+    """Place views outside the capture for a fit from a ``start``, and see how far into the scene they look.
+
+    Cameras step back from those of ``photos``. Pictures are half as large, at least ``LEAST_WIDTH`` wide. None if the
+    scene says nothing in any of them; of a scene without Gaussians, as views of blocks are joined, the start says it.
     """
-    if len(start) == 0 or len(photos) == 0:
+    rows = _sample(scene, ROWS * len(photos)) if len(scene.gaussians) else start
+    if len(rows) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
-    points = start.means[:: max(1, len(start) // SAMPLE)] + start.origin
+    points = rows.means[:: max(1, len(rows) // SAMPLE)]
     placed = outside_cameras(points, cameras, min(looks, max(PLACES, len(photos))), LOW, HIGH)
-    views = blank_photos(placed, min(2, photos.width / LEAST_WIDTH))
+    depths = [middle_depth(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
+    near = NEAREST * np.resize(depths, len(placed))
+    views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
 
-    def mark(view: int) -> np.ndarray:
-        return mark_empty(1 - _blend_black(start, views, view)[1])
+    def look(view: int) -> np.ndarray:
+        opacities, depths = _see(_tile(drawn, views, view, near[view]))
+        return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
 
-    marks = list(in_turn(mark, range(len(views))))
-    kept = [view for view, empty in enumerate(marks) if empty.mean() > LEAST]
+    limits = np.stack(list(in_turn(look, range(len(views)))))
     weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
-    return replace(views[kept], weights=weight * np.stack([marks[view] for view in kept])) if kept else None
+    weights = weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
+    kept = np.flatnonzero((limits > 0).mean((1, 2)) > LEAST).tolist()
+    return Outside(replace(views[kept], weights=weights[kept]), limits[kept], near[kept]) if kept else None
+
+
+def _sample(scene: Scene, count: int) -> Gaussians:
+    """Return about ``count`` of a scene's Gaussians, evenly among the rows, so large that they cover what all do."""
+    rows = np.flatnonzero(scene.valid) if scene.aligned else np.arange(len(scene.gaussians))
+    step = max(1, len(rows) // max(1, count))
+    first = np.arange(0, len(rows) - step + 1, step)
+    some = scene.gaussians[rows[first + (step * (EVEN[0] * np.arange(len(first)) % 1)).astype(np.int64)]]
+    return replace(some, scales=some.scales * np.float32(math.sqrt(step)))
 
 
 def outside_cameras(
@@ -89,12 +127,20 @@ def mark_empty(opacities: np.ndarray) -> np.ndarray:
     return np.asarray(empty, bool)
 
 
-def _blend_black(
-    splats: Splats, views: Photos, view: int, tiles: np.ndarray | None = None
-) -> tuple[TiledView, np.ndarray]:
-    """Tile a view and blend black Gaussians in it; return the view and the transmittance ``[h,w]``."""
-    tiled = tile_view(splats, **views.camera(view), tiles=tiles)
-    return tiled, blend(tiled, np.zeros((len(tiled.ids), 3), np.float32), np.zeros(3, np.float32))[1]
+def _tile(splats: Splats, views: Photos, view: int, near: float, tiles: np.ndarray | None = None) -> TiledView:
+    return tile_view(splats, **views.camera(view), near=near, tiles=tiles)
+
+
+def _blend_depths(tiled: TiledView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Blend depths as if they were colours; return these ``[m,3]``, their picture ``[h,w,3]``, and what is left."""
+    depths = np.repeat(tiled.depths[:, None], 3, 1)
+    return depths, *blend(tiled, depths, np.zeros(3, np.float32))
+
+
+def _see(tiled: TiledView) -> tuple[np.ndarray, np.ndarray]:
+    """Return the opacities and mean depths ``[h,w]`` that a view sees."""
+    _, image, left = _blend_depths(tiled)
+    return 1 - left, image[..., 0] / np.maximum(1 - left, 1e-6)
 
 
 def _tiles_of(weights: np.ndarray) -> np.ndarray:
@@ -104,24 +150,32 @@ def _tiles_of(weights: np.ndarray) -> np.ndarray:
     return np.asarray(padded.reshape(-(-height // TILE), TILE, -1, TILE).any((1, 3)))
 
 
-def fog_gradients(splats: Splats, views: Photos, view: int) -> Gradients:
-    """Return the gradients of each Gaussian for the fog of a view, which is the weighted mean of its opacity."""
+def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
+    """Return the gradients of each Gaussian that stands before the limits of a view, of what it hides there.
+
+    That is the weighted mean of the opacity less the share of the limit at which what is blended stands: the opacity
+    itself where nothing is to be. Where no more than ``MARGIN`` of a limit is lacking, nothing is asked.
+    """
+    views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
-    weights = views.weights[view]
-    tiled, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
-    black, colors = np.zeros((*weights.shape, 3), np.float32), np.zeros((len(tiled.ids), 3), np.float32)
-    wanted = weights / np.float32(-weights.size)  # of the transmittance, which is 1 - opacity
-    g = gradients_of(tiled, colors, black, transmittance, black, wanted, with_viewmat=False)
-    return g[np.flatnonzero(np.abs(g.opacities) > TOUCHED)]
+    tiled = _tile(splats, views, view, outside.near[view], _tiles_of(views.weights[view]))
+    depths, image, left = _blend_depths(tiled)
+    inverse = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
+    hidden = 1 - left - image[..., 0] * inverse
+    weights = np.where((hidden > MARGIN) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
+    wanted = np.zeros_like(image)
+    wanted[..., 0] = -weights * inverse
+    g = gradients_of(tiled, depths, image, left, wanted, -weights, with_viewmat=False)
+    g.colors[:] = 0
+    return g[np.flatnonzero(g.opacities > TOUCHED)]  # what stands behind is not to gain opacity
 
 
-def score_fog(splats: Splats, views: Photos) -> float:
-    """Measure the weighted mean opacity, in [0, 1], of the Gaussians over a sample of the views from outside."""
-    assert views.weights is not None
-    fog, count = 0.0, 0.0
-    for view in range(0, len(views), -(-len(views) // SCORED)):
-        weights = views.weights[view]
-        _, transmittance = _blend_black(splats, views, view, _tiles_of(weights))
-        fog += float((weights * (1 - transmittance)).sum(dtype=np.float64))
-        count += float(weights.sum(dtype=np.float64))
-    return fog / count
+def score_fog(splats: Splats, outside: Outside) -> float | None:
+    """Measure the mean opacity, in [0, 1], where nothing is to be, over a sample of the views; None: nowhere."""
+    fog, count = 0.0, 0
+    for view in range(0, len(outside.views), -(-len(outside.views) // SCORED)):
+        empty = np.isinf(outside.limits[view])
+        opacities, _ = _see(_tile(splats, outside.views, view, outside.near[view], _tiles_of(empty)))
+        fog += float(opacities[empty].sum(dtype=np.float64))
+        count += int(empty.sum())
+    return fog / count if count else None

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import choose, note, report_progress
 from gsmerge.types import Cameras, Gaussians
 
@@ -24,7 +25,7 @@ class FitReport:
     holdout_after: float  # The same after it
     stopped: str  # Why it ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None: fixed
-    # Mean opacity of the result, in [0, 1], seen from outside where the start shows nothing; None: it fills every view
+    # Mean opacity of the result, in [0, 1], seen from outside where the input shows nothing; None: it fills every view
     fog: float | None = None
     # [n] row of the start that each Gaussian comes from; None: not known
     origins: np.ndarray | None = field(default=None, compare=False)
@@ -44,6 +45,7 @@ class Fitted:
     gaussians: Gaussians  # Canonical Gaussians
     cameras: Cameras  # The scene's cameras, canonical, moved where the fit moved them
     report: FitReport | None  # What the fit did; None where nothing was fitted
+    outside: Outside | None = None  # Where it was to put nothing; None: not known
 
 
 def record_fit(report: FitReport | None) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN, reduced, training_weights
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import Photos
@@ -48,7 +49,7 @@ class FitJob:
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that stay as they are; None: none
     # Where renders stand for photos, how many of them, the first ones, a result has to show better; None: photos, all
     num_judged: int | None = None
-    outside: Photos | None = None  # Views in which some steps clear fog, see gsmerge.fit.outside; None: none
+    outside: Outside | None = None  # Views in which some steps clear fog and veils; None: none
 
     def judges(self, size: int) -> Photos:
         """Return the photos that a result has to show better, at a size as of :class:`DrawMode`."""
@@ -84,7 +85,7 @@ class FitRun:
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
-        return step // rates.outside_every % len(outside)
+        return step // rates.outside_every % len(outside.views)
 
     def draw_mode(self, step: int, progress: float) -> DrawMode:
         """Return how step ``step`` (from 1) draws the scene.

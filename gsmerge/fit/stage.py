@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.fit.fit_state import gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import grow_to
-from gsmerge.fit.outside import outside_views, score_fog
+from gsmerge.fit.outside import look_outside, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
@@ -48,6 +48,8 @@ def fit_scene(
         if decoded.exact and not options.grows:  # then nothing is left out either
             options = replace(options, min_contribution=0.0)
         job = FitJob(photos, options, decoded.count, seed, report_steps, decoded.fixed, num_judged)
+        if options.fit != "none":
+            job = replace(job, outside=look_outside(scene, decoded.gaussians, job.judges(1), options))
         gaussians, report = fit(decoded.gaussians, job)
         record_fit(report)
     cameras = scene.cameras
@@ -55,21 +57,17 @@ def fit_scene(
         viewmats = cameras.viewmats.astype(np.float64)
         viewmats[list(views)] = report.viewmats
         cameras = replace(cameras, viewmats=viewmats)
-    return Fitted(gaussians, cameras, report)
+    return Fitted(gaussians, cameras, report, job.outside)
 
 
 def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]:
     """Drop Gaussians that no photo shows, and fit the rest to the photos.
 
-    If the full fit does not improve held-out patches of the photos, the colour fit is tried. Views from outside are
-    added to the job. If the options need no photos, as in drafts without a fit, all Gaussians are returned and the
-    report is None.
+    If the full fit does not improve held-out patches of the photos, the colour fit is tried. If the options need no
+    photos, as in drafts without a fit, all Gaussians are returned and the report is None.
     """
-    options = job.options
-    if not options.needs_photos:  # it costs as much as all that was done before
+    if not job.options.needs_photos:  # it costs as much as all that was done before
         return gaussians, None
-    if options.fit != "none":
-        job = replace(job, outside=outside_views(prepare(gaussians), job.judges(1), options))
     fitted, report = _choose_fit(gaussians, job)
     if report is not None and job.outside is not None:
         report = replace(report, fog=score_fog(prepare(fitted), job.outside))

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.loss import image_gradient
-from gsmerge.fit.outside import fog_gradients
+from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.prepared_step import StepTables, is_prepared
 from gsmerge.fit.schedule import FitRun, Step, loss_weights, step_sizes
 from gsmerge.geometry import motion_matrices
@@ -138,10 +138,10 @@ class Optimiser:
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }
 
-    def clear_fog(self, state: FitState, step: Step, view: int) -> None:
-        """Take one Adam step against fog: opacity in a view from outside where the start was empty."""
+    def clear_veils(self, state: FitState, step: Step, view: int) -> None:
+        """Take one Adam step against fog and veils in a view from outside."""
         assert self.run.job.outside is not None
-        self._move(state, fog_gradients(state.splats, self.run.job.outside, view), step)
+        self._move(state, veil_gradients(state.splats, self.run.job.outside, view), step)
 
     def _move(self, state: FitState, g: Gradients, step: Step) -> None:
         """Take one Adam step along gradients."""

@@ -1,8 +1,8 @@
-"""Fog: what a compact scene shows where its input shows nothing, seen from outside of the capture.
+"""Fog and veils: what a compact scene shows where its input shows nothing or something behind, seen from outside.
 
 Photos judge a scene from where they stand. A viewer's first move is to step back and turn: Gaussians that hang in gaps
-between the views then show as haze, and gaps in surfaces as holes. The measure needs no photos, only the input and the
-cameras of its views; docs/guide/evaluate.md defines it for others.
+between the views then show as haze, those of wrong depth as veils before surfaces, and gaps in surfaces as holes. The
+measure needs no photos, only the input and the cameras of its views; docs/guide/evaluate.md defines it for others.
 """
 
 from __future__ import annotations
@@ -30,21 +30,39 @@ SIDE = 480  # pixels, at most, of the longer side of the pictures
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
 MARGIN = 17  # pixels per side of the square that erodes what is empty
 FAR = 0.1  # of the width: distance from what the input shows from which fog is far
+VEIL = 0.7  # of the input's depth: what a result shows nearer than that is a veil
+VEILED = 0.08  # worst veil above which a result gets a note
+TINY = 1e-6  # least opacity that depths are divided by
+NEAREST = 0.25  # of the median depth of the view: what is nearer to a camera is drawn in neither picture of depth
 
 
 @dataclass(frozen=True)
 class Fog:
-    """Fog and holes that a result shows from outside and its input does not; None where there is nothing to measure.
+    """Fog, veils and holes that a result shows from outside and its input not; None where there is nothing to measure.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
         fog_far: The same farther than a tenth of the width from what the input shows.
         holes: Share of the pixels where the input is solid and the result is not.
+        veil: Share of the pixels where the input is solid whose depth in the result is less than 0.7 of the input's,
+            mean of the cameras.
+        veil_worst: The same of the camera where it is most.
     """
 
     fog_near: float | None = None
     fog_far: float | None = None
     holes: float | None = None
+    veil: float | None = None
+    veil_worst: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What a camera sees of a scene."""
+
+    opacities: np.ndarray  # [h,w]
+    beyond: np.ndarray  # [h,w] without what is near
+    depths: np.ndarray  # [h,w] mean camera z of the same
 
 
 def measure_fog(
@@ -54,36 +72,43 @@ def measure_fog(
     near: float = 0.01,
     progress: Progress = lambda *_: None,
 ) -> dict[str, dict[str, Fog]]:
-    """Measure fog and holes of results, by name, seen from outside the ``cameras`` of the scene ``reference``.
+    """Measure fog, veils and holes of results, by name, seen from outside the ``cameras`` of the scene ``reference``.
 
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
     """
     first, splats = prepare(reference), {name: prepare(result) for name, result in results.items()}
-    sums = {name: {kind: np.zeros((3, 2)) for kind in CAMERAS} for name in results}
+    pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}
     outside = list(outside_cameras(reference, cameras))
-    for number, (kind, camera) in enumerate(outside):
+    for number, (kind, camera, depth) in enumerate(outside):
         progress("views from outside", number, len(outside))
-        shown = draw_opacity(first, camera, near)
+        expected = look(first, camera, near, NEAREST * depth)
         for name in results:
-            sums[name][kind] += fog_sums(shown, draw_opacity(splats[name], camera, near))
-    for kinds in sums.values():
-        kinds[ALL] = np.sum(list(kinds.values()), axis=0)
-    return {name: {kind: mean_fog(rows) for kind, rows in kinds.items()} for name, kinds in sums.items()}
+            pictures[name].append((kind, count_pixels(expected, look(splats[name], camera, near, NEAREST * depth))))
+    return {
+        name: {
+            kind: mean_fog(np.stack([counts for other, counts in rows if kind in (other, ALL)]))
+            for kind in (*CAMERAS, ALL)
+        }
+        for name, rows in pictures.items()
+    }
 
 
 def describe_fog(name: str, fog: Fog) -> str | None:
-    """Describe the haze of a result seen from outside; None if far fog is at most 0.05."""
-    if fog.fog_far is None or fog.fog_far <= HAZE:
+    """Describe haze and veils of a result seen from outside; None if far fog is at most 0.05, the worst veil 0.08."""
+    seen = []
+    if (fog.fog_far or 0) > HAZE:
+        seen.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f})")
+    if (fog.veil_worst or 0) > VEILED:
+        seen.append(f"a veil before up to {100 * (fog.veil_worst or 0):.0f} % of what the input shows")
+    if not seen:
         return None
-    return (
-        f"{name}: seen from outside, the result shows haze where the input shows nothing: far fog {fog.fog_far:.2f};"
-        " if it comes from a fit to photos, compact --fit none makes none"
-    )
+    remedy = "if it comes from a fit to photos, compact --fit none makes none"
+    return f"{name}: seen from outside, the result shows {' and '.join(seen)}; {remedy}"
 
 
-def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras]]:
-    """Yield (kind, camera) of each picture from outside."""
+def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
+    """Yield (kind, camera, median depth of the view that it steps back from) of each picture from outside."""
     cameras = shrink_cameras(cameras, SIDE)
     for view in pick_views(len(cameras), VIEWS):
         camera = cameras[[view]]
@@ -91,25 +116,36 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
         for kind, places in CAMERAS.items():
             for back, turn in places:
                 viewmat = step_outside(camera.viewmats[0], depth, back, turn)
-                yield kind, replace(camera, viewmats=viewmat[None])
+                yield kind, replace(camera, viewmats=viewmat[None]), depth
 
 
-def draw_opacity(splats: Splats, camera: Cameras, near: float) -> np.ndarray:
-    """Draw the opacity ``[h,w]`` of a scene in one camera."""
+def look(splats: Splats, camera: Cameras, near: float, nearest: float) -> Sight:
+    """Draw opacities beyond ``near``, and depths beyond ``nearest``, world units, of a scene in one camera."""
+    (opacities, _), (beyond, depths) = (_blend_depths(splats, camera, plane) for plane in (near, nearest))
+    return Sight(opacities, beyond, depths)
+
+
+def _blend_depths(splats: Splats, camera: Cameras, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Draw opacities and mean depths ``[h,w]`` beyond ``near``, world units."""
     tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    black = np.zeros((len(tiled.ids) + 1, 3), np.float32)
-    return 1 - blend(tiled, black[1:], black[0])[1]
+    image, left = blend(tiled, np.repeat(tiled.depths[:, None], 3, 1), np.zeros(3, np.float32))
+    return 1 - left, image[..., 0] / np.maximum(1 - left, np.float32(TINY))
 
 
-def fog_sums(reference: np.ndarray, result: np.ndarray) -> np.ndarray:
-    """Return (sum, number of pixels) ``[3,2]`` of near fog, far fog and holes, given opacities ``[h,w]``."""
-    empty, solid = (reference < EMPTY).astype(np.uint8), reference > SOLID
-    sides = MARGIN, max(MARGIN, 2 * round(FAR * reference.shape[1]) + 1)
+def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:
+    """Return (sum, number of pixels) ``[4,2]`` of near fog, far fog, holes and veil in a picture of a result."""
+    empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
+    sides = MARGIN, max(MARGIN, 2 * round(FAR * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
-    fog = [(float(result[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
-    return np.array([*fog, (float((result[solid] < OPEN).sum()), float(solid.sum()))])
+    fog = [(float(actual.opacities[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
+    covered = expected.beyond > SOLID
+    veil = covered & (actual.beyond > EMPTY) & (actual.depths < VEIL * expected.depths)
+    holes = float((actual.opacities[solid] < OPEN).sum()), float(solid.sum())
+    return np.array([*fog, holes, (float(veil.sum()), float(covered.sum()))])
 
 
-def mean_fog(sums: np.ndarray) -> Fog:
-    """Divide the sums by the pixel counts of :func:`fog_sums`, ``[3,2]``, to get mean fog and holes."""
-    return Fog(*(above / count if count else None for above, count in sums.tolist()))
+def mean_fog(counts: np.ndarray) -> Fog:
+    """Divide the sums by the numbers of pixels of :func:`count_pixels`, ``[pictures,4,2]``; veils by picture."""
+    near, far, holes, _ = (above / count if count else None for above, count in counts.sum(0).tolist())
+    veils = [above / count for above, count in counts[:, 3].tolist() if count]
+    return Fog(near, far, holes, *((sum(veils) / len(veils), max(veils)) if veils else ()))

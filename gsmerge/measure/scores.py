@@ -20,7 +20,9 @@ Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
-OUTSIDE = {"fog_near": "near fog", "fog_far": "far fog", "holes": "holes"}  # fields of Fog
+OUTSIDE = {
+    "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
+}  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal leaves out, the first one first
 LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
 MASKED = "_visible"  # suffix of what is measured over the pixels that the input views have seen
@@ -36,7 +38,7 @@ def evaluation_document(
 ) -> dict[str, Any]:
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
-    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog and holes, which are
+    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog, holes and veils,
     null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other sizes
     than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is true,
     ``lpips_views`` if LPIPS was measured on fewer views of some split. Within one schema version keys are only added.

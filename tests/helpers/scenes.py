@@ -273,6 +273,12 @@ def run_for(photos: tuple[Photos, ...], options: FitOptions, count: int = 0, **j
     return prepare_fit(FitJob(photos, options, count, **job))
 
 
+def bare(gaussians: Gaussians) -> Scene:
+    """Gaussians without views."""
+    none = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 8, 8)
+    return Scene(gaussians, none, None, None, ())
+
+
 def noise_for(photos: tuple[Photos, Photos]) -> tuple[Photos, Photos]:
     """Photos of noise: nothing that is learned of one patch holds in another."""
     rng = np.random.default_rng(0)

@@ -218,7 +218,7 @@ def test_what_a_camera_between_views_uncovers_is_filled_behind_what_they_see() -
     gaussians, cameras = slit(-0.6, 0.6)
     between = slit(0.0)[1]
     before = with_faint(gaussians)
-    after = fill_between(before, cameras)
+    after = fill_between(before, cameras, None)
     middle = np.s_[0, 60:180, 150:170, 0]
     assert render(before, between).alphas[middle].mean() < 0.1
     assert render(after, between).alphas[middle].mean() > 0.9
@@ -230,12 +230,12 @@ def test_what_a_camera_between_views_uncovers_is_filled_behind_what_they_see() -
 
 def test_only_faint_gaussians_make_room() -> None:
     gaussians, cameras = slit(-0.6, 0.6)
-    np.testing.assert_array_equal(fill_between(gaussians, cameras).means, gaussians.means)
+    np.testing.assert_array_equal(fill_between(gaussians, cameras, None).means, gaussians.means)
 
 
 def test_what_each_view_shows_as_empty_stays_empty() -> None:
     post = with_faint(sheet(-0.4, 0.4, 3, 0.8))
-    filled = fill_between(post, slit(-0.6, 0.0, 0.6)[1])
+    filled = fill_between(post, slit(-0.6, 0.0, 0.6)[1], None)
     np.testing.assert_array_equal(np.sort(filled.opacities), np.sort(post.opacities))
 
 
@@ -243,4 +243,4 @@ def test_what_each_view_shows_as_empty_stays_empty() -> None:
 def test_one_view_and_very_many_are_not_filled(count: int) -> None:
     gaussians, cameras = slit(*np.linspace(-0.6, 0.6, count))
     before = with_faint(gaussians)
-    assert fill_between(before, cameras) is before
+    assert fill_between(before, cameras, None) is before

@@ -1,4 +1,4 @@
-"""Views from outside: where the start is empty, and what shows there goes."""
+"""Views from outside: what shows where the scene is empty, or hides what it shows, goes."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from gsmerge import Gaussians
 from gsmerge.fit import FitJob, FitOptions, fit, record_fit
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import (
+    EMPTY,
     LEAST_WIDTH,
     LIGHT,
+    MARGIN,
     RIM,
-    fog_gradients,
+    VEIL,
+    Outside,
+    look_outside,
     mark_empty,
-    outside_views,
     score_fog,
+    veil_gradients,
 )
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_centres
@@ -28,18 +32,23 @@ from gsmerge.runtime.record import record_run
 
 Pair = tuple[Photos, Photos]
 OPTIONS = FitOptions(fit_steps=60, holdout=0.2)
-LONG = FitOptions(fit_steps=160, holdout=0.2)
+LONG = FitOptions(fit_steps=240, holdout=0.2)
 
 
 @pytest.fixture(scope="module")
-def outside(truth: Gaussians, photos: Pair) -> Photos:
-    views = outside_views(prepare(truth), photos[1], OPTIONS)
+def outside(truth: Gaussians, photos: Pair) -> Outside:
+    return look(truth, photos)
+
+
+def look(reference: Gaussians, photos: Pair) -> Outside:
+    """See how far views from outside look into Gaussians without pixels."""
+    views = look_outside(scenes.bare(reference), reference, photos[1], OPTIONS)
     assert views is not None
     return views
 
 
 def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
-    """One large Gaussian more, in the middle of the others."""
+    """One Gaussian more, in the middle of the others, that covers every picture."""
     last = gaussians[-1:]
     wide = np.full_like(last.scales, 5 * np.ptp(gaussians.means, 0).max())
     curtain = replace(
@@ -50,60 +59,106 @@ def with_curtain(gaussians: Gaussians, opacity: float = 0.8) -> Gaussians:
 
 def test_a_rim_beside_what_is_shown_does_not_count() -> None:
     opacities = np.zeros((40, 100), np.float32)
-    opacities[:, :10] = 0.06
+    opacities[:, :10] = EMPTY + 0.01
     assert mark_empty(opacities)[20].tolist() == [column >= 10 + round(100 * RIM) for column in range(100)]
     assert mark_empty(np.zeros((3, 4), np.float32)).all()
     assert not mark_empty(np.full((3, 4), 0.5, np.float32)).any()
 
 
-def test_views_stand_behind_and_around(outside: Photos, truth: Gaussians, photos: Pair) -> None:
+def test_views_stand_behind_and_around(outside: Outside, truth: Gaussians, photos: Pair) -> None:
     """Each looks at the middle of what its photo sees, from no nearer than the photo's camera."""
-    assert outside.weights is not None
-    assert outside.weights.shape == (len(outside), LEAST_WIDTH * photos[1].height // photos[1].width, LEAST_WIDTH)
-    assert np.unique(outside.weights).tolist() == [0, np.float32(LIGHT)]
-    eyes, own = camera_centres(outside.viewmats), camera_centres(photos[1].viewmats)
+    views = outside.views
+    assert views.weights is not None
+    assert views.weights.shape == (len(views), LEAST_WIDTH * photos[1].height // photos[1].width, LEAST_WIDTH)
+    assert np.unique(views.weights) == pytest.approx([0, LIGHT, VEIL * LIGHT])
+    eyes, own = camera_centres(views.viewmats), camera_centres(photos[1].viewmats)
     assert np.linalg.norm(eyes - truth.means.mean(0), axis=1).min() > 0.8 * np.linalg.norm(own, axis=1).min()
-    assert len(np.unique(outside.viewmats.round(6), axis=0)) == len(outside)
-    ahead = outside.viewmats[:, 2, :3]
+    assert len(np.unique(views.viewmats.round(6), axis=0)) == len(views)
+    ahead = views.viewmats[:, 2, :3]
     assert np.degrees(np.arccos(np.clip(ahead @ photos[1].viewmats[:, 2, :3].T, -1, 1)).min(1)).max() > 15
 
 
-def test_a_start_that_fills_every_view_has_none(truth: Gaussians, photos: Pair) -> None:
-    assert outside_views(prepare(with_curtain(truth)), photos[1], OPTIONS) is None
+def test_a_scene_that_shows_nothing_has_none(truth: Gaussians, photos: Pair) -> None:
+    faint = replace(truth[:5], opacities=np.full(5, 0.3, np.float32), scales=np.full((5, 3), 1e3, np.float32))
+    assert look_outside(scenes.bare(faint), truth, photos[1], OPTIONS) is None
+    assert look_outside(scenes.bare(truth[:0]), faint, photos[1], OPTIONS) is None
 
 
-def test_gradients_are_those_of_the_weighted_opacity(outside: Photos, truth: Gaussians) -> None:
-    """Against a central difference in the curtain's opacity."""
-    assert outside.weights is not None
-    spoilt, view, step = with_curtain(truth, 0.3), 0, 0.01
-    g = fog_gradients(prepare(spoilt), outside, view)
+def test_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: Gaussians) -> None:
+    """Against depths drawn from the same cameras, and nothing where it is empty."""
+    for view in range(0, len(outside.views), 9):
+        limits = outside.limits[view]
+        drawn = composite(tile_view(prepare(truth), **outside.views.camera(view)))
+        assert drawn[1][np.isinf(limits)].min(initial=1) > 0.8
+        solid = np.isfinite(limits) & (limits > 0)
+        assert drawn[1][solid].max(initial=0) < 0.15
+        depths = np.linalg.norm(truth.means - camera_centres(outside.views.viewmats)[view], axis=1)
+        assert depths.min() < np.median(limits[solid]) < depths.max()
+
+
+def test_points_before_a_limit_contradict(outside: Outside) -> None:
+    """In front of a surface and in an empty pixel, but neither behind the surface nor beside the picture."""
+    views = outside.views
+    shown = np.argwhere(np.isfinite(outside.limits[0]) & (outside.limits[0] > outside.near[0] / 0.8))
+    empty = np.argwhere(np.isinf(outside.limits[0]))
+    places = np.array([shown[0], shown[0], empty[0], [0, -5]])
+    limit = outside.limits[0][tuple(shown[0])]
+    depths = np.array([0.9 * limit, 1.1 * limit, limit, limit])
+    pixels = np.column_stack([places[:, ::-1] + 0.5, np.ones(4)])
+    local = depths[:, None] * (pixels @ np.linalg.inv(views.Ks[0]).T)
+    pose = np.linalg.inv(views.viewmats[0])
+    alone = replace(outside, views=views[[0]], limits=outside.limits[:1], near=outside.near[:1])
+    assert alone.contradict(local @ pose[:3, :3].T + pose[:3, 3], 0.95).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize("empty", [True, False])
+def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussians, empty: bool) -> None:
+    """Against a central difference in the curtain's opacity: its own where the scene is empty, before a wall as well.
+
+    The wall stands at four times its depth.
+    """
+    spoilt, step = with_curtain(truth, 0.3), 0.01
+    depth = float((outside.views.viewmats[0, 2] * np.append(spoilt.means[-1], 1)).sum())
+    far = np.full_like(outside.limits, 4 * depth)
+    looked = replace(outside, limits=np.where(np.isinf(outside.limits), np.inf, 0) if empty else far)
+    weights = np.full_like(far, 1) if not empty else np.where(np.isinf(looked.limits), np.float32(LIGHT), 0)
+    looked = replace(looked, views=replace(outside.views, weights=weights.astype(np.float32)))
+    g = veil_gradients(prepare(spoilt[len(truth) :]), looked, 0)
 
     def loss(change: float) -> float:
-        changed = replace(spoilt, opacities=np.append(spoilt.opacities[:-1], np.float32(0.3 + change)))
-        tiled = tile_view(prepare(changed), **outside.camera(view))
-        return float((outside.weights[view] * (1 - composite(tiled)[1])).mean(dtype=np.float64))
+        changed = replace(spoilt, opacities=np.append(spoilt.opacities[:-1], np.float32(0.3 + change)))[len(truth) :]
+        tiled = tile_view(prepare(changed), **outside.views.camera(0), near=outside.near[0])
+        hidden = (1 - composite(tiled)[1]) * (1 if empty else 0.75)
+        return float((weights[0] * hidden).mean(dtype=np.float64))
 
-    assert g.ids[-1] == len(truth)
+    assert g.ids.tolist() == [0]
     assert g.opacities[-1] == pytest.approx((loss(step) - loss(-step)) / (2 * step), rel=1e-3)
     assert not g.colors.any()
-    assert len(fog_gradients(prepare(truth), outside, view).ids) < len(g.ids)
 
 
-def test_fog_is_the_opacity_far_outside(outside: Photos, truth: Gaussians) -> None:
+def test_what_hides_little_and_what_stands_behind_is_left(outside: Outside, truth: Gaussians) -> None:
+    curtain = with_curtain(truth, 0.3)[len(truth) :]
+    depth = float((outside.views.viewmats[0, 2] * np.append(curtain.means[0], 1)).sum())
+    for limit, count in ((depth / (1 - MARGIN), 0), (0.5 * depth, 0), (8 * depth, 1)):
+        looked = replace(outside, limits=np.full_like(outside.limits, limit))
+        assert len(veil_gradients(prepare(curtain), looked, 0).ids) == count
+
+
+def test_fog_is_the_opacity_far_outside(outside: Outside, truth: Gaussians) -> None:
     assert score_fog(prepare(truth), outside) == pytest.approx(0, abs=0.01)
-    thick = score_fog(prepare(with_curtain(truth, 0.8)), outside)
-    thin = score_fog(prepare(with_curtain(truth, 0.2)), outside)
+    thick, thin = (score_fog(prepare(with_curtain(truth, opacity)), outside) or 0 for opacity in (0.8, 0.2))
     assert 0.3 < 2 * thin < thick <= 0.81
+    assert score_fog(prepare(truth), replace(outside, limits=np.zeros_like(outside.limits))) is None
 
 
-def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pair, outside: Photos) -> None:
+def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pair, outside: Outside) -> None:
     """Photos that a curtain stands in ask for one; from outside nobody wants it."""
     wanted = with_curtain(truth, 0.3)
     shown = tuple(replace(some, images=np.stack(render_photos(wanted, some)).clip(0, 1)) for some in photos)
     start = scenes.spoil(truth)
-    whole = replace(outside, weights=np.sign(outside.weights))
+    whole = replace(outside, views=replace(outside.views, weights=np.isinf(outside.limits).astype(np.float32)))
     fitted, without = (fit_full(start, scenes.run_for(shown, LONG, outside=views))[0] for views in (whole, None))
-    kept, grown = score_fog(prepare(fitted), outside), score_fog(prepare(without), outside)
+    kept, grown = (score_fog(prepare(one), outside) or 0 for one in (fitted, without))
     assert kept < 0.02
     assert grown > 4 * kept
 

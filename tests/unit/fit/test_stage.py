@@ -13,7 +13,7 @@ from gsmerge.fit import FitJob, FitOptions, FitReport, fit, stage
 from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
-from gsmerge.fit.outside import outside_views, score_fog
+from gsmerge.fit.outside import look_outside, score_fog
 from gsmerge.fit.survey import score_images, survey_photos, visible_mask
 from gsmerge.raster import composite, contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos
@@ -26,9 +26,9 @@ LONG = FitOptions(fit_steps=160, holdout=0.2)
 
 def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     start = scenes.spoil(truth)
-    result, report = fit(start, FitJob(photos, QUICK, seed=4))
-    outside = outside_views(prepare(start), photos[1], QUICK)
+    outside = look_outside(scenes.bare(truth), start, photos[1], QUICK)
     assert outside is not None
+    result, report = fit(start, FitJob(photos, QUICK, seed=4, outside=outside))
     expected, own = fit_full(start, scenes.run_for(photos, QUICK, seed=4, outside=outside))
     assert report == replace(own, fog=score_fog(prepare(result), outside))
     assert scenes.identical(result, expected)

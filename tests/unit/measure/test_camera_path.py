@@ -255,7 +255,7 @@ def test_the_camera_outside_is_one_that_fog_is_measured_with(walk: Cameras) -> N
     camera, distance = outside_camera(middle, means)
     assert distance == pytest.approx(1.5 * viewing_depth(middle, means))
     given = SimpleNamespace(means=means)
-    assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one in outside_cameras(given, middle))
+    assert any(np.array_equal(camera.viewmats, one.viewmats) for _, one, _ in outside_cameras(given, middle))
 
 
 @sweep("kind", ["orbit:40", "spline,back:0.5", "orbit"], often=2)

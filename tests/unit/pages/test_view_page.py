@@ -102,14 +102,14 @@ def with_three_results(data: ViewData) -> ViewData:
 
 def test_a_table_over_all_results(data: ViewData) -> None:
     three = with_three_results(data)
-    three = replace(
-        three, sides=(*three.sides[:1], replace(three.sides[1], fog=Fog(0.25, None, 0.0126)), *three.sides[2:])
-    )
+    foggy = replace(three.sides[1], fog=Fog(0.25, None, 0.0126, 0.02, 0.075))
+    three = replace(three, sides=(*three.sides[:1], foggy, *three.sides[2:]))
     head, rows = results_table(three)
-    assert head == ["", "File", "PSNR (dB)", "SSIM", "LPIPS", "Gaussians", "Share", "Near fog", "Far fog", "Holes"]
-    assert rows[0] == ["input", "2.0 MB", "20.00", "0.500", "-", "1,000", "100.0 %", "-", "-", "-"]
+    assert head[:7] == ["", "File", "PSNR (dB)", "SSIM", "LPIPS", "Gaussians", "Share"]
+    assert head[7:] == ["Near fog", "Far fog", "Holes", "Veil", "Worst veil"]
+    assert rows[0] == ["input", "2.0 MB", "20.00", "0.500", "-", "1,000", "100.0 %", *"-----"]
     assert rows[1][:8] == ["half", "2.0 kB", "25.00", "0.750", "-", "500", "50.0 %", "0.250"]
-    assert rows[1][-1] == "0.013"
+    assert rows[1][-3:] == ["0.013", "0.020", "0.075"]
     assert [row[:1] + row[5:7] + row[4:5] for row in rows[2:]] == [
         ["tenth", "100", "10.0 %", "0.250"],
         ["least", "10", "1.0 %", "0.250"],
