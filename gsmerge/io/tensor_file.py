@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,8 @@ _TYPES = {
 }  # fmt: skip
 
 
-def read_tensors(
-    path: Path, what: str, remedy: str, wanted: Callable[[str], bool] = lambda _: True
-) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays of ``wanted`` names.
+def read_tensors(path: Path, what: str, remedy: str) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Read the metadata of a safetensors file, and its arrays by name.
 
     Raises SceneError, which says that ``what`` was expected, for a file that is none, or becomes shorter meanwhile.
     """
@@ -41,7 +38,6 @@ def read_tensors(
             arrays = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
                 for name, tensor in deserialize(size + head + file.read())
-                if wanted(name)
             }
     except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
