@@ -18,8 +18,10 @@ _TYPES = {
 }  # fmt: skip
 
 
-def read_tensors(path: Path, what: str, remedy: str) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays by name.
+def read_tensors(
+    path: Path, what: str, remedy: str, *, arrays: bool = True
+) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """Read the metadata of a safetensors file, and its arrays by name; without ``arrays`` none of them.
 
     Raises SceneError, which says that ``what`` was expected, for a file that is none, or becomes shorter meanwhile.
     """
@@ -35,12 +37,12 @@ def read_tensors(path: Path, what: str, remedy: str) -> tuple[dict[str, str], di
             header = parse_json(head.decode("utf-8"), budget)
             metadata = header.get("__metadata__") if isinstance(header, dict) else None
             del header
-            arrays = {
+            tensors = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
-                for name, tensor in deserialize(size + head + file.read())
+                for name, tensor in (deserialize(size + head + file.read()) if arrays else ())
             }
     except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
         reason = next(iter(reason.splitlines()), "out of memory")
         raise SceneError(path, f"expected {what}, could not read it ({reason})", remedy) from error
-    return metadata or {}, arrays
+    return metadata or {}, tensors
