@@ -23,7 +23,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import render
-from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures
+from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures, shrink_pictures
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
@@ -390,10 +390,8 @@ def is_recolored(shown: Shown) -> bool:
 def _shrink(pictures: np.ndarray, side: int) -> np.ndarray:
     """Average pictures ``[v,h,w,...]`` to at most ``side`` pixels of the longer side."""
     level = max(1.0, max(pictures.shape[1:3]) / side)
-    size = max(1, round(pictures.shape[2] / level)), max(1, round(pictures.shape[1] / level))
-    return np.stack(
-        [cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA) for picture in pictures]
-    )
+    width, height = (max(1, round(side / level)) for side in pictures.shape[2:0:-1])
+    return shrink_pictures(pictures.astype(np.float32), width, height)
 
 
 def odd_photos(shown: Shown) -> list[int]:
