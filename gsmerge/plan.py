@@ -128,9 +128,9 @@ class Plan:
         """Return the plan with cameras that the fit leaves in place."""
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
-    def with_fit(self, fit: FitOptions, *, start_share: float = 1.0) -> Plan:
-        """Return the plan with another fit, which starts with ``start_share`` of the Gaussians."""
-        return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=start_share))
+    def with_fit(self, fit: FitOptions) -> Plan:
+        """Return the plan with another fit, which starts with all Gaussians."""
+        return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
 
 
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:

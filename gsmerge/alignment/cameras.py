@@ -32,7 +32,7 @@ from gsmerge.io.cameras.camera_file import (
     to_viewmats,
 )
 from gsmerge.io.photo_files import NO_IMAGES
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.matrices import invert, matmul, transform
 from gsmerge.types import Cameras
 
 _SAME = 1e-6  # of the cameras' distances: no difference
@@ -152,7 +152,7 @@ def move_cameras(
 def _photos_confirm(pairs: Correspondences, images: np.ndarray, given: Cameras, moved: Cameras) -> bool:
     """Return whether photos agree better from the given poses, each with the Gaussians of its view, than moved."""
     motions = matmul(invert(given.viewmats), moved.viewmats)[pairs.views]
-    points = matmul(motions[:, :3, :3], pairs.points[:, :, None])[..., 0] + motions[:, :3, 3]
+    points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
     return _disagreement(points, pairs, images, given) < CLEAR * _disagreement(pairs.points, pairs, images, moved)
 
 

@@ -23,7 +23,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, Convention
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.io.photo_files import ASPECT_TOLERANCE
-from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.matrices import transform
 from gsmerge.types import Cameras, Gaussians
 
 _SOME_CAMERA = 4.0  # times the limit, within which rows are pixels of some camera
@@ -104,7 +104,7 @@ def explain_misalignment(
     ]
     transposed = input_viewmats.copy()
     transposed[:, :3, :3] = input_viewmats[:, :3, :3].transpose(0, 2, 1)
-    transposed[:, :3, 3] = -matmul(transposed[:, :3, :3], cameras.centres[:, :, None])[..., 0]
+    transposed[:, :3, 3] = -transform(transposed[:, :3, :3], cameras.centres)
     readings.append(("the cameras fit with their rotations transposed", transposed))
     flips = (1, "y axis flipped (rows counted from the bottom)"), (0, "x axis flipped (mirrored images)")
     for axis, words in flips:

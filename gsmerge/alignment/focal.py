@@ -27,7 +27,7 @@ from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size, resize_to
-from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.matrices import transform
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
@@ -135,8 +135,7 @@ def _possible_sizes(ply: GaussianFile, size: Size) -> Iterator[PhotoTransform]:
 def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[float, tuple[float, ...]]:
     """Solve for (largest median distance of a part, (fx, fy, cx, cy)), pixels; inf on failure."""
     poses = viewmats[pairs.views]
-    turned = matmul(poses[:, :3, :3], pairs.points[:, :, None])[..., 0]
-    camera = turned + poses[:, :3, 3]
+    camera = transform(poses[:, :3, :3], pairs.points) + poses[:, :3, 3]
     front = camera[:, 2] > 0
     if not front.any() or front.mean() <= 0.5:
         return math.inf, ()

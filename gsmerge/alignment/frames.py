@@ -16,7 +16,7 @@ from gsmerge.alignment.resection import projection_errors, refine_poses, start_p
 from gsmerge.alignment.score import Correspondences
 from gsmerge.geometry import IDENTITY, Similarity, camera_centres, mean_pose_frame, robust_weights
 from gsmerge.kernels.elementary import arccos, log
-from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric
+from gsmerge.kernels.matrices import closest_rotation, eigh, invert, matmul, solve_symmetric, transform
 from gsmerge.types import Cameras
 
 _ROUNDS = 4  # of reweighted least squares
@@ -108,14 +108,9 @@ def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray
     """Compute unit directions ``[t,3]`` and origins ``[t,3]`` of the pixels' rays in the cameras' world."""
     ones = np.ones((len(pairs.pixels), 1))
     inverse = invert(cameras.Ks)[pairs.views]
-    local = _apply(inverse, np.concatenate([pairs.pixels, ones], 1))
-    rays = _apply(cameras.viewmats[pairs.views, :3, :3].swapaxes(1, 2), local)
+    local = transform(inverse, np.concatenate([pairs.pixels, ones], 1))
+    rays = transform(cameras.viewmats[pairs.views, :3, :3].swapaxes(1, 2), local)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True), camera_centres(cameras.viewmats)[pairs.views]
-
-
-def _apply(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Apply matrices ``[t,3,3]`` to vectors ``[t,3]``, one to one."""
-    return matmul(matrices, vectors[:, :, None])[..., 0]
 
 
 def solve_frame(
@@ -127,8 +122,8 @@ def solve_frame(
     """
     rays, centres = (matmul(part, rotation.T) for part in rays_and_centres)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    columns = [_apply(across, centres)[:, :, None]] + ([across] if shifted else [])
-    A, b = np.concatenate(columns, 2), _apply(across, points)
+    columns = [transform(across, centres)[:, :, None]] + ([across] if shifted else [])
+    A, b = np.concatenate(columns, 2), transform(across, points)
     weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
         heavy = (A * weights[:, None, None]).reshape(-1, A.shape[2])
@@ -140,7 +135,7 @@ def solve_frame(
         shift = solution[1:] if shifted else np.zeros(3)
         away = points - solution[0] * centres - shift
         depth = np.abs((away * rays).sum(1)) + 1e-12
-        angle = np.linalg.norm(_apply(across, away), axis=1) / depth
+        angle = np.linalg.norm(transform(across, away), axis=1) / depth
         weights = robust_weights(angle, 3, 1e-12, depth)
     return Similarity(rotation, float(solution[0]), shift)
 

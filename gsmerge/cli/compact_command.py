@@ -151,9 +151,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
     from gsmerge.io.formats.table import PLY, SITE
 
-    odd = document["choices"].get("photos_left_out")
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
-    doubts += [f"photos do not show what the Gaussians show: {len(odd)}"] if odd and args.strict else []
     say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():

@@ -15,6 +15,7 @@ from gsmerge.compaction.placement import add_colmap, add_views, name_photos, nam
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.compare_photos import STRAY_PHOTOS
 from gsmerge.io import atomic_outputs, output_format, write_gaussians
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
@@ -93,12 +94,14 @@ def compact_files(
         written = _write_results(add, outputs, first, results, comments, views_named)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
+        left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
+        recognised = load.recognised | {"left_out": "; ".join(filter(None, left_out)) or None}
         document = report_document(
             result.report, input_paths=files.plys, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read - start},
             seconds_after={"write": perf_counter() - compacted},
             coarser=[(path, level.report) for path, level in zip([*written][1:], result.coarser, strict=True)],
-            recognised=load.recognised, notes=[*load.notes, *notes], hashed=hashed,
+            recognised=recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
     if ending == INDEX:

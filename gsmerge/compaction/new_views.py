@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement
@@ -22,7 +21,7 @@ from gsmerge.geometry import nearest_views
 from gsmerge.measure.visibility import visible_pixels
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, make_plan
-from gsmerge.raster.photos import NEAR, scene_photos, score_photos
+from gsmerge.raster.photos import NEAR, scene_photos, score_photos, shrink_pictures
 from gsmerge.runtime.record import add_seconds, record_part
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene, grid_ids
@@ -130,13 +129,13 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)
     cut = slice(None), slice(0, height * step), slice(0, width * step)
-    images = [cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA) for photo in scene.images[cut]]
+    images = shrink_pictures(scene.images[cut], width, height)
     middle = slice(None), slice(step // 2, height * step, step), slice(step // 2, width * step, step)
     masks, missing, empty = (
         None if mask is None else mask[middle] for mask in (scene.masks, scene.missing, scene.empty)
     )
     small = replace(
-        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=np.stack(images), masks=masks,
+        scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images, masks=masks,
         empty=empty, gaussians=scene.gaussians[:0], pixel_ids=None, missing=None, large_photos=None,
     )  # fmt: skip
     if not scene.aligned:

@@ -23,7 +23,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import render
-from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures
+from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures, shrink_pictures
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
@@ -55,6 +55,7 @@ LEAST, SHARE = 0.06, 0.25  # least correlation of a photo that shows the scene, 
 GAIN = 0.4  # of the inverse hyperbolic tangent of the correlation: more with another view, and the photo is of that one
 CLOSEST = 0.995  # correlation above which photos are equally good
 NAMED = 4  # views that a note names
+STRAY_PHOTOS = "photos do not show what the Gaussians show"  # in the note on photos that are not used
 # Correlation of edges, chosen on twelve looks of three captures: .57 to .99, or with colours by depth .13 to .41 and .1
 # above that with other views; that is -.05 to .33
 LOOK_SIDE, OWN_EDGES, MORE_EDGES = 96, 0.5, 0.1
@@ -142,7 +143,7 @@ def _leave_out(scene: PicturedScene, odd: Sequence[int]) -> bool:
     """Note which photos do not show the scene; return whether the others are used."""
     names, few = [scene.names[view] for view in odd], 2 * len(odd) <= len(scene)
     choose(photos_left_out=names)
-    problem = f"{len(odd)} of {len(scene)} photos do not show what the Gaussians show"
+    problem = f"{len(odd)} of {len(scene)} {STRAY_PHOTOS}"
     which = list_names(scene.names, odd)
     if few:
         note(f"{problem} and are not used: {which}")
@@ -389,10 +390,8 @@ def is_recolored(shown: Shown) -> bool:
 def _shrink(pictures: np.ndarray, side: int) -> np.ndarray:
     """Average pictures ``[v,h,w,...]`` to at most ``side`` pixels of the longer side."""
     level = max(1.0, max(pictures.shape[1:3]) / side)
-    size = max(1, round(pictures.shape[2] / level)), max(1, round(pictures.shape[1] / level))
-    return np.stack(
-        [cv2.resize(picture.astype(np.float32), size, interpolation=cv2.INTER_AREA) for picture in pictures]
-    )
+    width, height = (max(1, round(side / level)) for side in pictures.shape[2:0:-1])
+    return shrink_pictures(pictures.astype(np.float32), width, height)
 
 
 def odd_photos(shown: Shown) -> list[int]:

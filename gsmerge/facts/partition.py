@@ -178,18 +178,18 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
     return factors
 
 
-def partition_views(weights: np.ndarray, count: int, shared: float = SHARED) -> list[Block]:
+def partition_views(weights: np.ndarray, count: int) -> list[Block]:
     """Cluster v views into ``count`` blocks of similar size with weak edges between them; add views of neighbours.
 
     ``weights [v,v]`` are symmetric and at least 0. Every view belongs to one block. A block also shares the views of
-    other blocks with the largest weights, up to ``shared`` times the number of its own.
+    other blocks with the largest weights, up to ``SHARED`` times the number of its own.
     """
     labels = exchange(weights, grow_blocks(weights, count))
     blocks = []
     for label in range(count):
         members = np.flatnonzero(labels == label)
         seen = np.where(labels == label, 0, weights[members].sum(0))
-        nearest = np.argsort(-seen, kind="stable")[: round(shared * len(members))]
+        nearest = np.argsort(-seen, kind="stable")[: round(SHARED * len(members))]
         blocks.append(Block(tuple(members.tolist()), tuple(sorted(nearest[seen[nearest] > 0].tolist()))))
     return blocks
 

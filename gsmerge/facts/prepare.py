@@ -298,19 +298,24 @@ def _lacks_photos(scene: Scene) -> bool:
     return scene.images is None and scene.is_shown and len(scene) > 0
 
 
-def with_row_colors(scene: Scene) -> Scene:
-    """Return a scene with its rows' own colours as photos if it has pixels and no photos, as :func:`prepare` does.
+def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
+    """Return a scene with the pictures that results are judged by, and whether :func:`prepare` changes its photos.
 
-    So it is with photos that have another look, or do not show it.
+    Pictures of a scene with pixels are its rows' own colours where photos are missing, have another look, or do not
+    show it, as :func:`prepare` has it.
     """
-    if not (_lacks_photos(scene) or (scene.aligned and len(scene) and scene.valid.any())):
-        return scene
+    has_colors = _lacks_photos(scene) or (scene.aligned and len(scene) > 0 and bool(scene.valid.any()))
+    if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):
+        return scene, False
     with record_part(silent=True):
         canonical = canonicalise(scene)[0]
-        if scene.images is not None and compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))[1]:
-            return scene
+        if scene.images is not None:
+            compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
+            if views or not has_colors:
+                compared = equalise_exposure(compared, views, "auto") if canonical.aligned else compared
+                return scene, not views or compared.images is not scene.images
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
-    return replace(scene, images=colored.images, masks=colored.masks)
+    return replace(scene, images=colored.images, masks=colored.masks), False
 
 
 @stage("prepare")
@@ -325,18 +330,6 @@ def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     judged, frame = canonicalise(add_judges(finite))
     reference = Reference(RENDERS, (), tuple(range(len(judged))), placed=True)
     return Prepared(scene, draw_pictures(judged), frame, reference, (), moved=False, unseen=finite.gaussians[:0])
-
-
-def photos_count_as_they_are(scene: Scene) -> bool:
-    """Return whether :func:`prepare` would leave the photos of a scene unchanged."""
-    if scene.images is None or len(scene) == 0 or len(scene.gaussians) == 0:
-        return True
-    with record_part(silent=True):
-        canonical, _ = canonicalise(add_views(scene))
-        compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
-        if canonical.aligned:
-            compared = equalise_exposure(compared, views, "auto")
-        return bool(views) and compared.images is scene.images
 
 
 def _with_photos(given: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:

@@ -10,8 +10,9 @@ import numpy as np
 from gsmerge.facts.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Of Gaussians that captures have: median largest scale as a share of the diagonal of the box that holds most, and
-# median coefficient of the base colours; of fewer nothing is said
+# Of Gaussians that captures have: median largest scale as a share of twice the median distance from the middle, which
+# a far sky does not stretch, and of the diagonal of the box that holds most; median coefficient of the base colours; of
+# fewer nothing is said
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
 FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
 SAMPLES = 65536  # Gaussians that these are measured on
@@ -67,8 +68,10 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     if len(gaussians) < FEWEST:
         return None
     sample = gaussians[:: max(1, len(gaussians) // SAMPLES)]
-    low, high = np.percentile(sample.means.astype(np.float64), (1, 99), axis=0)
+    means = sample.means.astype(np.float64)
+    low, middle, high = np.percentile(means, (1, 50, 99), axis=0)
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
+    extent = 2 * float(np.median(np.sqrt(((means - middle) ** 2).sum(1))))
     size, color = float(np.median(sample.scales.max(1))), float(np.median(np.abs(sample.sh0)))
     low_color, high_color = np.percentile(sample.sh0[:, 0], (1, 99), axis=0)
     flat, faint = float((high_color - low_color).max()) < FLAT, float(np.median(sample.opacities)) < FAINT
@@ -78,8 +81,8 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
         problem = "the Gaussians have one flat colour"
     elif faint:
         problem = f"half of the opacities are below {FAINT:.2g}"
-    elif size < TINY * diagonal:
-        problem = f"half of the Gaussians are at most {size / diagonal:.2g} times as large as the scene"
+    elif size < TINY * extent:
+        problem = f"half of the Gaussians are at most {size / extent:.2g} times as large as the scene"
     elif size > LARGE * diagonal:
         problem = f"half of the Gaussians are at least {size / max(diagonal, 1e-30):.2g} times as large as the scene"
     else:

@@ -12,6 +12,7 @@ from gsmerge.types import Cameras, Scene, SceneT, grid_ids
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
+BY_VIEW = ("cameras", "images", "missing", "large_photos", "masks", "empty")  # fields of scenes with a part for a view
 
 
 def even_views(num_views: int, count: int) -> list[int]:
@@ -84,27 +85,13 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     """Return the scene with only the views ``view_ids`` and their Gaussians; unaligned Gaussians all stay."""
     ids = list(view_ids)
-    images = None if scene.images is None else scene.images[ids]
-    names = tuple(scene.names[i] for i in ids)
-    large = None if scene.large_photos is None else scene.large_photos[ids]
-    masks = None if scene.masks is None else scene.masks[ids]
-    empty = getattr(scene, "empty", None)
-    scene = scene if empty is None else replace(scene, empty=empty[ids])  # type: ignore[call-arg]  # of PicturedScene
-    if not scene.aligned:
-        return replace(scene, cameras=scene.cameras[ids], images=images, names=names, large_photos=large, masks=masks)
-    size = scene.pixels_per_view
-    rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
-    return replace(
-        scene,
-        gaussians=scene.gaussians[rows],
-        cameras=scene.cameras[ids],
-        images=images,
-        pixel_ids=grid_ids(scene.valid[ids]),
-        names=names,
-        missing=None if scene.missing is None else scene.missing[ids],
-        large_photos=large,
-        masks=masks,
-    )
+    parts = {name: value[ids] for name, value in vars(scene).items() if name in BY_VIEW and value is not None}
+    parts["names"] = tuple(scene.names[i] for i in ids)
+    if scene.aligned:
+        size = scene.pixels_per_view
+        rows = (np.asarray(ids, np.int64)[:, None] * size + np.arange(size)).reshape(-1)
+        parts |= {"gaussians": scene.gaussians[rows], "pixel_ids": grid_ids(scene.valid[ids])}
+    return replace(scene, **parts)
 
 
 def in_float64(cameras: Cameras) -> Cameras:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,9 @@ _TYPES = {
 
 
 def read_tensors(
-    path: Path, what: str, remedy: str, wanted: Callable[[str], bool] = lambda _: True
+    path: Path, what: str, remedy: str, *, arrays: bool = True
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Read the metadata of a safetensors file, and its arrays of ``wanted`` names.
+    """Read the metadata of a safetensors file, and its arrays by name; without ``arrays`` none of them.
 
     Raises SceneError, which says that ``what`` was expected, for a file that is none, or becomes shorter meanwhile.
     """
@@ -38,13 +37,12 @@ def read_tensors(
             header = parse_json(head.decode("utf-8"), budget)
             metadata = header.get("__metadata__") if isinstance(header, dict) else None
             del header
-            arrays = {
+            tensors = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
-                for name, tensor in deserialize(size + head + file.read())
-                if wanted(name)
+                for name, tensor in (deserialize(size + head + file.read()) if arrays else ())
             }
     except (SafetensorError, OSError, ValueError, KeyError, MemoryError) as error:  # KeyError: of a type not in _TYPES
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
         reason = next(iter(reason.splitlines()), "out of memory")
         raise SceneError(path, f"expected {what}, could not read it ({reason})", remedy) from error
-    return metadata or {}, arrays
+    return metadata or {}, tensors

@@ -33,14 +33,10 @@ def cast(eye, axes, lens, step, kinds, rotations, centres, sizes, waves, rects, 
         lens: ``[4]`` float64 fx, fy, cx, cy in pixels.
         step: Pixels from one sample to the next.
         kinds: ``[m]`` int32 kinds of the shapes, 0 to 5.
-        rotations: ``[m,3,3]`` float64.
-        centres: ``[m,3]`` float64.
         sizes: ``[m,4]`` float64 half sizes and ``extra``.
-        waves: ``[m,4,5]`` float64.
         rects: ``[m,4]`` int32 samples x0, y0, x1, y1 that can see the shape.
         depth: ``[h,w]`` float64, the farthest before.
         ids: ``[h,w]`` int32, -1 before.
-        points: ``[h,w,3]`` float32.
         normals: ``[h,w,3]`` float32, towards the camera.
     """
 
@@ -53,13 +49,11 @@ def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
     """Add up the share of each light that reaches points, times the cosine and its weight.
 
     Args:
-        points: ``[n,3]`` float32.
         normals: ``[n,3]`` float32 of length 1.
         axes: ``[k,3,3]`` float64 rows right, down and forward of the lights' parallel rays.
         centre: ``[3]`` float64 middle of the shadow maps.
         radius: Half their side.
         maps: ``[k,s,s]`` float32: how far forward of the middle the first surface lies.
         bias: How far behind it a point is still lit.
-        weights: ``[k]`` float64.
         out: ``[n]`` float32, added to.
     """

@@ -95,6 +95,11 @@ def eigh(matrices: ArrayLike) -> tuple[Array, Array]:
     return values.reshape(wide.shape[:-1]).astype(kind), vectors.reshape(wide.shape).astype(kind)
 
 
+def transform(matrices: ArrayLike, vectors: ArrayLike) -> Array:
+    """Multiply matrices ``[n,i,j]`` and vectors ``[n,j]``, one to one."""
+    return matmul(matrices, np.asarray(vectors)[..., None])[..., 0]
+
+
 def solve_symmetric(a: ArrayLike, b: ArrayLike, rcond: float = 1e-12) -> Array:
     """Solve ``a x = b`` for a matrix ``[d,d]`` of normal equations and ``b [d]`` or ``[d,k]``, by the shortest x.
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import photos_count_as_they_are, scene_frame, with_row_colors
+from gsmerge.facts.prepare import judged_pictures, scene_frame
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
@@ -107,6 +107,7 @@ class Evaluation:
         num_views: Views by split.
         notes: Warnings, one sentence each.
         options: What was measured.
+        pictures: ``[v,h,w,3]`` of the input views: photos, or the model's own pixels; None: renders of the input.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -121,6 +122,7 @@ class Evaluation:
     num_views: dict[str, int]
     notes: tuple[str, ...]
     options: EvaluateOptions = EvaluateOptions()
+    pictures: np.ndarray | None = None
 
     def __repr__(self) -> str:
         scores = ", ".join(f"{row[0]} {row[2]} dB" for row in self._rows()[1:])
@@ -214,7 +216,8 @@ def evaluate(
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
-    photos, scene = scene, with_row_colors(scene)
+    given = scene
+    scene, mended = judged_pictures(given)
     inputs, results = scene.file_gaussians, {name: gaussians.numpy() for name, gaussians in results.items()}
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_array(targets.images))
@@ -223,7 +226,7 @@ def evaluate(
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        reference = PHOTOS if scene is photos else ROW_COLORS
+        reference = PHOTOS if scene is given else ROW_COLORS
         splits, scores = _splits(scene, reference, inputs, targets, renderer), []
         named = {INPUT: inputs, **results} if options.own else results
         fogs = options.fog and bool(results)
@@ -242,7 +245,8 @@ def evaluate(
                 splits = {kind: part.with_covered(opaque[kind]) for kind, part in splits.items()}
             scores.append(replace(score, fog=fog.get(name, {})))
     counts = {name: len(split.views.names) for name, split in splits.items()}
-    return Evaluation(tuple(scores), _name_reference(splits), counts, tuple(_notes(photos, splits, scores)), options)
+    notes = tuple(_notes(splits, scores, mended=mended))
+    return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:
@@ -256,10 +260,9 @@ def near_plane(scene: Scene) -> float:
     return NEAR * scene_frame(scene).unit
 
 
-def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultScores]) -> Iterator[str]:
+def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:
     """Note which results are clearly worse than the input, and which figures may mislead."""
     photos = "context" in splits and splits["context"].reference == PHOTOS
-    mended = photos and not photos_count_as_they_are(scene)
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
     if photos and INPUT in psnrs and not mended:
         yield from filter(None, (describe_loss(name, psnrs[INPUT], psnr, OWN_PHOTOS) for name, psnr in psnrs.items()))
@@ -268,7 +271,7 @@ def _notes(scene: Scene, splits: Mapping[str, _Split], scores: Sequence[ResultSc
         yield "no held-out views were given: input views flatter what was fitted to them"
     elif (share := splits["target"].visible.mean()) < MIN_SEEN_SHARE:
         yield f"the input views have seen {100 * share:.0f} % of the held-out views: are those of the same world?"
-    if mended:
+    if photos and mended:
         yield MENDED
 
 

@@ -70,27 +70,25 @@ def load_checkpoint(path: str | PathLike[str]) -> Checkpoint:
     return Checkpoint(build_networks(path, options, tensors), path, version, training)
 
 
-def build_networks(
-    path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray], remedy: str = REMEDY
-) -> NetworkWeights:
+def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NetworkWeights:
     """Build networks from options, as ``NetworkOptions.from_dict`` takes them, and weights by name.
 
-    Raises SceneError with ``path`` and ``remedy`` if the sizes are out of range, or the weights do not fit them.
+    Raises SceneError with ``path`` if the sizes are out of range, or the weights do not fit them.
     """
     try:
         sizes = NetworkOptions.from_dict(options)
     except (ValueError, TypeError) as error:
-        raise _header_error(path, error, remedy) from error
+        raise _header_error(path, error) from error
     expected = weight_shapes(sizes)
     for name in sorted(arrays.keys() ^ expected.keys()):
         difference = "a tensor too many" if name in arrays else "none"
-        raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", remedy)
+        raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", REMEDY)
     for name, array in arrays.items():
         if array.shape != expected[name] or array.dtype != np.float32:
             have, want = list(array.shape), list(expected[name])
-            raise SceneError(path, f"{name}: expected float32 {want}, found {array.dtype} {have}", remedy)
+            raise SceneError(path, f"{name}: expected float32 {want}, found {array.dtype} {have}", REMEDY)
         if not np.isfinite(array).all():
-            raise SceneError(path, f"{name}: expected finite numbers, found others", remedy)
+            raise SceneError(path, f"{name}: expected finite numbers, found others", REMEDY)
     return NetworkWeights(sizes, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
@@ -109,12 +107,12 @@ def _header(header: Mapping[str, str], budget: ReadBudget) -> tuple[dict[str, An
                 raise ValueError(f"no {name}")
         return values["options"], values["training"], values["gsmerge"]
     except ValueError as error:
-        raise _header_error(path, error, REMEDY) from error
+        raise _header_error(path, error) from error
 
 
-def _header_error(path: StrPath, error: Exception, remedy: str) -> SceneError:
+def _header_error(path: StrPath, error: Exception) -> SceneError:
     reason = str(error).splitlines()[0]
-    return SceneError(path, f"expected a header that describes the networks ({reason})", remedy)
+    return SceneError(path, f"expected a header that describes the networks ({reason})", REMEDY)
 
 
 def find_checkpoint(name: str, *, required: bool) -> tuple[Checkpoint | None, list[str]]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import Frame, scene_frame, with_row_colors
+from gsmerge.facts.prepare import Frame, scene_frame
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.photo_files import photo_array
@@ -179,7 +179,7 @@ def page_data(
     light: bool = False,
 ) -> ViewData:
     """Make the content of a page of what was measured: see :func:`collect`."""
-    pictures = photo_array(with_row_colors(scene).images)
+    pictures = photo_array(evaluation.pictures)
     splits = {"context": (scene.cameras.numpy(), pictures, scene.names)}
     splits |= {} if held_out is None else {"target": (held_out.cameras.numpy(), held_out.images, held_out.names)}
     frame = scene_frame(scene)

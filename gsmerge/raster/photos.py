@@ -134,15 +134,18 @@ def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarr
 def photos_of(images: np.ndarray, cameras: Cameras, level: float = 1) -> Photos:
     """Return photos ``[v,h,w,3]`` with their cameras, sides divided by ``level`` (area averages)."""
     blank = blank_photos(cameras, level)
-    if level == 1:
-        return replace(blank, images=images)
-    small = make_array((len(images), blank.height, blank.width, 3), images.dtype.type)
+    return replace(blank, images=images if level == 1 else shrink_pictures(images, blank.width, blank.height))
+
+
+def shrink_pictures(pictures: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Shrink pictures ``[v,h,w,...]`` to ``[v,height,width,...]`` by area averages."""
+    small = make_array((len(pictures), height, width, *pictures.shape[3:]), pictures.dtype.type)
 
     def shrink(view: int) -> None:
-        small[view] = cv2.resize(images[view], (blank.width, blank.height), interpolation=cv2.INTER_AREA)
+        small[view] = cv2.resize(pictures[view], (width, height), interpolation=cv2.INTER_AREA)
 
-    parallel_map(shrink, range(len(images)))
-    return replace(blank, images=small)
+    parallel_map(shrink, range(len(pictures)))
+    return small
 
 
 def blank_photos(cameras: Cameras, level: float = 1) -> Photos:

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from gsmerge.compaction.compact import compact_prepared
@@ -17,8 +16,9 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.geometry import camera_centres
 from gsmerge.measure.coverage import shares_inside
+from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
-from gsmerge.runtime.threads import parallel_map, use_threads
+from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -127,7 +127,7 @@ def _join_views(first: Scene, second: Scene) -> Scene:
     assert second.images is not None
     images, cameras = second.images, second.cameras
     if images.shape[2:0:-1] != size:
-        images = np.stack(parallel_map(lambda image: cv2.resize(image, size, interpolation=cv2.INTER_AREA), images))
+        images = shrink_pictures(images, *size)
         cameras = resize_cameras(cameras, *size)
     return replace(
         first,

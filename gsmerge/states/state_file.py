@@ -17,6 +17,7 @@ from gsmerge.io.formats.gsm import (
     SCENE,
     GsmFile,
     read_gsm,
+    read_header,
     stored_cameras,
     stored_names,
     write_gsm,
@@ -88,7 +89,7 @@ def load_state(path: StrPath) -> State:
 
 def holds_features(path: Path) -> bool:
     """Return whether a ``.gsm`` holds Feature Gaussians, not results; SceneError if it cannot be read."""
-    return bool(read_gsm(path).header["kind"] != SCENE)
+    return bool(read_header(path)["kind"] != SCENE)
 
 
 def _read_features(file: GsmFile) -> FeatureState:

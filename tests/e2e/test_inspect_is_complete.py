@@ -71,6 +71,7 @@ class Kind:
     pattern: str
     make: Callable[[Path], Any] = lambda _: None
     words: tuple[str, ...] = ("compact", "--dry-run", "{}")  # the last is what is checked, {} the folder
+    named: tuple[str, str] | tuple[()] = ()  # option and file: what is only found beside a scene is left out
     many: int = MANY  # mutations in the sweep
 
 
@@ -79,12 +80,12 @@ KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
     "parts": Kind("view_*.ply", places.in_parts(lambda path: None), many=FEWER),
     "cameras inside": Kind("scene.ply", embed, many=FEWER),
-    "transforms": Kind("transforms.json"),
-    "photos": Kind("images/*.png"),
-    "views.npz": Kind("views.npz", of_views("views.npz")),
-    "results.npz": Kind("results.npz", of_views("results.npz")),
-    "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), many=FEWER),
-    "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), many=FEWER),
+    "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
+    "photos": Kind("images/*.png", named=("--images", "images")),
+    "views.npz": Kind("views.npz", of_views("views.npz"), named=("--cameras", "views.npz")),
+    "results.npz": Kind("results.npz", of_views("results.npz"), named=("--cameras", "results.npz")),
+    "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), named=("--cameras", "sparse"), many=FEWER),
+    "COLMAP, text": Kind("sparse/*.txt", colmap("txt"), named=("--cameras", "sparse"), many=FEWER),
     "state": Kind("a.gsm", extended("."), STATE),
     "state of two batches": Kind("a.gsm", extended(".", "."), STATE),
 }
@@ -109,8 +110,12 @@ def test_what_a_command_refuses_inspect_refuses(
     folder = Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
     kind.make(folder)
     words = placed(kind.words, folder)
+    check = ["inspect", words[-1]]
+    if kind.named:
+        option, file = kind.named
+        words, check = [*words, option, folder / file], [*check, option, folder / file]
     assert server.run(words, LIMITS).code == 0
-    assert server.run(["inspect", words[-1]], LIMITS).code == 0
+    assert server.run(check, LIMITS).code == 0
     num_refused = 0
     for _ in range(count):
         path = rng.choice(sorted(folder.glob(kind.pattern)))
@@ -120,7 +125,7 @@ def test_what_a_command_refuses_inspect_refuses(
         assert refusal.code in (0, 3), refusal
         if refusal.code == 3:
             num_refused += 1
-            refused_by_inspect(refusal, server.run(["inspect", words[-1]], LIMITS))
+            refused_by_inspect(refusal, server.run(check, LIMITS))
         path.write_bytes(sound)
     assert num_refused or count == COUNT
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -13,11 +12,6 @@ from gsmerge import read_ply
 from gsmerge.settings.compact import method_names
 
 from .conftest import Run, assert_refused, listing
-
-
-@pytest.fixture
-def copied(smallest_scene: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
 
 
 @pytest.mark.parametrize("method", method_names())
@@ -65,20 +59,22 @@ def test_the_program_may_be_on_the_path(
 
 @pytest.mark.parametrize("named", [None, "no/such/program"])
 def test_a_missing_program_is_one_line(
-    named: str | None, copied: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    named: str | None, smallest_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", named or "")
-    before = listing(copied)
-    said = run("compact", copied, "--set", "method=splat-transform")
+    before = listing(smallest_copy)
+    said = run("compact", smallest_copy, "--set", "method=splat-transform")
     found = f"GSMERGE_SPLAT_TRANSFORM={named}" if named else "GSMERGE_SPLAT_TRANSFORM"
     assert_refused(said, 2, "splat-transform", found, "npm install -g @playcanvas/splat-transform")
-    assert listing(copied) == before
+    assert listing(smallest_copy) == before
 
 
-def test_a_failing_program_is_one_line(copied: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_program_is_one_line(
+    smallest_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     put_stand_in(tmp_path / "program", monkeypatch, "#!{python}\nraise SystemExit('Error: out of\\nmemory')\n")
-    before = listing(copied)
-    said = run("compact", copied, "--set", "method=splat-transform", "--quiet")
+    before = listing(smallest_copy)
+    said = run("compact", smallest_copy, "--set", "method=splat-transform", "--quiet")
     assert_refused(said, 1, tmp_path / "program" / "splat-transform", "code 1: out of")
-    assert listing(copied) == before
+    assert listing(smallest_copy) == before

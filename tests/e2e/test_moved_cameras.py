@@ -15,7 +15,7 @@ from tiny_scene import edited_json
 
 from gsmerge.kernels import elementary
 
-from .conftest import Run
+from .conftest import Run, assert_refused
 
 SCALE = 1.8
 
@@ -81,7 +81,9 @@ def test_preview_and_render_agree_with_photos_that_are_broken(
         (moved_scene / "images" / path.name).write_bytes(path.read_bytes()[:100])
     run("render", moved_scene, "-o", tmp_path / "out", code=0)
     floor(psnr(tmp_path / "out", photos))
-    assert run("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png").code == 3
+    broken, sheet = moved_scene / "images", ("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png")
+    assert names(run(*sheet, code=0).err, f"the photos in {broken} are left out", "cannot be decoded")
+    assert_refused(run(*sheet, "--overwrite", "--images", broken), 3, broken / "view_000.png", "cannot be decoded")
 
 
 @pytest.mark.slow

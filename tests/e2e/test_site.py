@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -29,22 +28,17 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-@pytest.fixture
-def copied(smallest_scene: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
-
-
-def test_compact_writes_a_site_whole_or_not_at_all(run: Run, copied: Path) -> None:
-    site = copied / "site"
+def test_compact_writes_a_site_whole_or_not_at_all(run: Run, smallest_copy: Path) -> None:
+    site = smallest_copy / "site"
     quick = ("--effort", "draft", "--fit", "none")
-    document = json.loads(run("compact", copied, "-o", f"{site}/", *quick, "--json", code=0).out)
+    document = json.loads(run("compact", smallest_copy, "-o", f"{site}/", *quick, "--json", code=0).out)
     assert names(site) == FILES
     assert document["output"]["path"] == str(site / "index.html")
     assert document["output"]["bytes"] == sum(path.stat().st_size for path in site.iterdir())
-    assert_refused(run("compact", copied, "-o", site, "--budget", "50"), 2, site / "index.html")
+    assert_refused(run("compact", smallest_copy, "-o", site, "--budget", "50"), 2, site / "index.html")
     (site / "scene.sog").write_bytes(b"")
     (site / "index.html").unlink()  # what is left is no site: the result goes into the folder
-    run("compact", copied, "-o", site, *quick, code=0)
+    run("compact", smallest_copy, "-o", site, *quick, code=0)
     assert "scene.compact.ply" in names(site)
 
 
@@ -57,8 +51,8 @@ def test_a_budget_in_bytes_is_that_of_the_scene(run: Run, small_copy: Path) -> N
     assert 10_000 < (site / "scene.sog").stat().st_size <= 12_000
 
 
-def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, copied: Path) -> None:
-    small, site = copied / "scene.ply", copied / "site"
+def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, smallest_copy: Path) -> None:
+    small, site = smallest_copy / "scene.ply", smallest_copy / "site"
     run("convert", small, site, code=0)
     assert names(site) == FILES
     before = (site / "index.html").read_bytes()

@@ -7,6 +7,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 from messages import ERROR, names
 
@@ -47,6 +49,21 @@ def test_a_batch_says_so_again_where_it_is_done(stray: Path, run: Run) -> None:
     outcome = run(*words, "--strict", code=4)
     assert outcome.err.endswith(f"{ERROR}1 of 1 scenes are read without what does not belong to them\n")
     assert "left out" not in run(*words, "--cameras", "none", "--strict").out
+
+
+def test_photos_that_do_not_show_the_scene_are_a_doubt_too(smallest_copy: Path, run: Run) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
+    assert cv2.imwrite(str(smallest_copy / "images" / "view_001.png"), noise)
+    words = ("compact", smallest_copy, "-o", smallest_copy / "small.ply", *FEW)
+    outcome = run(*words, "--strict", "--json", code=4)
+    document = json.loads(outcome.out)
+    note = document["input"]["left_out"]
+    assert names(note, "1 of 3", "view_001")
+    assert document["notes"].count(note) == 1
+    assert outcome.err == f"{ERROR}{note}\n"
+    words = ("batch", smallest_copy, "-o", smallest_copy.parent / "out", *FEW[:2], "--set", "fit=none", *FEW[4:])
+    assert note in run(*words, code=0).out
+    assert run(*words, "--strict", code=4).err.endswith("read without what does not belong to them\n")
 
 
 @pytest.mark.parametrize("words", [("render", "SCENE", "-o", "OUT.png"), ("convert", "SMALL", "OUT.spz")], ids=str)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from bare_files import write_without_grid
 from messages import ERROR, says
 from tiny_scene import edited_json
@@ -23,91 +21,88 @@ Run = Callable[..., Any]
 QUICK = ("--set", "superpixels=40", "--fit", "none", "--set", "checkpoint=none")
 
 
-@pytest.fixture
-def small_copy(smallest_scene: Path, tmp_path: Path) -> Path:
-    """Three views that a test may change."""
-    return Path(shutil.copytree(smallest_scene, tmp_path / "scene"))
-
-
-def test_the_views_are_written_and_named(small_copy: Path, run: Run) -> None:
-    done = run("compact", small_copy, "-o", small_copy / "small.ply", *QUICK, code=0)
+def test_the_views_are_written_and_named(smallest_copy: Path, run: Run) -> None:
+    done = run("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK, code=0)
     assert done.out.splitlines()[-1].endswith(" small.cameras.json")
-    scene = gsmerge.read_scene(small_copy)
-    entries = json.loads((small_copy / "small.cameras.json").read_text())
+    scene = gsmerge.read_scene(smallest_copy)
+    entries = json.loads((smallest_copy / "small.cameras.json").read_text())
     assert [entry["img_name"] for entry in entries] == list(scene.names)
     assert list(entries[0]) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx"]
     np.testing.assert_allclose([entry["position"] for entry in entries], scene.cameras.centres, atol=1e-9)
-    back = gsmerge.read_cameras(small_copy / "small.cameras.json")
+    back = gsmerge.read_cameras(smallest_copy / "small.cameras.json")
     np.testing.assert_allclose(back.viewmats, scene.cameras.viewmats, atol=1e-9)
 
 
-def test_they_have_a_principal_point_that_is_not_in_the_middle(small_copy: Path) -> None:
-    cameras = gsmerge.read_scene(small_copy).cameras
+def test_they_have_a_principal_point_that_is_not_in_the_middle(smallest_copy: Path) -> None:
+    cameras = gsmerge.read_scene(smallest_copy).cameras
     Ks = cameras.Ks.copy()
     Ks[1, :2, 2] += (3.25, -2.5)
-    (small_copy / "a.json").write_text(viewer_cameras(replace(cameras, Ks=Ks), ["a", "b", "c"]))
-    entries = json.loads((small_copy / "a.json").read_text())
+    (smallest_copy / "a.json").write_text(viewer_cameras(replace(cameras, Ks=Ks), ["a", "b", "c"]))
+    entries = json.loads((smallest_copy / "a.json").read_text())
     assert ["cx" in entry for entry in entries] == [False, True, False]
-    np.testing.assert_allclose(gsmerge.read_cameras(small_copy / "a.json").Ks, Ks, atol=1e-6)
+    np.testing.assert_allclose(gsmerge.read_cameras(smallest_copy / "a.json").Ks, Ks, atol=1e-6)
 
 
-def test_they_are_in_the_frame_of_the_gaussians(small_copy: Path, run: Run) -> None:
-    path = small_copy / "transforms.json"
+def test_they_are_in_the_frame_of_the_gaussians(smallest_copy: Path, run: Run) -> None:
+    path = smallest_copy / "transforms.json"
     with edited_json(path) as content:
         for frame in content["frames"]:
             for row in frame["transform_matrix"][:3]:
                 row[3] *= 3
-    assert run("compact", small_copy, "-o", small_copy / "small.ply", *QUICK, "-q").code == 0
-    back = gsmerge.read_cameras(small_copy / "small.cameras.json")
-    np.testing.assert_allclose(back.viewmats, gsmerge.read_scene(small_copy).cameras.viewmats, atol=1e-9)
+    assert run("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK, "-q").code == 0
+    back = gsmerge.read_cameras(smallest_copy / "small.cameras.json")
+    np.testing.assert_allclose(back.viewmats, gsmerge.read_scene(smallest_copy).cameras.viewmats, atol=1e-9)
     assert np.abs(back.viewmats[:, :3, 3]).max() < 0.5 * np.abs(gsmerge.read_cameras(path).viewmats[:, :3, 3]).max()
 
 
-def test_none_are_written_unless_there_are_any(small_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_none_are_written_unless_there_are_any(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    done = run("compact", small_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json", code=0)
+    done = run("compact", smallest_copy, "-o", out / "a.ply", "--set", "viewer_cameras=false", *QUICK, "--json", code=0)
     assert json.loads(done.out)["viewer_cameras"] is None
-    bare = write_without_grid(small_copy / "scene.ply", out / "scene.ply")
+    bare = write_without_grid(smallest_copy / "scene.ply", out / "scene.ply")
     done = run("compact", bare, "-o", out / "b.ply", *QUICK, code=0)
     assert "viewers" not in done.out
     assert sorted(path.name for path in out.iterdir()) == ["a.ply", "b.ply", "scene.ply"]
 
 
-def test_they_are_replaced_on_request_alone(small_copy: Path, run: Run) -> None:
-    cameras, call = small_copy / "small.cameras.json", ("compact", small_copy, "-o", small_copy / "small.ply", *QUICK)
+def test_they_are_replaced_on_request_alone(smallest_copy: Path, run: Run) -> None:
+    cameras, call = (
+        smallest_copy / "small.cameras.json",
+        ("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK),
+    )
     cameras.write_text("mine")
     assert says(run(*call, code=2).err.removeprefix(ERROR), cameras, "exists")
-    assert not (small_copy / "small.ply").exists()
+    assert not (smallest_copy / "small.ply").exists()
     assert cameras.read_text() == "mine"
     run(*call, "--overwrite", code=0)
     assert len(json.loads(cameras.read_text())) == 3
 
 
-def test_a_second_format_shares_them(small_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_a_second_format_shares_them(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     """They are there, with the same content; those of other views are no result's own."""
     out = tmp_path / "out"
     out.mkdir()
-    run("compact", small_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
+    run("compact", smallest_copy, "-o", out / "a.ply", *QUICK, "-q", code=0)
     before = (out / "a.cameras.json").read_bytes()
-    done = run("compact", small_copy, "-o", out / "a.spz", *QUICK, code=0)
+    done = run("compact", smallest_copy, "-o", out / "a.spz", *QUICK, code=0)
     assert done.out.splitlines()[-1].endswith(" a.cameras.json")
     assert (out / "a.cameras.json").read_bytes() == before
-    run("compact", small_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
+    run("compact", smallest_copy, "-o", out / "a.cameras.json", *QUICK, code=2)
     entries = json.loads(before)
     for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}):
         (out / "a.cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
-        done = run("compact", small_copy, "-o", out / "a.sog", *QUICK, code=2)
+        done = run("compact", smallest_copy, "-o", out / "a.sog", *QUICK, code=2)
         assert says(done.err.removeprefix(ERROR), "a.cameras.json", "cameras", "--overwrite")
     assert sorted(path.name for path in out.iterdir()) == ["a.cameras.json", "a.ply", "a.spz"]
-    run("compact", small_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)
+    run("compact", smallest_copy, "-o", out / "a.sog", "--overwrite", *QUICK, "-q", code=0)
     assert (out / "a.cameras.json").read_bytes() == before
 
 
-def test_conversions_beside_a_result_share_its_cameras(small_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_conversions_beside_a_result_share_its_cameras(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     """Reading and writing them again may change their last digits, and is no reason to refuse."""
     names = ("b.spz", "b.glb", "b.splat", "b.ply", "a.ply", "a.sog")
-    run("compact", small_copy, "-o", tmp_path / names[0], *QUICK, "-q", code=0)
+    run("compact", smallest_copy, "-o", tmp_path / names[0], *QUICK, "-q", code=0)
     first, last = tmp_path / "b.cameras.json", tmp_path / "a.cameras.json"
     before = first.read_text()
     for source, output in pairwise(names):
@@ -125,12 +120,12 @@ def test_their_name_is_made_of_the_result_s() -> None:
         assert viewer_cameras_path(Path(f"{output}.ply")) == Path(f"{expected}.cameras.json")
 
 
-def test_a_folder_with_a_result_and_its_cameras_needs_no_options(small_copy: Path, run: Run, tmp_path: Path) -> None:
+def test_a_folder_with_a_result_and_its_cameras_needs_no_options(smallest_copy: Path, run: Run, tmp_path: Path) -> None:
     """The output's folders are made; the cameras beside a result go before others in the folder."""
     out = tmp_path / "new" / "out"
-    run("compact", small_copy, "-o", out / "small.ply", *QUICK, "-q", code=0)
+    run("compact", smallest_copy, "-o", out / "small.ply", *QUICK, "-q", code=0)
     assert sorted(path.name for path in out.iterdir()) == ["small.cameras.json", "small.ply"]
-    count = len(gsmerge.read_scene(small_copy))
+    count = len(gsmerge.read_scene(smallest_copy))
     for place in (out, out / "small.ply"):
         facts = json.loads(run("inspect", place, "--json", code=0).out)
         assert (facts["cameras"], facts["num_views"]) == (str(out / "small.cameras.json"), count)
@@ -139,6 +134,6 @@ def test_a_folder_with_a_result_and_its_cameras_needs_no_options(small_copy: Pat
     document = json.loads(run("evaluate", out, "--lpips", "none", "--json", code=0).out)
     assert document["num_views"]["context"] == count
     assert not says(run("view", out, "-o", tmp_path / "view.html", code=0).err, "placed")
-    (out / "transforms.json").write_bytes((small_copy / "transforms.json").read_bytes())
+    (out / "transforms.json").write_bytes((smallest_copy / "transforms.json").read_bytes())
     facts = json.loads(run("inspect", out / "small.ply", "--json", code=0).out)
     assert facts["cameras"] == str(out / "small.cameras.json")

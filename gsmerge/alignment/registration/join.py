@@ -113,9 +113,6 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
     images = [scene.images for scene in scenes if scene.images is not None]
     if photos is None and len(images) == len(scenes):
         photos = np.concatenate(images)
-    gaps = [scene.missing for scene in scenes]
-    incomplete = any(gap is not None for gap in gaps)
-    filled = [np.zeros(_grid(scene), bool) if gap is None else gap for scene, gap in zip(scenes, gaps, strict=True)]
     aligned = all(scene.aligned for scene in scenes)
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
@@ -123,21 +120,19 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         images=photos,
         pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
         names=tuple(name for scene in scenes for name in scene.names),
-        missing=np.concatenate(filled) if incomplete else None,
+        missing=_concat_flags(scenes, [scene.missing for scene in scenes], usual=False),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=None if photos is None else _concat_masks(scenes),
+        masks=None if photos is None else _concat_flags(scenes, [scene.masks for scene in scenes], usual=True),
     )
 
 
-def _concat_masks(scenes: Sequence[Scene]) -> np.ndarray | None:
-    """Concatenate masks; a scene without masks gets full ones. None if no scene has masks."""
-    if all(scene.masks is None for scene in scenes):
+def _concat_flags(scenes: Sequence[Scene], flags: Sequence[np.ndarray | None], *, usual: bool) -> np.ndarray | None:
+    """Concatenate flags ``[v,h,w]`` of pixels; a scene without any has the ``usual``. None if all are."""
+    if all(each is None for each in flags):
         return None
-    return np.concatenate([np.full(_grid(s), True) if s.masks is None else s.masks for s in scenes])
-
-
-def _grid(scene: Scene) -> tuple[int, int, int]:
-    return len(scene), scene.cameras.height, scene.cameras.width
+    shapes = ((len(scene), scene.cameras.height, scene.cameras.width) for scene in scenes)
+    filled = [np.full(shape, usual) if each is None else each for shape, each in zip(shapes, flags, strict=True)]
+    return np.concatenate(filled)
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:

@@ -24,7 +24,7 @@ from gsmerge.alignment.registration.similarities import (
 )
 from gsmerge.geometry import IDENTITY, Damping, Similarity, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.kernels.elementary import exp, log, log1p
-from gsmerge.kernels.matrices import matmul, solve
+from gsmerge.kernels.matrices import matmul, solve, transform
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
@@ -153,16 +153,16 @@ def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: f
     """
     turns = other.viewmats[:, :3, :3]
     moved = place.move_points(end.points)
-    camera = _times(turns, moved) + other.viewmats[:, :3, 3]
+    camera = transform(turns, moved) + other.viewmats[:, :3, 3]
     z = np.maximum(camera[:, 2], 1e-9 * np.abs(camera).max(1) + 1e-30)
-    projected = _times(other.Ks, camera)[:, :2] / z[:, None]
+    projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
     # how the place in the photo moves where a depth is wrong by one standard deviation
     poses = end.viewmats[:, :3, :3]
-    eyes = -_times(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
-    along = place.scale * _times(turns, matmul(end.points - eyes, place.rotation.T))
-    streaks = spread * _times(by_camera[:, :2], along)
+    eyes = -transform(poses.swapaxes(1, 2), end.viewmats[:, :3, 3])
+    along = place.scale * transform(turns, matmul(end.points - eyes, place.rotation.T))
+    streaks = spread * transform(by_camera[:, :2], along)
     lengths = np.maximum((streaks * streaks).sum(1), 1e-30)
     shrink = (1 - pixels / np.sqrt(pixels**2 + lengths)) / lengths
     outer = shrink[:, None, None] * streaks[:, :, None] * streaks[:, None]
@@ -172,14 +172,9 @@ def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: f
     by_camera[:, 2, 2] = 1 / (depth_share * z)
     ratios = log(z / camera_depths(other.points, other.viewmats))
     values = np.empty((len(moved), 3))
-    values[:, :2] = _times(whiten, projected - other.pixels)
+    values[:, :2] = transform(whiten, projected - other.pixels)
     values[:, 2] = np.where(camera[:, 2] > 0, ratios, BEHIND) / depth_share
     return _Residuals(moved, values, matmul(by_camera, turns))
-
-
-def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Multiply matrices ``[m,i,j]`` and vectors ``[m,j]``."""
-    return matmul(matrices, vectors[..., None])[..., 0]
 
 
 def _squares(places: Places, matches: KeypointMatches, spread: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.geometry import Similarity, normalize, quat_to_rotmat, rotmat_to_quat
-from gsmerge.kernels.matrices import eigh, matmul
+from gsmerge.kernels.matrices import eigh, matmul, transform
 
 DIGITS = 7  # decimals of a rounded place: its last bits mean nothing
 
@@ -31,7 +31,7 @@ def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple
     form[:, 1:, 0] = turn
     form[:, 1:, 1:] = m + m.swapaxes(1, 2) - trace[:, None, None] * np.eye(3)
     rotations = quat_to_rotmat(eigh(form)[1][:, :, -1])
-    shifts = middle_q - scales[:, None] * matmul(rotations, middle_p[..., None])[..., 0]
+    shifts = middle_q - scales[:, None] * transform(rotations, middle_p)
     return rotations, scales, shifts
 
 

@@ -92,7 +92,7 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
     """Read a ``.gsm``, of one ``kind`` or of any; SceneError for other files, and where a checksum is wrong."""
     path = Path(path)
     metadata, arrays = read_tensors(path, "a .gsm file", REMEDY)
-    header = _read_header(path, metadata)
+    header = _parse_header(path, metadata)
     if kind not in (None, header["kind"]):
         remedy = f"gsmerge compact {path} --k 2 makes Gaussians of them, convert arrays"
         raise SceneError(path, "expected results in the .gsm, found Feature Gaussians", remedy)
@@ -103,7 +103,12 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
     return file
 
 
-def _read_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+def read_header(path: Path) -> dict[str, Any]:
+    """Read the header of a ``.gsm`` alone, which says what it holds; SceneError for other files."""
+    return _parse_header(path, read_tensors(path, "a .gsm file", REMEDY, arrays=False)[0])
+
+
+def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     """Parse the header of a file of this schema."""
     text = metadata.get(HEADER, metadata.get(ENCODED))
     if text is None:
@@ -171,7 +176,7 @@ def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
 def holds_views(path: Path) -> bool:
     """Return whether a path is a ``.gsm`` with cameras; True for a damaged one, whose reader says what is wrong."""
     try:
-        return len(read_gsm(path).header["names"]) > 0
+        return len(read_header(path)["names"]) > 0
     except SceneError:
         return True
 

@@ -26,7 +26,6 @@ def edge_scores(neighbors, means, covars, colors, latents, views, max_color, sim
 
     Args:
         neighbors: ``[g,k]`` int64, below 0: none.
-        means: ``[g,3]`` float64.
         covars: ``[g,6]`` float64, as xx xy xz yy yz zz.
         colors: ``[g,3]`` float64 base colours.
         latents: ``[g,d]`` float32 of length 1; d may be 0.

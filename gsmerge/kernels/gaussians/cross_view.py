@@ -77,17 +77,11 @@ def sum_cross_view(
     """Sum over the views that see each point, for the points from ``first`` to before ``last``.
 
     Args:
-        points: ``[g,3]`` float64.
         colors: ``[g,3]`` float32 base colours less a half.
         own: ``[g]`` int64 view of each, which is left out.
-        viewmats: ``[v,4,4]`` float64.
-        Ks: ``[v,3,3]`` float64.
         width: Of the views, pixels.
         height: Of the views, pixels.
         fronts: ``[v,h,w]`` int32 Gaussian of each pixel, -1 for none; None: the pixel's own number.
-        means: ``[n,3]`` float32.
-        opacities: ``[n]`` float32.
-        sh0: ``[n,1,3]`` float32.
         color_scale: From ``sh0`` to colours.
         near: Largest difference of the logarithms of two depths of one surface.
         far: Larger differences are clipped to this.

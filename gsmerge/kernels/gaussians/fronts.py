@@ -27,11 +27,7 @@ def weigh_centres(means, scales, opacities, viewmat, K, near, fronts):
     """Weigh Gaussians at the pixels of their centres, nearest first; of equal depths the first row comes first.
 
     Args:
-        means: ``[n,3]`` float32.
-        scales: ``[n,3]`` float32.
-        opacities: ``[n]`` float32.
         viewmat: ``[4,4]`` float64, world to camera.
-        K: ``[3,3]`` float64.
         near: Depth beyond which Gaussians count, world units.
         fronts: ``[h,w]`` int32, written: the Gaussian with the largest opacity times transmittance at each pixel, -1
             without any.

@@ -20,7 +20,6 @@ def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
     Args:
         quats: ``[n,4]`` wxyz of any length.
         scales: ``[n,3]`` standard deviations.
-        opacities: ``[n]``.
         flatness: Least scale, as a share of the largest.
         covars: Written.
         masses: Written.
@@ -47,10 +46,7 @@ def agglomerate(
     any cost are the first ones of every cell.
 
     Args:
-        means: ``[n,3]`` float64.
         covars: ``[n,6]`` float32, upper triangles.
-        masses: ``[n]`` float32.
-        colors: ``[n,3]`` float32.
         order: ``[n]`` int64 rows, cell by cell.
         starts: ``[c+1]`` int64 into the order, at most ``CELL`` apart.
         color_weight: Of squared distances of colours against nats.

@@ -39,9 +39,6 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         means: ``[n,3]`` float32, as are the other columns of the members.
         quats: ``[n,4]`` wxyz of any length.
         scales: ``[n,3]`` standard deviations.
-        opacities: ``[n]``.
-        sh0: ``[n,1,3]``.
-        shN: ``[n,k-1,3]``.
         footprints: ``[n]`` sizes of the members' pixels, world units.
         own_covariance: Whether members have an extent: without, only the spread of the means counts (paper eq.
             teacher_cov) and nothing is capped.

@@ -53,7 +53,6 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
         boxes: ``[m,4]`` int16 their boxes, in the same order.
         tile_width: Tiles per row.
         cursors: ``[tiles]`` int64 where each list goes on, advanced.
-        flatten_ids: ``[intersections]`` int32, written.
     """
 
 

@@ -42,8 +42,6 @@ def image_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, 
 
     Args:
         image: ``[h,3w]`` float32, interleaved channels.
-        photo: ``[h,3w]`` float32.
-        weight: ``[h,w]`` float32.
         ssim_lambda: Share of structural similarity, float32.
         edge_weight: Weight of the differences between neighbouring pixels, float32.
         first: First row.

@@ -54,7 +54,6 @@ def project(means, quats, scales, opacities, ids, camera, conics, depths, boxes)
     Args:
         quats: ``[n,4]`` wxyz; normalised here.
         opacities: ``[n]``; above 1 they count as 1.
-        conics: ``[m,CONIC]`` float32, written.
         depths: ``[m]`` float32, written: camera z.
         boxes: ``[m,4]`` int16, written: first and (exclusive) last tile column, first and last tile row; all 0
             where nothing is drawn.
@@ -77,10 +76,6 @@ def project_backward(
         sums: ``[m,SUMS]`` float32, see :func:`gsmerge.kernels.raster.blend.blend_backward`.
         first: Start of the range, a multiple of BLOCK.
         last: End of the range, exclusive.
-        grad_means: ``[m,3]`` float32, written.
-        grad_quats: ``[m,4]`` float32, written.
-        grad_scales: ``[m,3]`` float32, written.
-        grad_opacities: ``[m]`` float32, written.
         grad_poses: ``[blocks,POSE]`` float32, written: gradient of the world-to-camera matrix, summed over blocks of
             BLOCK Gaussians; None for none.
     """

@@ -23,8 +23,5 @@ def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors,
 
     Args:
         colors: ``[m,3]`` float32, as seen; no gradient passes where they are 0.
-        grad_colors: ``[m,3]`` float32.
-        grad_sh0: ``[m,1,3]`` float32, written.
-        grad_shN: ``[m,k-1,3]`` float32, written.
         grad_means: ``[m,3]`` float32, through the viewing direction alone, written.
     """

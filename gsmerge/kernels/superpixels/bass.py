@@ -46,8 +46,6 @@ def sum_regions(labels, colours, marks, count):
 
     Args:
         labels: Padded labels.
-        colours: ``[h,w,3]`` float32.
-        marks: ``[h,w]`` bool.
         count: Number of regions.
     """
     sums = np.zeros((count, SUMS))
@@ -125,7 +123,6 @@ def split(labels, colours, areas, prior, across, most, least=0.0):
 
     Args:
         labels: Padded labels 0 to ``len(areas) - 1``, each region 4-connected and none empty; they stay so.
-        colours: ``[h,w,3]`` float32.
         areas: ``[count]`` float64 expected area of every region, pixels; halves share it.
         prior: ``[4]`` float64, log α, a, b and v.
         across: Whether the halves are left and right, else top and bottom.

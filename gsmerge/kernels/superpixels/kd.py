@@ -47,7 +47,6 @@ def split_rectangles(pixels, count, block, compactness):
     """Cut the picture into ``count`` rectangles (at least one per block), the most rewarding cuts first.
 
     Args:
-        pixels: ``[h,w,3]`` float32.
         count: Rectangles wanted, at most h·w.
         block: Side of the blocks that the picture is divided into at the start, pixels.
         compactness: Weight of squared pixels against squared colours.

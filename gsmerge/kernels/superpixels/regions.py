@@ -68,7 +68,6 @@ def sweep(labels, pixels, rows, table, spread, backward):
 
     Args:
         labels: Padded labels 0 to ``count - 1``, changed.
-        pixels: ``[h,w,3]`` float32.
         rows: ``[count,8]`` float32 rows of the regions with their last two columns, changed.
         table: From :func:`connectivity_table`.
         spread: Square root of the weight of squared pixels against squared colours.

@@ -22,9 +22,10 @@ def room() -> Scene:
 
 
 def sized(gaussians: Gaussians, share: float) -> Gaussians:
-    """All of one size: a share of the diagonal of the box that holds most of them."""
-    low, high = np.percentile(gaussians.means, (1, 99), axis=0)
-    size = share * np.linalg.norm(high - low)
+    """All of one size: a share of the diagonal of the box that holds most of them, or of where half are if tiny."""
+    low, middle, high = np.percentile(gaussians.means, (1, 50, 99), axis=0)
+    extent = high - low if share > 1e-3 else 2 * np.median(np.linalg.norm(gaussians.means - middle, axis=1))
+    size = share * np.linalg.norm(extent)
     return replace(gaussians, scales=np.full_like(gaussians.scales, size))
 
 
@@ -36,6 +37,12 @@ def test_sizes_have_bounds(share: float, words: str | None, room: Scene) -> None
     odd = unlike_captures(sized(room.gaussians, share))
     assert (odd is None) == (words is None)
     assert words is None or (f"{words} {share:.2g} times as large as the scene" in odd and "nothing is scored" in odd)
+
+
+def test_a_far_sky_makes_no_gaussian_small(room: Scene) -> None:
+    means = room.gaussians.means.copy()
+    means[::3] *= 1e7
+    assert unlike_captures(replace(room.gaussians, means=means)) is None
 
 
 @pytest.mark.parametrize(("value", "is_odd"), [(0.9 * BRIGHT, False), (1.1 * BRIGHT, True), (-1.1 * BRIGHT, True)])
