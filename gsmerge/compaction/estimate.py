@@ -56,10 +56,10 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     drawn = pixels if options.method == "unmerged-fit" else count
     seconds = wall_seconds(
         at_once * choices.blocks, len(scene), settings, threads=options.threads or available_threads(),
-        photos=size.fitted, fit_steps=choices.fit.steps,
+        photos=True, fit_steps=choices.fit.steps,
         num_drawn=drawn * float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
     )  # fmt: skip
-    memory = memory_bytes(at_once, photos=size.fitted, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    memory = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
@@ -71,7 +71,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "method": options.method,
         "superpixels_per_view": 0 if merges_pairs(size, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings, photos=size.fitted),
+        "fit": fit_of(settings, photos=True),
         "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),

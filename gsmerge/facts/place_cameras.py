@@ -18,11 +18,14 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24
-JUDGES, JUDGE_SIZE = 8, 320  # views that judge a result, and their pixels per side, at most
+JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
+FITTED = 16  # views that a fit without cameras sees from afar, as many from near by and from where most shows
+FITTED_LONG = 48  # the same of a long fit
 FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
+FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 LOOKS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
@@ -72,6 +75,22 @@ def keep_finite(scene: Scene) -> Scene:
 
 def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
     return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
+
+
+def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
+    """Add renders of a canonical scene: ``count`` each from afar, near by, and where most of it shows; these come last.
+
+    What a background shows through the renders is their ``empty``.
+    """
+    centre, half = _extent(sampled(scene.gaussians).means.astype(np.float64))
+    outside = [_around(centre, half, radii, count) for radii in (FAR, NEAR)]
+    viewmats = np.concatenate([*outside, place_cameras(scene.gaussians, count).viewmats])
+    more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
+    drawn = render(scene.gaussians, more)
+    images = np.concatenate([scene.images, drawn.images.clip(0, 1)])
+    empty = np.concatenate([np.zeros(scene.images.shape[:3], np.float32), 1 - drawn.alphas[..., 0]])
+    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
+    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, empty=empty, names=names)
 
 
 def add_judges(scene: Scene) -> Scene:
@@ -175,15 +194,19 @@ def _sphere(count: int) -> np.ndarray:
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
-    radius = float(np.sqrt((half * half).sum()))
-    away = _sphere(AROUND)
-    distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
-    eyes, looks = [centre + distance * away], [-away]
+    eyes, looks = [], []
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     for place in grid:
         eyes.append(np.broadcast_to(centre + place * half, (LOOKS, 3)))
         looks.append(_sphere(LOOKS))
-    return np.stack([_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)])
+    inside = [_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)]
+    return np.concatenate([_around(centre, half, FAR, AROUND), inside])
+
+
+def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre."""
+    distance = radii * float(np.sqrt((half * half).sum()))
+    return np.stack([_look(centre + distance * away, -away) for away in _sphere(count)])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:

@@ -20,12 +20,15 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.place_cameras import (
+    FITTED,
+    FITTED_LONG,
     NO_VIEWS,
     add_judges,
     add_views,
     blank_pictures,
     draw_around,
     draw_pictures,
+    draw_placed,
     keep_finite,
 )
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
@@ -159,7 +162,7 @@ class Prepared:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
         reference = self.reference
-        size = measure_size(measured, "photos" if reference.of_views else "renders" if reference.fit_views else "none")
+        size = measure_size(measured, "photos" if reference.of_views else "renders")
         # Gaussians that fill holes are not the file's
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
@@ -173,8 +176,13 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with renders of it around its views besides, which a fit to renders needs."""
-        return draw_around(self.scene)
+        """The canonical scene with renders of it besides, around its views or placed, which a fit to renders needs."""
+        return draw_placed(self.scene, FITTED) if self.reference.placed else draw_around(self.scene)
+
+    @cached_property
+    def scene_all_around(self) -> PicturedScene:
+        """The same with more renders, if views are placed, for a long fit."""
+        return draw_placed(self.scene, FITTED_LONG) if self.reference.placed else self.scene_around
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -317,8 +325,7 @@ def with_row_colors(scene: Scene) -> Scene:
 def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     """Bring a scene without views into its canonical frame, and add pictures on which results are judged.
 
-    Nothing is fitted to these pictures: a fit to renders of the input makes other views worse. Raises ValueError if
-    there is no finite Gaussian.
+    Nothing is fitted to these pictures. Raises ValueError if there is no finite Gaussian.
     """
     finite = keep_finite(scene)
     note(NO_VIEWS)
