@@ -32,7 +32,8 @@ def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
 # work and spare are work space for a cell
 _agglomerate = declare(
     "agglomerate", STATUS, means=f8("n", 3), covars=f4("n", 6), masses=f4("n"), weights=f4("n"), colors=f4("n", 3),
-    order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(), least_share=f8(), first=i8(), last=i8(), work=f4(WORK, CELL, out=True), spare=i4(3, CELL, out=True),
+    order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(),
+    least_share=f8(), first=i8(), last=i8(), work=f4(WORK, CELL, out=True), spare=i4(3, CELL, out=True),
     pairs=i4("n", 2, out=True), costs=f4("n", out=True),
 )  # fmt: skip
 
@@ -63,8 +64,8 @@ def agglomerate(
     """
     work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
     _agglomerate(
-        means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, work, spare, pairs,
-        costs,
+        means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, work, spare,
+        pairs, costs,
     )  # fmt: skip
 
 
@@ -75,6 +76,6 @@ def agglomerate(
 def merge_pairs(pairs, means, covars, masses, weights, sh, sizes):
     """Replace the first row of each pair by the Gaussian with the moments of both, one pair after the other.
 
-    Masses and weights add up, and so do ``sizes``, the numbers of merged Gaussians; harmonics are means by mass. The second rows
-    stay unchanged.
+    Masses and weights add up, and so do ``sizes``, the numbers of merged Gaussians; harmonics are means by mass. The
+    second rows stay unchanged.
     """
