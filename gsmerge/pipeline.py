@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.facts.holes import fill_between
+from gsmerge.facts.place_cameras import placed_views
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
@@ -23,8 +24,8 @@ from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
-LONG = 600  # steps of a fit from which on it sees more views, where they are placed
-TOLERANCE = 0.3  # dB that a fit may lose in a view which it has not seen
+# dB that a fit may lose in a view which it has not seen, by the power that was best: few look at objects from within
+TOLERANCES = dict(zip(POWERS, (0.3, 3.0), strict=True))
 NEAR_INPUT = 36.0  # dB from renders of the input, from which on nobody sees what a fit to them gains
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for
@@ -50,39 +51,42 @@ def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
 
     A fit to views that are placed is refused where it shows worse what it has not seen, with a note.
     """
-    merged, psnr = merge_shown(prepared, count)
+    merged, psnr, power = merge_shown(prepared, count)
     if plan.fit.fit == "none":
         return Fitted(merged, prepared.scene.cameras, None)
     if psnr >= max(NEAR_INPUT, plan.target_psnr or 0.0):  # a fit is not worth its time
         note("nothing is fitted: merged Gaussians look as the input")
         return Fitted(merged, prepared.scene.cameras, None)
     placed, given = prepared.reference.placed, len(prepared.scene)
-    scene = prepared.scene
-    if placed or plan.fit.grows:
-        scene = prepared.scene_all_around if plan.fit.steps >= LONG else prepared.scene_around
+    if placed:
+        scene = prepared.scene_placed(placed_views(plan.fit.steps))
+    else:
+        scene = prepared.scene_around if plan.fit.grows else prepared.scene
     decoded, views = Decoded(merged, count, exact=True), range(given if placed else 0, len(scene))
     fitted = fit_scene(decoded, scene, views, plan.fit, plan.seed, num_judged=given)
     refused = fitted.report is None or not fitted.report.accepted
-    if placed and not refused and not shows_all_as_well(fitted.gaussians, merged, prepared):
+    if placed and not refused and not shows_as_well(fitted.gaussians, merged, prepared, TOLERANCES[power]):
         note("nothing is fitted: a fit to placed views shows others worse; with cameras it is fitted to theirs")
         refused = True
     return replace(fitted, gaussians=merged if refused else fitted.gaussians, cameras=prepared.scene.cameras)
 
 
-def shows_all_as_well(after: Gaussians, before: Gaussians, prepared: Prepared) -> bool:
-    """Return whether renders of the input, which no fit has seen, are all shown no worse after a fit."""
+def shows_as_well(after: Gaussians, before: Gaussians, prepared: Prepared, tolerance: float) -> bool:
+    """Return whether renders of the input, which no fit has seen, are shown better after a fit, each one nearly."""
     photos = scene_photos(prepared.scene)
-    scores = [[score_photos(g, photos, [v]).psnr for v in prepared.reference.score_views] for g in (after, before)]
-    return all(now >= then - TOLERANCE for now, then in zip(*scores, strict=True))
+    views = prepared.reference.score_views
+    now, then = (np.array([score_photos(g, photos, [view]).psnr for view in views]) for g in (after, before))
+    gains = now - then
+    return bool(gains.mean() > 0 and gains.min() >= -tolerance)
 
 
-def merge_shown(prepared: Prepared, count: int) -> tuple[Gaussians, float]:
-    """Merge neighbours by each power of their masses; return what is nearest to renders of the input, and its dB."""
+def merge_shown(prepared: Prepared, count: int) -> tuple[Gaussians, float, float]:
+    """Merge neighbours by each power of their masses; return what is nearest to the renders, its dB and its power."""
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
     ways = [merge_neighbors(prepared.scene.gaussians, count, power) for power in POWERS]
     scores = [score_photos(way, photos, views, quarter=True).psnr for way in ways]
     best = int(np.argmax(scores))
-    return ways[best], scores[best]
+    return ways[best], scores[best], POWERS[best]
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

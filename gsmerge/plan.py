@@ -48,7 +48,8 @@ MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians 
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
 KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
-PER_STEP = 800  # Gaussians of a scene without views for each step of its fit, up to the steps of an effort
+# Gaussians of a scene without views for each step of its fit, more of them the more it draws; up to those of an effort
+PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
 PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
@@ -230,7 +231,8 @@ def choose_for_scene(
     ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
     """
     keeps = keeps_input(scene, options)
-    if scene.num_views == 0 and resolve_fit(options).steps <= SHORT_STEPS:  # too few for views that have to be placed
+    if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
+        # too few steps for views that have to be placed, or too many counts to be tried
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
     if segment.superpixels == AUTO_SHARE:  # which work on the scene decides
@@ -240,7 +242,8 @@ def choose_for_scene(
     share = limits.share if fit.share is None and scene.num_views else fit.share
     steps = steps_for(options, scene.num_views, USUAL_SHARE if share is None else share)
     if scene.num_views == 0 and options.fit.fit_steps is None and options.effort != "best":
-        steps = min(steps, max(SHORT_STEPS, scene.num_gaussians // PER_STEP))
+        work = PER_STEP + (limits.count or limits.default) // PER_DRAWN
+        steps = min(steps, max(SHORT_STEPS, scene.num_gaussians // work))
     fit = replace(fit, fit_steps=steps, share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)

@@ -20,7 +20,7 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 NUM_VIEWS = 24
 JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
 FITTED = 16  # views that a fit without cameras sees from afar, as many from near by and from where most shows
-FITTED_LONG = 48  # the same of a long fit
+FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
 FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
@@ -75,6 +75,11 @@ def keep_finite(scene: Scene) -> Scene:
 
 def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
     return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
+
+
+def placed_views(steps: int) -> int:
+    """Return how many views of each of three kinds are placed for a fit of so many steps."""
+    return FITTED_LONG if steps >= LONG else FITTED
 
 
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:

@@ -20,8 +20,6 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
 from gsmerge.facts.place_cameras import (
-    FITTED,
-    FITTED_LONG,
     NO_VIEWS,
     add_judges,
     add_views,
@@ -176,13 +174,18 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with renders of it besides, around its views or placed, which a fit to renders needs."""
-        return draw_placed(self.scene, FITTED) if self.reference.placed else draw_around(self.scene)
+        """The canonical scene with renders of it around its views besides, which a fit to renders needs."""
+        return draw_around(self.scene)
 
     @cached_property
-    def scene_all_around(self) -> PicturedScene:
-        """The same with more renders, if views are placed, for a long fit."""
-        return draw_placed(self.scene, FITTED_LONG) if self.reference.placed else self.scene_around
+    def _placed(self) -> dict[int, PicturedScene]:
+        return {}
+
+    def scene_placed(self, views: int) -> PicturedScene:
+        """Return the canonical scene with renders of it from placed views besides, drawn once for each number."""
+        if views not in self._placed:
+            self._placed[views] = draw_placed(self.scene, views)
+        return self._placed[views]
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
