@@ -1,15 +1,18 @@
 """How like the input a trained scene stays at several counts: ours beside splat-transform, mean and worst view.
 
 python benchmarks/trained_counts.py fox,fern --folder made      # made/fox.ply and .cameras.json, by trained_scenes.py
+python benchmarks/trained_counts.py biker --folder made --orbits    # made/biker.ply, which has neither
 
-Input and results are rendered at the held-out cameras and at cameras at random between the input's. Results of
-splat-transform (on the PATH, or named by GSMERGE_SPLAT_TRANSFORM) are kept in the folder. A line has the
-mean of all views and the worst by PSNR; `least` is what ours has more than theirs in the view where that is least.
+Input and results are rendered at the held-out cameras and at cameras at random between the input's, or on two orbits.
+Results of both modes of splat-transform (on the PATH, or named by GSMERGE_SPLAT_TRANSFORM) are kept in the folder. A
+line has the mean of all views, the worst by PSNR, and processor seconds of what was made anew; `least` is what ours has
+more than theirs in the view where that is least.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import subprocess
 import time
 from pathlib import Path
@@ -26,6 +29,8 @@ from gsmerge.raster.metrics import psnr, ssim
 from gsmerge.types import Cameras, Gaussians, Scene
 
 BETWEEN = 12  # cameras at random
+ORBITS, AROUND, SIDE = (1.2, 2.2), 8, 512  # radii of half the extent's diagonal; cameras on each; pixels
+MODES = {"uniform": "-d", "adaptive": "--decimate-adaptive"}
 
 
 def cameras_between(cameras: Cameras, count: int, seed: int = 0) -> Cameras:
@@ -39,6 +44,33 @@ def cameras_between(cameras: Cameras, count: int, seed: int = 0) -> Cameras:
         viewmats[view, :3, :3] = quat_to_rotmat(quat[None] / np.linalg.norm(quat))[0]
         viewmats[view, :3, 3] = -viewmats[view, :3, :3] @ ((1 - share) * centres[a] + share * centres[b])
     return Cameras(viewmats, cameras.Ks[rows[:, 0]], cameras.width, cameras.height)
+
+
+def orbits(gaussians: Gaussians) -> list[Cameras]:
+    """Place cameras on two circles about the middle, around the shortest axis, a little above it."""
+    low, high = np.quantile(gaussians.means.astype(np.float64), [0.05, 0.95], axis=0)
+    up, turns = np.eye(3)[(high - low).argmin()], 2 * np.pi * np.arange(AROUND) / AROUND
+    first, sets = np.roll(up, 1), []
+    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
+    for radii in ORBITS:
+        viewmats = np.tile(np.eye(4), (AROUND, 1, 1))
+        for viewmat, turn in zip(viewmats, turns, strict=True):
+            away = np.cos(turn) * first + np.sin(turn) * np.cross(up, first) + 0.25 * up
+            away /= np.linalg.norm(away)
+            right = np.cross(-away, up) / np.linalg.norm(np.cross(away, up))
+            viewmat[:3, :3] = np.stack([right, np.cross(-away, right), -away])
+            eye = (low + high) / 2 + radii * np.linalg.norm(high - low) / 2 * away
+            viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        sets.append(Cameras(viewmats, np.repeat(K[None], AROUND, 0), SIDE, SIDE))
+    return sets
+
+
+def seconds_of(call: list[str]) -> float:
+    """Run a command; return its processor seconds."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(call, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def draw(gaussians: Gaussians, sets: list[Cameras]) -> list[np.ndarray]:
@@ -58,34 +90,37 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(), help="has the scenes of trained_scenes.py")
     parser.add_argument("--shares", nargs="*", default=["1", "2", "4.4", "10", "20"], help="percent")
     parser.add_argument("--cameras", action="store_true", help="give ours the cameras")
+    parser.add_argument("--orbits", action="store_true", help="judge from two orbits")
+    parser.add_argument("--effort", default="default")
     parser.add_argument("--ours-only", action="store_true")
     parser.add_argument("--lpips", action="store_true")
     args = parser.parse_args()
-    for folder in scene_folders(args.scenes):
-        path = args.folder / f"{folder.name}.ply"
+    for name in args.scenes.split(",") if args.orbits else [folder.name for folder in scene_folders(args.scenes)]:
+        path = args.folder / f"{name}.ply"
         source, seen = read_ply(path, opacity="logit").gaussians, gsmerge.read_scene(path)
-        sets = [read_held_out(folder).cameras, cameras_between(seen.cameras, BETWEEN)]
+        if args.orbits:
+            sets = orbits(source)
+        else:
+            sets = [read_held_out(scene_folders(name)[0]).cameras, cameras_between(seen.cameras, BETWEEN)]
         expected, bare = draw(source, sets), Scene(source, seen.cameras[:0], None, None, ())
         for share in args.shares:
             start, count = time.process_time(), round(len(source) * float(share) / 100)
-            made = gsmerge.compact(seen if args.cameras else bare, budget=count).gaussians
-            seconds = time.process_time() - start
+            made = gsmerge.compact(seen if args.cameras else bare, budget=count, effort=args.effort).gaussians
+            seconds = {"ours": time.process_time() - start}
             results = {"ours": compare(draw(made, sets), expected, args.lpips)}
-            target = args.folder / "theirs" / f"{folder.name}-{share}.ply"
-            if not args.ours_only:
+            for mode, option in {} if args.ours_only else MODES.items():
+                target = args.folder / "theirs" / f"{name}-{share}-{mode}.ply"
                 target.parent.mkdir(exist_ok=True)
                 if not target.exists():
-                    call = [find_program(), "-q", "-g", "cpu", str(path), "-d", str(count), str(target)]
-                    subprocess.run(call, check=True)
+                    call = [find_program(), "-q", "-g", "cpu", str(path), option, str(count), str(target)]
+                    seconds[mode] = seconds_of(call)
                 theirs = draw(read_ply(target, opacity="logit").gaussians, sets)
-                results["theirs"] = compare(theirs, expected, args.lpips)
-            for name, values in results.items():
-                worst = values[values[:, 0].argmin()]
-                print(folder.name, share, name, *np.round(values.mean(0), 3), "worst", *np.round(worst, 3))
-            if "theirs" in results:
-                gains = results["ours"] - results["theirs"]
-                print(folder.name, share, "least", *np.round(gains[gains[:, 0].argmin()], 3))
-            print(folder.name, share, f"{seconds:.1f} s of ours", flush=True)
+                results[mode] = compare(theirs, expected, args.lpips)
+            for way, values in results.items():
+                worst, least = (each[each[:, 0].argmin()] for each in (values, results["ours"] - values))
+                line = [name, share, way, *np.round(values.mean(0), 3), "worst", *np.round(worst, 3)]
+                line += [] if way == "ours" else ["least", *np.round(least, 3)]
+                print(*line, f"{seconds[way]:.1f} s" if way in seconds else "", flush=True)
 
 
 if __name__ == "__main__":
