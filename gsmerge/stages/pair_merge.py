@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
 from gsmerge.kernels.gaussians.cross_view import LEAF, build_tree
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
@@ -131,15 +131,14 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 def gaussians_of(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
     """Convert moments to Gaussians; those that were not merged stay the same.
 
-    A mass over its area is an optical depth. What it covers is wider than its Gaussian, the more the deeper it is:
-    scales grow with it, at most by ``wider`` for each doubling.
+    Masses that would need an opacity above one make scales larger instead, at most by ``wider`` for each doubling.
     """
     scales, quats = principal_axes(cloud.covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
     squares = scales * scales
-    depths = cloud.masses / np.sqrt((squares * squares[:, [1, 2, 0]]).sum(1))
+    opacities = cloud.masses / np.sqrt((squares * squares[:, [1, 2, 0]]).sum(1))
     most = 1 + wider * log(cloud.sizes.astype(np.float64)) / float(log(2.0))
-    scales *= np.minimum(np.sqrt(1 + depths / 4), most)[:, None]
-    opacities = np.minimum(1 - exp(-depths), MAX_OPACITY)
+    scales *= np.sqrt(opacities).clip(1, most)[:, None]
+    opacities = np.minimum(opacities, MAX_OPACITY)
     sh = cloud.sh.reshape(len(cloud), -1, 3)
     means, quats, scales = to_float32(cloud.means), to_float32(quats), to_float32(scales)
     out = Gaussians(means, quats, scales, to_float32(opacities), sh[:, :1].copy(), sh[:, 1:].copy())
