@@ -25,7 +25,7 @@ from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
 # dB that a fit may lose in a view which it has not seen, by the power that was best: few look at objects from within
-TOLERANCES = dict(zip(POWERS, (0.3, 3.0), strict=True))
+TOLERANCES = dict(zip(POWERS, (0.0, 3.0), strict=True))
 NEAR_INPUT = 36.0  # dB from renders of the input, from which on nobody sees what a fit to them gains
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for

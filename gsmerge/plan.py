@@ -167,7 +167,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         choices = choose_for_scene(
-            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen)
+            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen), keeps=keeps
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
@@ -224,13 +224,19 @@ class SceneChoices:
 
 
 def choose_for_scene(
-    scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
+    scene: SceneSize,
+    options: CompactOptions,
+    *,
+    num_input: int | None = None,
+    num_reserved: int = 0,
+    keeps: bool | None = None,
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
+    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`. ``keeps``: of options as they
+    were given, None: of these.
     """
-    keeps = keeps_input(scene, options)
+    keeps = keeps_input(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
         # too few steps for views that have to be placed, or too many counts to be tried
         options = replace(options, fit=replace(options.fit, fit="none"))

@@ -25,7 +25,7 @@ COST_READ = 3.0  # of reading and judging
 COST_PLACED = 0.15  # of drawing a view
 COST_PAIRS = 3.0  # of merging pairs, for each count that is tried
 PLACED_PIXELS = 512 * 512  # of a view, at most
-TRIED = 4  # counts, where the input's quality decides
+TRIED = 5  # counts, where the input's quality decides
 
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
