@@ -27,6 +27,8 @@ EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is
 AROUND = 40  # candidate cameras around the scene
 FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
+WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
+GOLDEN = np.pi * (1 + math.sqrt(5))  # turn after which directions spread evenly
 LOOKS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
 PROBE = 96  # pixels per side of the pictures that candidates are judged by
@@ -83,13 +85,15 @@ def placed_views(steps: int) -> int:
 
 
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
-    """Add renders of a canonical scene: ``count`` each from afar, near by, and where most of it shows; these come last.
+    """Add renders of a canonical scene: ``count`` each from afar, near by and where most of it shows, half of it on a walk.
 
-    What a background shows through the renders is their ``empty``.
+    They come last. What a background shows through the renders is their ``empty``.
     """
-    centre, half = _extent(sampled(scene.gaussians).means.astype(np.float64))
+    means = sampled(scene.gaussians).means.astype(np.float64)
+    centre, half = _extent(means)
     outside = [_around(centre, half, radii, count) for radii in (FAR, NEAR)]
-    viewmats = np.concatenate([*outside, place_cameras(scene.gaussians, count).viewmats])
+    within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
+    viewmats = np.concatenate([*outside, *within])
     more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
     drawn = render(scene.gaussians, more)
     images = np.concatenate([scene.images, drawn.images.clip(0, 1)])
@@ -192,7 +196,7 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sphere(count: int) -> np.ndarray:
     """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
-    height, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
+    height, turn = 1 - 2 * i / count, GOLDEN * i
     ring = np.sqrt(1 - height**2)
     return np.stack([ring * cos(turn), height, ring * sin(turn)], 1)
 
@@ -212,6 +216,15 @@ def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int) -> n
     """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre."""
     distance = radii * float(np.sqrt((half * half).sum()))
     return np.stack([_look(centre + distance * away, -away) for away in _sphere(count)])
+
+
+def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides of it."""
+    _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
+    steps = 2 * (np.arange(count) + 0.5) / count - 1
+    turns = GOLDEN * np.arange(count)
+    looks = cos(turns)[:, None] * along + sin(turns)[:, None] * side
+    return np.stack([_look(middle + s * WALKED * half.max() * along, d) for s, d in zip(steps, looks, strict=True)])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
