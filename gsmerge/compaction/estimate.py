@@ -67,7 +67,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     if stands_alone(scene, options):
         seconds = placed_seconds(
             scene.num_gaussians, count, threads=threads, fit_steps=steps * (choices.fit.fit != "none"),
-            views=3 * placed_views(steps), tries=TRIED if choices.keeps_input else 1,
+            views=7 * placed_views(steps) // 2, tries=TRIED if choices.keeps_input else 1,
         )  # fmt: skip
     else:
         inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))

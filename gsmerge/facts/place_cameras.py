@@ -85,7 +85,7 @@ def placed_views(steps: int) -> int:
 
 
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
-    """Add renders of a canonical scene: ``count`` each from afar, near by and where most of it shows, half of it on a walk.
+    """Add renders of a canonical scene: ``count`` each from afar, near by and where most shows, half of it on a walk.
 
     They come last. What a background shows through the renders is their ``empty``.
     """
@@ -219,7 +219,7 @@ def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int) -> n
 
 
 def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
-    """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides of it."""
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides."""
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     steps = 2 * (np.arange(count) + 0.5) / count - 1
     turns = GOLDEN * np.arange(count)

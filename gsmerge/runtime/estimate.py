@@ -25,6 +25,7 @@ COST_READ = 3.0  # of reading and judging
 COST_PLACED = 0.15  # of drawing a view
 COST_PAIRS = 3.0  # of merging pairs, for each count that is tried
 PLACED_PIXELS = 512 * 512  # of a view, at most
+FITS = 2  # to placed views, for each count
 TRIED = 5  # counts, where the input's quality decides
 
 # Memory, in bytes
@@ -73,7 +74,7 @@ def placed_seconds(num_input: int, num_drawn: float, *, threads: int, fit_steps:
     """
     step = COST_STEP * min(num_input, PLACED_PIXELS) + COST_DRAWN * num_drawn
     whole = num_input * (COST_READ + COST_PLACED * views * (fit_steps > 0))
-    work = 1.0 + (whole + tries * (COST_PAIRS * num_input + fit_steps * step)) / 1e6
+    work = 1.0 + (whole + tries * (COST_PAIRS * num_input + FITS * fit_steps * step)) / 1e6
     return IMPORT_SECONDS + work / (1.0 if threads == 1 else 1.3)  # little of it runs on several
 
 
