@@ -52,6 +52,7 @@ KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where t
 PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
 PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
+NO_FIT = f"nothing is fitted to placed views: that needs --budget or --effort best, and more than {SHORT_STEPS} steps"
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -175,6 +176,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
             factor = PLACED_STEPS if reference.placed else RENDERS_STEPS
             fit = replace(fit, judged=False, tuning=fit.tuning.scaled(factor))
+        if pairs and reference.placed and fit.fit == "none" != options.fit.fit:
+            note(NO_FIT)
     if keeps and has_few_rows(size):
         few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
         note(f"{few} the photos' pixels, up to half of the Gaussians")

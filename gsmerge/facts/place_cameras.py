@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24
 JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
-FITTED = 16  # views that a fit without cameras sees from afar, as many from near by and from where most shows
+FITTED = 16  # views that a fit without cameras sees of each kind, and half of it on a walk
 FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
 FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by

@@ -112,3 +112,8 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
     report = report_of(run, "compact", tmp_path / "scene.ply", *images, *quick, "-o", tmp_path / "a.ply")
     assert not noted(report["notes"], "not used")
     assert report["psnr_input_views"]["after"] is not None
+
+
+def test_an_effort_that_is_too_short_for_a_fit_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
+    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--budget", "20%", "--effort", "fast")
+    assert noted(report["notes"], "nothing is fitted", "--effort best")
