@@ -5,22 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from gsmerge.facts.holes import fill_between
+from gsmerge.facts.place_cameras import placed_views
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
-from gsmerge.raster.photos import scene_photos, score_photos
-from gsmerge.runtime.record import choose
+from gsmerge.raster.photos import Photos, scene_photos, score_photos
+from gsmerge.runtime.record import choose, note
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge, refine
-from gsmerge.stages.pair_merge import merge_neighbors
+from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
 
+# dB that a fit may lose in a view which it has not seen, by the power: few look at objects from within
+TOLERANCES = 0.0, 3.0
 NEAR_INPUT = 36.0  # dB from renders of the input, from which on nobody sees what a fit to them gains
 
 Build = Callable[[Prepared, Plan, int | None], Fitted]  # a way to make canonical Gaussians, as many as are asked for
@@ -42,21 +47,55 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
 
 
 def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
-    """Merge neighbours into ``count`` canonical Gaussians, and fit them to renders of the input if these differ."""
-    merged = merge_neighbors(prepared.scene.gaussians, count)
-    if plan.fit.fit == "none" or shows_input(merged, prepared, plan):
-        return Fitted(merged, prepared.scene.cameras, None)
-    scene = prepared.scene_around if plan.fit.grows else prepared.scene
-    decoded, views, given = Decoded(merged, count, exact=True), range(len(scene)), len(prepared.scene)
-    fitted = fit_scene(decoded, scene, views, plan.fit, plan.seed, num_judged=given)
-    refused = fitted.report is None or not fitted.report.accepted
-    return replace(fitted, gaussians=merged if refused else fitted.gaussians, cameras=prepared.scene.cameras)
+    """Merge neighbours into ``count`` canonical Gaussians, and fit them to renders of the input if these differ.
 
-
-def shows_input(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> bool:
-    """Return whether canonical Gaussians are so near to renders of the input that a fit is not worth its time."""
+    They are merged by each power of their masses; the best is kept, after the fit where views are placed.
+    """
     photos, views = scene_photos(prepared.scene), prepared.reference.score_views
-    return score_photos(gaussians, photos, views, quarter=True).psnr >= max(NEAR_INPUT, plan.target_psnr or 0.0)
+    ways = [merge_neighbors(prepared.scene.gaussians, count, power) for power in POWERS]
+    scores = [score_photos(way, photos, views, quarter=True).psnr for way in ways]
+    best = int(np.argmax(scores))
+    start = Fitted(ways[best], prepared.scene.cameras, None)
+    if plan.fit.fit == "none":
+        return start
+    if scores[best] >= max(NEAR_INPUT, plan.target_psnr or 0.0):  # a fit is not worth its time
+        note("nothing is fitted: merged Gaussians look as the input")
+        return start
+    if prepared.reference.placed:
+        return fit_placed(prepared, plan, ways, best)
+    scene = prepared.scene_around if plan.fit.grows else prepared.scene
+    decoded = Decoded(ways[best], count, exact=True)
+    fitted = fit_scene(decoded, scene, range(len(scene)), plan.fit, plan.seed, num_judged=len(prepared.scene))
+    accepted = fitted.report is not None and fitted.report.accepted
+    return replace(fitted, gaussians=fitted.gaussians if accepted else ways[best], cameras=prepared.scene.cameras)
+
+
+def fit_placed(prepared: Prepared, plan: Plan, ways: list[Gaussians], best: int) -> Fitted:
+    """Fit each of several ``ways`` to placed views, and return what then shows best what no fit has seen.
+
+    With a note it is returned unfitted where its fit shows that worse, and the ``best`` way where no fit helps.
+    """
+    scene = prepared.scene_placed(placed_views(plan.fit.steps))
+    photos, views = scene_photos(prepared.scene), prepared.reference.score_views
+    placed = range(len(prepared.scene), len(scene))
+    fits = [
+        fit_scene(Decoded(way, len(way), exact=True), scene, placed, plan.fit, plan.seed, num_judged=len(placed))
+        for way in ways
+    ]
+    helped = [fit.report is not None and fit.report.accepted for fit in fits]
+    after = [score_each(fit.gaussians, photos, views) for fit in fits]
+    if any(helped):
+        best = int(np.argmax([scores.mean() for scores in after]))
+    gains = after[best] - score_each(ways[best], photos, views)
+    if helped[best] and gains.mean() > 0 and gains.min() >= -TOLERANCES[best]:
+        return replace(fits[best], cameras=prepared.scene.cameras)
+    note("nothing is fitted: a fit to placed views shows others worse; with cameras it is fitted to theirs")
+    return Fitted(ways[best], prepared.scene.cameras, None)
+
+
+def score_each(gaussians: Gaussians, photos: Photos, views: tuple[int, ...]) -> np.ndarray:
+    """Return the PSNR of each view."""
+    return np.array([score_photos(gaussians, photos, [view]).psnr for view in views])
 
 
 def start(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

@@ -48,7 +48,11 @@ MOST_STEPS = 2.0  # times the steps, for more than the usual share of Gaussians 
 USUAL_VIEWS = 12  # that the steps of an effort are for; more need more
 KEPT_PSNR = 32.5  # dB from the input in its views that results keep by default where there are no photos and no pixels
 KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where there are photos and no pixels
+# Gaussians of a scene without views for each step of its fit, more of them the more it draws; up to those of an effort
+PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
+PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
+NO_FIT = f"nothing is fitted to placed views: that needs --budget or --effort best, and more than {SHORT_STEPS} steps"
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -164,13 +168,16 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         choices = choose_for_scene(
-            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen)
+            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen), keeps=keeps
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
         pairs = checkpoint is None and merges_pairs(size, asked)
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
-            fit = replace(fit, judged=False, tuning=fit.tuning.scaled(RENDERS_STEPS))
+            factor = PLACED_STEPS if reference.placed else RENDERS_STEPS
+            fit = replace(fit, judged=False, tuning=fit.tuning.scaled(factor))
+        if pairs and reference.placed and fit.fit == "none" != options.fit.fit:
+            note(NO_FIT)
     if keeps and has_few_rows(size):
         few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
         note(f"{few} the photos' pixels, up to half of the Gaussians")
@@ -220,22 +227,33 @@ class SceneChoices:
 
 
 def choose_for_scene(
-    scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, num_reserved: int = 0
+    scene: SceneSize,
+    options: CompactOptions,
+    *,
+    num_input: int | None = None,
+    num_reserved: int = 0,
+    keeps: bool | None = None,
 ) -> SceneChoices:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`.
+    ``num_input``, ``num_reserved``: as of :func:`gsmerge.stages.segment.count_limits`. ``keeps``: of options as they
+    were given, None: of these.
     """
-    keeps = keeps_input(scene, options)
-    if not scene.fitted:
+    keeps = keeps_input(scene, options) if keeps is None else keeps
+    if scene.num_views == 0 and (keeps or resolve_fit(options).steps <= SHORT_STEPS) and options.effort != "best":
+        # too few steps for views that have to be placed, or too many counts to be tried
         options = replace(options, fit=replace(options.fit, fit="none"))
     segment, decode = options.segment, resolve_decode(options, scene)
     if segment.superpixels == AUTO_SHARE:  # which work on the scene decides
         segment = replace(segment, superpixels=SHARE)
     limits = count_limits(scene, segment, decode, options.budget, num_input=num_input, num_reserved=num_reserved)
     fit = resolve_fit(options)
-    share = limits.share if fit.share is None else fit.share
-    fit = replace(fit, fit_steps=steps_for(options, scene.num_views, share), share=share)
+    share = limits.share if fit.share is None and scene.num_views else fit.share
+    steps = steps_for(options, scene.num_views, USUAL_SHARE if share is None else share)
+    if scene.num_views == 0 and options.fit.fit_steps is None and options.effort != "best":
+        work = PER_STEP + (limits.count or limits.default) // PER_DRAWN
+        steps = min(steps, max(SHORT_STEPS, scene.num_gaussians // work))
+    fit = replace(fit, fit_steps=steps, share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
     return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps)
@@ -440,7 +458,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
         return decode
     asked = budget != BudgetOptions() or segment.superpixels != SHARE
     other = options.method != OURS or options.recipe is not None or options.checkpoint not in ("auto", "none")
-    fits = scene.fitted and options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)
 

@@ -372,7 +372,8 @@ class Scene:
 class PicturedScene(Scene):
     """A scene that has a picture of every view: its photo, or what stands in for it.
 
-    Pictures are black, and do not count for scores, where ``empty [v,h,w]``: nothing may be there; None: nowhere.
+    Pictures are black, and do not count for scores, where ``empty [v,h,w]``, a mask or shares: nothing may be there;
+    None: nowhere.
     """
 
     images: np.ndarray

@@ -13,14 +13,23 @@ from gsmerge.compaction.files import Outputs, check_colmap, sized
 from gsmerge.compaction.methods import check_method
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.partition import gaussians_at_once
+from gsmerge.facts.place_cameras import placed_views
 from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
-from gsmerge.plan import KEPT_LOSS, KEPT_PSNR, choose_for_scene, load_networks, merges_pairs, resolve_budget
+from gsmerge.plan import (
+    KEPT_LOSS,
+    KEPT_PSNR,
+    choose_for_scene,
+    load_networks,
+    merges_pairs,
+    resolve_budget,
+    stands_alone,
+)
 from gsmerge.report import document_head
-from gsmerge.runtime.estimate import fit_of, memory_bytes, memory_problem, wall_seconds
+from gsmerge.runtime.estimate import TRIED, fit_of, memory_bytes, memory_problem, placed_seconds, wall_seconds
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
@@ -54,12 +63,19 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     count = min(scene.num_gaussians or pixels, most)
     at_once, num_rest = gaussians_at_once(pixels, choices.blocks), 3 * scene.gaussians.shN.shape[1]
     drawn = pixels if options.method == "unmerged-fit" else count
-    seconds = wall_seconds(
-        at_once * choices.blocks, len(scene), settings, threads=options.threads or available_threads(),
-        photos=size.fitted, fit_steps=choices.fit.steps,
-        num_drawn=drawn * float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0])),
-    )  # fmt: skip
-    memory = memory_bytes(at_once, photos=size.fitted, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    threads, steps = options.threads or available_threads(), choices.fit.steps
+    if stands_alone(scene, options):
+        seconds = placed_seconds(
+            scene.num_gaussians, count, threads=threads, fit_steps=steps * (choices.fit.fit != "none"),
+            views=7 * placed_views(steps) // 2, tries=TRIED if choices.keeps_input else 1,
+        )  # fmt: skip
+    else:
+        inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))
+        seconds = wall_seconds(
+            at_once * choices.blocks, len(scene), settings, threads=threads, photos=True, fit_steps=steps,
+            num_drawn=drawn * inside,
+        )  # fmt: skip
+    memory = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,
@@ -71,7 +87,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "method": options.method,
         "superpixels_per_view": 0 if merges_pairs(size, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings, photos=size.fitted),
+        "fit": fit_of(settings | {"fit": choices.fit.fit}, photos=True),
         "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),

@@ -95,7 +95,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
 
 def _unused_alone(options: CompactOptions) -> list[str]:
     """Note changed settings that have no effect on a scene without views."""
-    parts = (options.prepare, options.segment, options.match, options.decode, options.fit)
+    parts = (options.prepare, options.segment, options.match, options.decode)
     names = {field.name for part in parts for field in fields(part)} - {*COUNTS}
     default, given = CompactOptions().to_dict(), options.to_dict()
     unused = [name for name in given if name in names and given[name] not in (default[name], "none")]

@@ -18,12 +18,17 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 NUM_VIEWS = 24
-JUDGES, JUDGE_SIZE = 8, 320  # views that judge a result, and their pixels per side, at most
+JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per side, at most
+FITTED = 16  # views that a fit without cameras sees of each kind, and half of it on a walk
+FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
 FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
+FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
+WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
+GOLDEN = np.pi * (1 + math.sqrt(5))  # turn after which directions spread evenly
 LOOKS = 8  # directions of a camera inside
 FIELD = 1.0  # width of the image over the focal length
 PROBE = 96  # pixels per side of the pictures that candidates are judged by
@@ -72,6 +77,29 @@ def keep_finite(scene: Scene) -> Scene:
 
 def _with_cameras(scene: Scene, cameras: Cameras) -> Scene:
     return Scene(scene.gaussians, cameras, None, None, tuple(f"placed {view}" for view in range(len(cameras))))
+
+
+def placed_views(steps: int) -> int:
+    """Return how many views of each of three kinds are placed for a fit of so many steps."""
+    return FITTED_LONG if steps >= LONG else FITTED
+
+
+def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
+    """Add renders of a canonical scene: ``count`` each from afar, near by and where most shows, half of it on a walk.
+
+    They come last. What a background shows through the renders is their ``empty``.
+    """
+    means = sampled(scene.gaussians).means.astype(np.float64)
+    centre, half = _extent(means)
+    outside = [_around(centre, half, radii, count) for radii in (FAR, NEAR)]
+    within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
+    viewmats = np.concatenate([*outside, *within])
+    more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
+    drawn = render(scene.gaussians, more)
+    images = np.concatenate([scene.images, drawn.images.clip(0, 1)])
+    empty = np.concatenate([np.zeros(scene.images.shape[:3], np.float32), 1 - drawn.alphas[..., 0]])
+    names = (*scene.names, *(f"around {view}" for view in range(len(more))))
+    return replace(scene, cameras=concat_cameras(scene.cameras, more), images=images, empty=empty, names=names)
 
 
 def add_judges(scene: Scene) -> Scene:
@@ -168,22 +196,35 @@ def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sphere(count: int) -> np.ndarray:
     """Return directions ``[count,3]`` spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
-    height, turn = 1 - 2 * i / count, np.pi * (1 + math.sqrt(5)) * i
+    height, turn = 1 - 2 * i / count, GOLDEN * i
     ring = np.sqrt(1 - height**2)
     return np.stack([ring * cos(turn), height, ring * sin(turn)], 1)
 
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
-    radius = float(np.sqrt((half * half).sum()))
-    away = _sphere(AROUND)
-    distance = radius * (1 + 2 / FIELD) / 1.5  # the box fills the image
-    eyes, looks = [centre + distance * away], [-away]
+    eyes, looks = [], []
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     for place in grid:
         eyes.append(np.broadcast_to(centre + place * half, (LOOKS, 3)))
         looks.append(_sphere(LOOKS))
-    return np.stack([_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)])
+    inside = [_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)]
+    return np.concatenate([_around(centre, half, FAR, AROUND), inside])
+
+
+def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre."""
+    distance = radii * float(np.sqrt((half * half).sum()))
+    return np.stack([_look(centre + distance * away, -away) for away in _sphere(count)])
+
+
+def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras on the longest axis that look to all sides."""
+    _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
+    steps = 2 * (np.arange(count) + 0.5) / count - 1
+    turns = GOLDEN * np.arange(count)
+    looks = cos(turns)[:, None] * along + sin(turns)[:, None] * side
+    return np.stack([_look(middle + s * WALKED * half.max() * along, d) for s, d in zip(steps, looks, strict=True)])
 
 
 def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:

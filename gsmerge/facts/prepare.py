@@ -26,6 +26,7 @@ from gsmerge.facts.place_cameras import (
     blank_pictures,
     draw_around,
     draw_pictures,
+    draw_placed,
     keep_finite,
 )
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
@@ -159,7 +160,7 @@ class Prepared:
         """Sizes of the scene that the plan depends on."""
         measured = self.input_scene if self.reference.placed else self.scene
         reference = self.reference
-        size = measure_size(measured, "photos" if reference.of_views else "renders" if reference.fit_views else "none")
+        size = measure_size(measured, "photos" if reference.of_views else "renders")
         # Gaussians that fill holes are not the file's
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
@@ -175,6 +176,16 @@ class Prepared:
     def scene_around(self) -> PicturedScene:
         """The canonical scene with renders of it around its views besides, which a fit to renders needs."""
         return draw_around(self.scene)
+
+    @cached_property
+    def _placed(self) -> dict[int, PicturedScene]:
+        return {}
+
+    def scene_placed(self, views: int) -> PicturedScene:
+        """Return the canonical scene with renders of it from placed views besides, drawn once for each number."""
+        if views not in self._placed:
+            self._placed[views] = draw_placed(self.scene, views)
+        return self._placed[views]
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
         """Return a copy with the canonical cameras that a fit has moved."""
@@ -322,8 +333,7 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
 def prepare_alone(scene: Scene, _: PrepareOptions | None = None) -> Prepared:
     """Bring a scene without views into its canonical frame, and add pictures on which results are judged.
 
-    Nothing is fitted to these pictures: a fit to renders of the input makes other views worse. Raises ValueError if
-    there is no finite Gaussian.
+    Nothing is fitted to these pictures. Raises ValueError if there is no finite Gaussian.
     """
     finite = keep_finite(scene)
     note(NO_VIEWS)

@@ -16,7 +16,7 @@ from gsmerge.types import Gaussians, Scene
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
 FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
 SAMPLES = 65536  # Gaussians that these are measured on
-Pictures = Literal["photos", "renders", "none"]  # photos or what stands in for them; drawings of the scene itself
+Pictures = Literal["photos", "renders"]  # photos or what stands in for them; drawings of the scene itself
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,9 @@ class SceneSize:
     sh_degree: int = 0
 
     @property
-    def fitted(self) -> bool:
-        """Whether there are pictures to fit to."""
-        return self.pictures != "none"
-
-    @property
     def rendered(self) -> bool:
         """Whether results are measured against renders of the input, for lack of photos and of pixels."""
-        return self.pictures == "renders" or not (self.fitted or self.aligned)
+        return self.pictures == "renders"
 
     @property
     def pixels_per_view(self) -> int:
@@ -51,7 +46,7 @@ class SceneSize:
 def measure_size(scene: Scene, pictures: Pictures | None = None) -> SceneSize:
     """Return the sizes of a scene; ``pictures`` None: as they are before photos are compared with the Gaussians."""
     if pictures is None:
-        pictures = "photos" if scene.is_shown else "renders" if len(scene) else "none"
+        pictures = "photos" if scene.is_shown else "renders"
     cameras = scene.cameras.numpy()  # the Gaussians may stay on a GPU: only their number counts
     return SceneSize(
         scene.num_gaussians, len(scene), cameras.height, cameras.width, scene.aligned, pictures,

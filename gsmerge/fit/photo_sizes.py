@@ -45,7 +45,7 @@ def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
     if scene.empty is None:
         return photos
     size = photos.width, photos.height
-    shares = [cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA) for mask in scene.empty]
+    shares = [cv2.resize((mask * 255).astype(np.uint8), size, interpolation=cv2.INTER_AREA) for mask in scene.empty]
     empty = np.stack(shares) / np.float32(255)
     weights = None if photos.weights is None else np.maximum(photos.weights, empty)
     return replace(photos, weights=weights, empty=empty)

@@ -158,7 +158,8 @@ class Schedule:
         if not self.queue:
             self.queue = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view, background, kept = self.queue.pop(), self.rng.random(3, dtype=np.float32), None
-        if self.run.job.num_judged is not None:  # renders are black where the scene is empty
+        job = self.run.job
+        if job.num_judged is not None and job.photos[0].empty is None:  # renders are black where the scene is empty
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             kept = self.rng.random(count, dtype=np.float32) >= self.run.dropout

@@ -20,6 +20,14 @@ COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.15  # per million Gaussians that it draws
 USUAL_DRAWN = 0.3  # Gaussians of the result per pixel of a view that lie in it, where the scene is not known
 
+# Where views are placed, per million Gaussians of the input:
+COST_READ = 3.0  # of reading and judging
+COST_PLACED = 0.15  # of drawing a view
+COST_PAIRS = 3.0  # of merging pairs, for each count that is tried
+PLACED_PIXELS = 512 * 512  # of a view, at most
+FITS = 2  # to placed views, for each count
+TRIED = 5  # counts, where the input's quality decides
+
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
 BYTES_PER_GAUSSIAN = 150
@@ -57,6 +65,17 @@ def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, thr
     """Estimate the wall time of a run on ``threads`` threads with imports; other arguments: :func:`work_seconds`."""
     work = work_seconds(pixels, pixels / max(num_views, 1), options, **facts)
     return IMPORT_SECONDS + work / max(1, min(threads, num_views))
+
+
+def placed_seconds(num_input: int, num_drawn: float, *, threads: int, fit_steps: int, views: int, tries: int) -> float:
+    """Estimate the wall time of merging pairs without views, with imports.
+
+    ``num_drawn``: Gaussians of the result; ``fit_steps``: 0 without a fit, which sees ``views``; ``tries``: counts.
+    """
+    step = COST_STEP * min(num_input, PLACED_PIXELS) + COST_DRAWN * num_drawn
+    whole = num_input * (COST_READ + COST_PLACED * views * (fit_steps > 0))
+    work = 1.0 + (whole + tries * (COST_PAIRS * num_input + FITS * fit_steps * step)) / 1e6
+    return IMPORT_SECONDS + work / (1.0 if threads == 1 else 1.3)  # little of it runs on several
 
 
 def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:

@@ -82,7 +82,8 @@ def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_p
 def test_settings_of_stages_that_are_left_out_are_named(bare: Path, tmp_path: Path, run: Any) -> None:
     words = ("--set", "fit_steps=50", "--set", "unseen=keep", "--levels", "3", "--set", "drop=floaters", "--k", "2")
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", *words)
-    assert noted(report["notes"], "not used", "fit_steps", "unseen")
+    assert noted(report["notes"], "not used", "unseen")
+    assert not noted(report["notes"], "not used", "fit_steps")
     assert not noted(report["notes"], "not used", "k")
     assert len(report["levels"]) == 2
     assert all(level["choices"]["fidelity"]["psnr"] > 5 for level in report["levels"])
@@ -111,3 +112,8 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
     report = report_of(run, "compact", tmp_path / "scene.ply", *images, *quick, "-o", tmp_path / "a.ply")
     assert not noted(report["notes"], "not used")
     assert report["psnr_input_views"]["after"] is not None
+
+
+def test_an_effort_that_is_too_short_for_a_fit_says_so(bare: Path, tmp_path: Path, run: Any) -> None:
+    report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--budget", "20%", "--effort", "fast")
+    assert noted(report["notes"], "nothing is fitted", "--effort best")

@@ -109,7 +109,7 @@ def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
     ],
 )  # fmt: skip
 def test_networks_are_loaded_where_they_help(settings: dict[str, Any], photos: bool, aligned: bool, name: str) -> None:
-    size = SceneSize(768, 1, 24, 32, aligned, "photos" if photos else "none")
+    size = SceneSize(768, 1, 24, 32, aligned, "photos" if photos else "renders")
     assert choose_networks(options_of(**settings), size) == name
 
 

@@ -1,15 +1,15 @@
 // Pairwise merging: the cheapest pair of a cell of neighbours becomes one Gaussian, again and again.
 #include "exp_log.h"
 
-enum { CELL = 64, COLUMNS = 14 };  // most Gaussians of a cell; numbers of each in the work space
-enum { X, Y, Z, COV, MASS = COV + 6, LOGDET, COLOR };  // the columns, of CELL numbers each
+enum { CELL = 64, COLUMNS = 15 };  // most Gaussians of a cell; numbers of each in the work space
+enum { X, Y, Z, COV, MASS = COV + 6, WEIGHT, LOGDET, COLOR };  // the columns, of CELL numbers each
 static const float LEAST = 1e-30f;  // of determinants and masses
 
 typedef struct {
   float (*columns)[CELL], *costs, *best_costs;
   int32_t *rows, *best, *stale;
   int32_t n;
-  float color_weight, exponent;
+  float color_weight;
 } cell;
 
 static inline float find_det(const float *a) {
@@ -24,7 +24,7 @@ static void measure(cell *s, int i) {
 }
 
 // What it costs to merge one Gaussian with each of the others: Runnalls' bound for the pair, per mass, and the
-// distance of the colours, times a power of the mass.
+// distance of the colours, times what both weigh.
 static void find_costs(cell *s, int i) {
   float own[COLUMNS], *costs = s->costs;
   for (int k = 0; k < COLUMNS; k++) own[k] = s->columns[k][i];
@@ -40,7 +40,7 @@ static void find_costs(cell *s, int i) {
     float r = c[COLOR][j] - own[COLOR], g = c[COLOR + 1][j] - own[COLOR + 1], b = c[COLOR + 2][j] - own[COLOR + 2];
     float lost = log4(maxf(find_det(both), LEAST)) - p * own[LOGDET] - q * c[LOGDET][j];
     float apart = r * r + g * g + b * b;
-    costs[j] = (0.5f * lost + s->color_weight * apart) * exp4(s->exponent * log4(mass));
+    costs[j] = (0.5f * lost + s->color_weight * apart) * (own[WEIGHT] + c[WEIGHT][j]);
   }
   costs[i] = __builtin_inff();
 }
@@ -76,6 +76,7 @@ static void join(cell *s, int i, int j) {
     c[COLOR + k][i] += q * (c[COLOR + k][j] - c[COLOR + k][i]);
   }
   c[MASS][i] = mass;
+  c[WEIGHT][i] += c[WEIGHT][j];
   measure(s, i);
   int last = --s->n;
   for (int k = 0; k < COLUMNS; k++) c[k][j] = c[k][last];
@@ -100,15 +101,13 @@ static void update_best(cell *s, int i, int j) {
   for (int e = 0; e < count; e++) find_best(s, s->stale[e]);
 }
 
-// Loads the Gaussians of a run of the order, in the unit of their own size, masses in that of their mean.
+// Loads the Gaussians of a run of the order, in the unit of their own size.
 static void load_cell(cell *s, const double *means, const float *covars, const float *masses,
-                      const float *colors, const int64_t *order, int n) {
-  float(*c)[CELL] = s->columns, mass = 0.f, size = 0.f;
-  for (int i = 0; i < n; i++) {
-    mass += masses[order[i]];
+                      const float *weights, const float *colors, const int64_t *order, int n) {
+  float(*c)[CELL] = s->columns, size = 0.f;
+  for (int i = 0; i < n; i++)
     for (int k = 0; k < 6; k += k == 0 ? 3 : 2) size += covars[6 * order[i] + k];
-  }
-  mass = maxf(mass / (float)n, LEAST), size = maxf(size / (float)n, LEAST);
+  size = maxf(size / (float)n, LEAST);
   float unit = 1.f / sqrtf4(size);
   s->n = n;
   for (int i = 0; i < CELL; i++) {
@@ -119,26 +118,27 @@ static void load_cell(cell *s, const double *means, const float *covars, const f
       c[COLOR + k][i] = colors[3 * row + k];
     }
     for (int k = 0; k < 6; k++) c[COV + k][i] = covars[6 * row + k] / size;
-    c[MASS][i] = maxf(masses[row] / mass, LEAST);
+    c[MASS][i] = maxf(masses[row], LEAST);
+    c[WEIGHT][i] = weights[row];
     measure(s, i);
   }
   for (int i = 0; i < n; i++) find_best(s, i);
 }
 
 API int32_t agglomerate(const double *restrict means, const float *restrict covars,
-                        const float *restrict masses, const float *restrict colors,
+                        const float *restrict masses, const float *restrict weights, const float *restrict colors,
                         const int64_t *restrict order, const int64_t *restrict starts,
-                        double color_weight, double exponent, double least_share, int64_t first,
+                        double color_weight, double least_share, int64_t first,
                         int64_t last, float *restrict work, int32_t *restrict spare,
                         int32_t *restrict pairs, float *restrict costs, int64_t n, int64_t ends) {
   cell s = {(float(*)[CELL])work, work + COLUMNS * CELL, work + (COLUMNS + 1) * CELL, spare,
-            spare + CELL, spare + 2 * CELL, 0, (float)color_weight, (float)exponent};
+            spare + CELL, spare + 2 * CELL, 0, (float)color_weight};
   if (first < 0 || first > last || last >= ends || starts[last] > n) return OUTSIDE;
   for (int64_t number = first; number < last; number++) {
     int64_t low = starts[number], count = starts[number + 1] - low, at = low;
     if (count > CELL) return OUTSIDE;
     if (count < 2) continue;
-    load_cell(&s, means, covars, masses, colors, order + low, (int)count);
+    load_cell(&s, means, covars, masses, weights, colors, order + low, (int)count);
     double left = least_share * (double)count;
     int least = left > 1.0 ? (int)mind(left, CELL) : 1;
     for (float most = 0.f; s.n > least; at++) {
@@ -157,7 +157,7 @@ API int32_t agglomerate(const double *restrict means, const float *restrict cova
 }
 
 API int32_t merge_pairs(const int32_t *restrict pairs, double *restrict means,
-                        float *restrict covars, float *restrict masses, float *restrict sh,
+                        float *restrict covars, float *restrict masses, float *restrict weights, float *restrict sh,
                         int32_t *restrict sizes, int64_t m, int64_t n, int64_t columns) {
   if (any_outside(pairs, 2 * m, n)) return OUTSIDE;
   for (int64_t e = 0; e < m; e++) {
@@ -175,12 +175,13 @@ API int32_t merge_pairs(const int32_t *restrict pairs, double *restrict means,
       }
     for (int64_t k = 0; k < columns; k++) sh[columns * i + k] += q * (sh[columns * j + k] - sh[columns * i + k]);
     masses[i] = mass;
+    weights[i] += weights[j];
     sizes[i] += sizes[j];
   }
   return 0;
 }
 
-// Covariances, and masses: opacity times the two largest scales.
+// Covariances, and masses: opacity times the root of the sum of the squared products of two scales.
 API void gaussian_moments(const float *restrict quats, const float *restrict scales,
                           const float *restrict opacities, double flatness, float *restrict covars,
                           float *restrict masses, int64_t n) {
@@ -193,11 +194,9 @@ API void gaussian_moments(const float *restrict quats, const float *restrict sca
       {f * (x * z - w * y), f * (y * z + w * x), 1.0 - f * (x * x + y * y)},
     };
     double s[3] = {scales[3 * i], scales[3 * i + 1], scales[3 * i + 2]};
-    double largest = maxd(maxd(s[0], s[1]), s[2]);
-    double middle = maxd(mind(s[0], s[1]), mind(maxd(s[0], s[1]), s[2]));
-    masses[i] = (float)(opacities[i] * (largest * middle));
-    double least = maxd(flatness * largest, 1e-12);
+    double least = maxd(flatness * maxd(maxd(s[0], s[1]), s[2]), 1e-12);
     for (int k = 0; k < 3; k++) s[k] = maxd(s[k], least) * maxd(s[k], least);
+    masses[i] = (float)(opacities[i] * sqrtf8(s[0] * s[1] + s[1] * s[2] + s[2] * s[0]));
     for (int a = 0, k = 0; a < 3; a++)
       for (int b = a; b < 3; b++, k++)
         covars[6 * i + k] = (float)(r[a][0] * r[b][0] * s[0] + r[a][1] * r[b][1] * s[1] + r[a][2] * r[b][2] * s[2]);

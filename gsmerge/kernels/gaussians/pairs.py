@@ -7,7 +7,7 @@ import numpy as np
 from gsmerge.kernels.signature import STATUS, declare, f4, f8, i4, i8, native
 
 CELL = 64  # Gaussians, at most
-WORK = 16  # rows of the work space
+WORK = 17  # rows of the work space
 
 
 @native(
@@ -15,7 +15,9 @@ WORK = 16  # rows of the work space
     masses=f4("n", out=True),
 )  # fmt: skip
 def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
-    """Write covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and masses ``[n]``: opacity times the two largest scales.
+    """Write covariances ``[n,6]`` (xx, xy, xz, yy, yz, zz) and masses ``[n]``.
+
+    A mass is the opacity times the root of (ab)^2 + (bc)^2 + (ca)^2 of the scales: the area that is seen from any side.
 
     Args:
         quats: ``[n,4]`` wxyz of any length.
@@ -28,29 +30,28 @@ def gaussian_moments(quats, scales, opacities, flatness, covars, masses):
 
 # work and spare are work space for a cell
 _agglomerate = declare(
-    "agglomerate", STATUS, means=f8("n", 3), covars=f4("n", 6), masses=f4("n"), colors=f4("n", 3),
-    order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(), exponent=f8(),
+    "agglomerate", STATUS, means=f8("n", 3), covars=f4("n", 6), masses=f4("n"), weights=f4("n"), colors=f4("n", 3),
+    order=i8("n", least=0, below="n"), starts=i8("ends", least=0, ascending=True), color_weight=f8(),
     least_share=f8(), first=i8(), last=i8(), work=f4(WORK, CELL, out=True), spare=i4(3, CELL, out=True),
     pairs=i4("n", 2, out=True), costs=f4("n", out=True),
 )  # fmt: skip
 
 
 def agglomerate(
-    means, covars, masses, colors, order, starts, color_weight, exponent, least_share, first, last, pairs, costs
+    means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, pairs, costs
 ):
     """Write the merges in cells ``first`` to ``last``: in each cell the cheapest remaining pair, again and again.
 
     The cost of a pair is Runnalls' bound (2007) on the divergence of its merging, per mass, plus the squared distance
-    of colours, times a power of its mass. Sizes and masses are in units of the means of the cell, so costs of different
-    cells can be compared. The cost of a merge is at least that of the merges before it in its cell, so the merges up to
-    any cost are the first ones of every cell.
+    of colours, times what both weigh. The cost of a merge is at least that of the merges before it in its cell, so the
+    merges up to any cost are the first ones of every cell.
 
     Args:
         covars: ``[n,6]`` float32, upper triangles.
+        weights: ``[n]`` float32, by which costs of different cells are compared; they add up.
         order: ``[n]`` int64 rows, cell by cell.
         starts: ``[c+1]`` int64 into the order, at most ``CELL`` apart.
         color_weight: Of squared distances of colours against nats.
-        exponent: Power of the mass.
         least_share: Share of a cell's Gaussians that is left in the end; one, at least.
         first: First cell.
         last: The cell after the last one.
@@ -59,18 +60,18 @@ def agglomerate(
     """
     work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
     _agglomerate(
-        means, covars, masses, colors, order, starts, color_weight, exponent, least_share, first, last, work, spare,
+        means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, work, spare,
         pairs, costs,
     )  # fmt: skip
 
 
 @native(
     STATUS, pairs=i4("m", 2), means=f8("n", 3, out=True), covars=f4("n", 6, out=True), masses=f4("n", out=True),
-    sh=f4("n", "columns", out=True), sizes=i4("n", out=True),
+    weights=f4("n", out=True), sh=f4("n", "columns", out=True), sizes=i4("n", out=True),
 )  # fmt: skip
-def merge_pairs(pairs, means, covars, masses, sh, sizes):
+def merge_pairs(pairs, means, covars, masses, weights, sh, sizes):
     """Replace the first row of each pair by the Gaussian with the moments of both, one pair after the other.
 
-    Masses add up, and so do ``sizes``, the numbers of merged Gaussians; harmonics are means by mass. The second rows
-    stay unchanged.
+    Masses and weights add up, and so do ``sizes``, the numbers of merged Gaussians; harmonics are means by mass. The
+    second rows stay unchanged.
     """

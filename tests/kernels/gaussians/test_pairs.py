@@ -12,7 +12,7 @@ from gsmerge.geometry import covariances
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
 
 UPPER = np.triu_indices(3)
-WEIGHT, POWER = 2.0, 0.6
+WEIGHT = 2.0
 
 
 def cloud_of(count: int, seed: int = 0) -> dict[str, np.ndarray]:
@@ -20,24 +20,31 @@ def cloud_of(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
     gaussian_moments(g.quats, g.scales, g.opacities, 0.1, covars, masses)
     colors = np.ascontiguousarray(g.sh0[:, 0])
-    return {"means": g.means.astype(np.float64), "covars": covars, "masses": masses, "colors": colors}
+    weights = np.random.default_rng(seed).uniform(0.1, 1, count).astype(np.float32)
+    return {
+        "means": g.means.astype(np.float64),
+        "covars": covars,
+        "masses": masses,
+        "weights": weights,
+        "colors": colors,
+    }
 
 
 def merge_two(first: tuple, second: tuple) -> tuple:
-    """Mean, covariance, mass and colour of two."""
+    """Mean, covariance, mass, colour and weight of two."""
     share = second[2] / (first[2] + second[2])
     apart = second[0] - first[0]
     covar = (1 - share) * first[1] + share * second[1] + share * (1 - share) * np.outer(apart, apart)
     color = first[3] + share * (second[3] - first[3])
-    return first[0] + share * apart, covar, first[2] + second[2], color
+    return first[0] + share * apart, covar, first[2] + second[2], color, first[4] + second[4]
 
 
 def cost_of(first: tuple, second: tuple) -> float:
-    """Runnalls' bound per mass, and the distance of the colours, times a power of the mass."""
+    """Runnalls' bound per mass, and the distance of the colours, times both weights."""
     both = merge_two(first, second)
     logs = [np.linalg.slogdet(one[1])[1] for one in (both, first, second)]
     lost = 0.5 * (logs[0] - (first[2] * logs[1] + second[2] * logs[2]) / both[2])
-    return (lost + WEIGHT * ((first[3] - second[3]) ** 2).sum()) * both[2] ** POWER
+    return (lost + WEIGHT * ((first[3] - second[3]) ** 2).sum()) * both[4]
 
 
 def agglomerate_slowly(cloud: dict[str, np.ndarray], rows: np.ndarray, least: int) -> tuple[list, list[float]]:
@@ -45,9 +52,10 @@ def agglomerate_slowly(cloud: dict[str, np.ndarray], rows: np.ndarray, least: in
     means, masses = cloud["means"][rows], cloud["masses"][rows].astype(float)
     covars = np.zeros((len(rows), 3, 3))
     covars[:, UPPER[0], UPPER[1]] = covars[:, UPPER[1], UPPER[0]] = cloud["covars"][rows]
-    size, mass = np.trace(covars, axis1=1, axis2=2).mean(), masses.mean()
+    size = np.trace(covars, axis1=1, axis2=2).mean()
+    colors, weights = cloud["colors"].astype(float), cloud["weights"].astype(float)
     left = {
-        int(row): (means[i] / np.sqrt(size), covars[i] / size, masses[i] / mass, cloud["colors"][row].astype(float))
+        int(row): (means[i] / np.sqrt(size), covars[i] / size, masses[i], colors[row], weights[row])
         for i, row in enumerate(rows)
     }
     members = {int(row): {int(row)} for row in rows}
@@ -65,7 +73,7 @@ def agglomerate_slowly(cloud: dict[str, np.ndarray], rows: np.ndarray, least: in
 def run(cloud: dict[str, np.ndarray], order: np.ndarray, starts: np.ndarray, least_share: float) -> tuple:
     count = len(order)
     pairs, costs = np.full((count, 2), -1, np.int32), np.full(count, np.inf, np.float32)
-    agglomerate(*cloud.values(), order, starts, WEIGHT, POWER, least_share, 0, len(starts) - 1, pairs, costs)
+    agglomerate(*cloud.values(), order, starts, WEIGHT, least_share, 0, len(starts) - 1, pairs, costs)
     return pairs, costs
 
 
@@ -92,15 +100,16 @@ def test_moments_are_those_of_the_formula() -> None:
     scales = np.maximum(g.scales, 0.2 * g.scales.max(1, keepdims=True)).astype(np.float64)
     full = covariances(g.quats.astype(np.float64), scales)
     np.testing.assert_allclose(covars, full[:, UPPER[0], UPPER[1]], rtol=1e-4, atol=1e-7 * full.max())
-    np.testing.assert_allclose(masses, g.opacities * np.sort(g.scales, 1)[:, 1:].prod(1), rtol=1e-5)
+    areas = np.sqrt(((scales * scales[:, [1, 2, 0]]) ** 2).sum(1))
+    np.testing.assert_allclose(masses, g.opacities * areas, rtol=1e-5)
 
 
 def test_merged_rows_have_the_moments_of_all() -> None:
     cloud = cloud_of(6, 3)
-    means, covars, masses = (cloud[name].copy() for name in ("means", "covars", "masses"))
+    means, covars, masses, added = (cloud[name].copy() for name in ("means", "covars", "masses", "weights"))
     sh, sizes = np.random.default_rng(0).normal(size=(6, 12)).astype(np.float32), np.ones(6, np.int32)
     before = sh.copy()
-    merge_pairs(np.array([[1, 4], [1, 2], [0, 5]], np.int32), means, covars, masses, sh, sizes)
+    merge_pairs(np.array([[1, 4], [1, 2], [0, 5]], np.int32), means, covars, masses, added, sh, sizes)
     assert sizes[[0, 1, 3]].tolist() == [2, 3, 1]
     for row, members in ((0, [0, 5]), (1, [1, 4, 2])):
         weights = cloud["masses"][members].astype(float)
@@ -109,6 +118,7 @@ def test_merged_rows_have_the_moments_of_all() -> None:
         spread = np.average(apart[:, UPPER[0]] * apart[:, UPPER[1]], axis=0, weights=weights)
         np.testing.assert_allclose(means[row], mean, atol=1e-6)
         np.testing.assert_allclose(masses[row], weights.sum(), rtol=1e-5)
+        np.testing.assert_allclose(added[row], cloud["weights"][members].sum(), rtol=1e-5)
         covar = np.average(cloud["covars"][members], axis=0, weights=weights) + spread
         np.testing.assert_allclose(covars[row], covar, rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(sh[row], np.average(before[members], axis=0, weights=weights), atol=1e-5)
@@ -124,10 +134,11 @@ def test_what_points_outside_is_refused() -> None:
     pairs, costs = np.zeros((CELL + 1, 2), np.int32), np.zeros(CELL + 1, np.float32)
     for first, last in ((0, -1), (0, -(2**62)), (1, 0), (0, 2)):
         with refuses(ValueError, "agglomerate", "indices"):
-            agglomerate(*cloud.values(), order, np.array([0, CELL]), WEIGHT, POWER, 0.5, first, last, pairs, costs)
+            agglomerate(*cloud.values(), order, np.array([0, CELL]), WEIGHT, 0.5, first, last, pairs, costs)
     sizes, sh = np.ones(CELL + 1, np.int32), np.zeros((CELL + 1, 3), np.float32)
     with refuses(ValueError, "merge_pairs", "indices"):
-        merge_pairs(np.array([[0, -1]], np.int32), cloud["means"], cloud["covars"], cloud["masses"], sh, sizes)
+        moments = (cloud[name] for name in ("means", "covars", "masses", "weights"))
+        merge_pairs(np.array([[0, -1]], np.int32), *moments, sh, sizes)
 
 
 def test_numbers_that_are_none_end_a_cell() -> None:

@@ -21,7 +21,7 @@ def seconds(
     views: int = 12, *, photos: bool = True, fit_steps: int = 240, num_drawn: float | None = None, **settings: Any
 ) -> float:
     options = CompactOptions().with_settings(settings)
-    size = SceneSize(views * VIEW, views, 320, 480, True, "photos" if photos else "none")
+    size = SceneSize(views * VIEW, views, 320, 480, True, "photos" if photos else "renders")
     plain = choose_for_scene(size, options).settings(options)
     return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps, num_drawn=num_drawn)
 

@@ -73,6 +73,18 @@ def test_scales_grow_where_opacity_cannot(opacity: float, wider: float) -> None:
     np.testing.assert_allclose(merged.opacities, min(2 * opacity, MAX_OPACITY), rtol=1e-4)
 
 
+@pytest.mark.parametrize(("power", "kept"), [(1.0, [0, 1]), (0.3, [2, 3])])
+def test_powers_of_masses_decide_between_large_and_small(power: float, kept: list[int]) -> None:
+    """The pair of the smaller ones fits ten times worse, and has a 64th of the area."""
+    sizes, places = np.array([8, 8, 1, 1], np.float32), np.array([0, 4, 1000, 1001.8], np.float32)
+    means, scales = np.zeros((4, 3), np.float32), np.repeat(sizes[:, None], 3, 1)
+    means[:, 0] = places
+    pairs = replace(random_gaussians(4, 0), means=means, scales=scales, opacities=np.full(4, 0.5, np.float32))
+    pairs = replace(pairs, sh0=np.zeros_like(pairs.sh0))
+    merged = merge_neighbors(pairs, 3, power)
+    assert np.isin(places[kept], merged.means[:, 0]).all()
+
+
 def test_a_fifth_looks_nearly_as_all(room: Scene) -> None:
     fifth = len(room.gaussians) // 5
     merged = merge_neighbors(room.gaussians, fifth)
