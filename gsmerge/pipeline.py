@@ -14,7 +14,7 @@ from gsmerge.facts.row_colors import RENDERS
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import Photos, scene_photos, score_photos
-from gsmerge.runtime.record import choose, note
+from gsmerge.runtime.record import choose, note, stage
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
@@ -70,6 +70,7 @@ def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
     return replace(fitted, gaussians=fitted.gaussians if accepted else ways[best], cameras=prepared.scene.cameras)
 
 
+@stage("fit")
 def fit_placed(prepared: Prepared, plan: Plan, ways: list[Gaussians], best: int) -> Fitted:
     """Fit each of several ``ways`` to placed views, and return what then shows best what no fit has seen.
 

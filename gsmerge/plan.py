@@ -52,7 +52,7 @@ KEPT_LOSS = 0.3  # dB that they may show the photos worse than the input where t
 PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
 PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
-NO_FIT = f"nothing is fitted to placed views: that needs --budget or --effort best, and more than {SHORT_STEPS} steps"
+NO_FIT = "nothing is fitted to placed views: that takes --effort best, or the default effort with a --budget"
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 

@@ -55,7 +55,7 @@ def record_fit(report: FitReport | None) -> None:
     choose(fit=report.to_dict())
     if report.fog is not None and report.fog > HAZE:
         seen = f"seen from outside, the result shows haze where the scene is empty: fog {report.fog:.2f}"
-        note(f"{seen}; --fit none makes none" if report.accepted else seen)
+        note(f"{seen}; --fit none makes less, and is farther from the photos" if report.accepted else seen)
     if not report.accepted:
         note("the fit was not accepted: held-out patches of the photos did not get better")
 

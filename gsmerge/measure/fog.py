@@ -98,13 +98,11 @@ def describe_fog(name: str, fog: Fog) -> str | None:
     """Describe haze and veils of a result seen from outside; None if far fog is at most 0.05, the worst veil 0.08."""
     seen = []
     if (fog.fog_far or 0) > HAZE:
-        seen.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f})")
+        seen.append(f"haze where the input shows nothing (far fog {fog.fog_far:.2f}; compact --fit none makes less)")
     if (fog.veil_worst or 0) > VEILED:
-        seen.append(f"a veil before up to {100 * (fog.veil_worst or 0):.0f} % of what the input shows")
-    if not seen:
-        return None
-    remedy = "if it comes from a fit to photos, compact --fit none makes none"
-    return f"{name}: seen from outside, the result shows {' and '.join(seen)}; {remedy}"
+        share = 100 * (fog.veil_worst or 0)
+        seen.append(f"a veil before up to {share:.0f} % of what the input shows, as of wrong depth")
+    return f"{name}: seen from outside, the result shows {' and '.join(seen)}" if seen else None
 
 
 def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, Cameras, float]]:
