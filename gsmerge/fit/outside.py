@@ -30,7 +30,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 LOW, HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # Steps of three numbers, modulo one, that fill a cube evenly however many there are (the R sequence of Roberts 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
-PLACES = 48  # views outside, at most, or as many as there are photos
+PLACES = 42  # views outside, at most, or as many as there are photos
 SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
 ROWS = 4000  # Gaussians of the input for each photo that stand for all, made as much larger as they are fewer
 NEAREST = 0.25  # of the depth of what a view sees: nearer to a camera nothing is looked at

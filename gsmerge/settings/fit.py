@@ -49,7 +49,7 @@ class Tuning:
     # The same of the mean size, in units of each Gaussian's own at its start: fewer of them
     # overlap, and a step takes a third less time
     scale_reg: float = 0.01
-    outside_every: int = 6  # Steps from one look from outside to the next, see gsmerge.fit.outside
+    outside_every: int = 7  # Steps from one look from outside to the next, see gsmerge.fit.outside
     outside_from: float = 0.15  # Share of the steps that come before them; what hangs in gaps early on helps the rest
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
     prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
