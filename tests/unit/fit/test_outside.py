@@ -29,10 +29,11 @@ from gsmerge.geometry import camera_centres
 from gsmerge.raster import composite, prepare, tile_view
 from gsmerge.raster.photos import Photos, render_photos
 from gsmerge.runtime.record import record_run
+from gsmerge.settings.fit import Tuning
 
 Pair = tuple[Photos, Photos]
 OPTIONS = FitOptions(fit_steps=60, holdout=0.2)
-LONG = FitOptions(fit_steps=240, holdout=0.2)
+LONG = FitOptions(fit_steps=160, holdout=0.2, tuning=Tuning(outside_every=4))
 
 
 @pytest.fixture(scope="module")
