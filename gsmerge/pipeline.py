@@ -55,12 +55,12 @@ def build_from_pairs(prepared: Prepared, plan: Plan, count: int) -> Fitted:
     ways = [merge_neighbors(prepared.scene.gaussians, count, power) for power in POWERS]
     scores = [score_photos(way, photos, views, quarter=True).psnr for way in ways]
     best = int(np.argmax(scores))
-    start = Fitted(ways[best], prepared.scene.cameras, None)
+    unfitted = Fitted(ways[best], prepared.scene.cameras, None)
     if plan.fit.fit == "none":
-        return start
+        return unfitted
     if scores[best] >= max(NEAR_INPUT, plan.target_psnr or 0.0):  # a fit is not worth its time
         note("nothing is fitted: merged Gaussians look as the input")
-        return start
+        return unfitted
     if prepared.reference.placed:
         return fit_placed(prepared, plan, ways, best)
     scene = prepared.scene_around if plan.fit.grows else prepared.scene

@@ -131,7 +131,7 @@ class Job:
     @property
     def memory(self) -> int:
         """Estimated memory of the call in bytes, within a factor of about two."""
-        return memory_bytes(self.num_gaussians, photos=True, num_rest=self.num_rest)
+        return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:
         """Find the files of the scene; SceneError if there are none."""

@@ -225,7 +225,7 @@ def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool)
 
     count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
-    needed = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=count - at_once)
+    needed = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=count - at_once)
     problem = memory_problem(needed)
     if problem is not None:
         say(f"gsmerge: warning: {problem}", quiet=quiet)

@@ -87,7 +87,7 @@ def compact_in_blocks(
         factors = count_factors(blocks, covisibility).tolist()
         frame, options = scene_frame(scene), with_choices(options, choices)
     size = gaussians_at_once(scene.num_gaussians, count)
-    memory = memory_bytes(size, photos=True, num_rest=3 * scene.gaussians.shN.shape[1])
+    memory = memory_bytes(size, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
     with start_work(engine.engine, engine.address, threads=options.threads, memory=memory) as work:
         seen = work.share(covisibility)

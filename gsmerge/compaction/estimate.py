@@ -13,7 +13,7 @@ from gsmerge.compaction.files import Outputs, check_colmap, sized
 from gsmerge.compaction.methods import check_method
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.partition import gaussians_at_once
-from gsmerge.facts.place_cameras import placed_views
+from gsmerge.facts.place_cameras import count_placed, placed_views
 from gsmerge.facts.prepare import canonicalise, missing_notes
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io.formats.ply import file_bytes
@@ -67,7 +67,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     if stands_alone(scene, options):
         seconds = placed_seconds(
             scene.num_gaussians, count, threads=threads, fit_steps=steps * (choices.fit.fit != "none"),
-            views=7 * placed_views(steps) // 2, tries=TRIED if choices.keeps_input else 1,
+            views=count_placed(placed_views(steps)), tries=TRIED if choices.keeps_input else 1,
         )  # fmt: skip
     else:
         inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))
@@ -75,7 +75,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
             at_once * choices.blocks, len(scene), settings, threads=threads, photos=True, fit_steps=steps,
             num_drawn=drawn * inside,
         )  # fmt: skip
-    memory = memory_bytes(at_once, photos=True, num_rest=num_rest, num_elsewhere=pixels - at_once)
+    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
         "num_gaussians": count,

@@ -24,7 +24,7 @@ from gsmerge.geometry import nearest_views, project, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import Splats, TiledView, prepare, tile_view
-from gsmerge.raster.composite import blend, view_colors
+from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.images import tile_views
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.record import note
@@ -77,7 +77,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
 
     def fill(view: int, tiled: TiledView) -> None:
-        depths, left = _blend_depths(tiled)
+        depths, left = blend_depths(tiled)
         covered = left <= 1 - EMPTY
         if not everywhere:
             sparse = blur(left, gap / 4) > 1 - SPARSE  # single Gaussians at the edges of what was cut out
@@ -144,12 +144,6 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
         black = np.zeros((*empty.shape[1:], 3), np.float32)
         large = change_large(large, [PhotoChange(cover=mask, colors=black) for mask in empty])
     return replace(scene, images=images, masks=masks, large_photos=large, empty=empty)
-
-
-def _blend_depths(tiled: TiledView) -> tuple[np.ndarray, np.ndarray]:
-    """Blend the mean depth ``[h,w]`` of what a view sees, camera z, and the transmittance ``[h,w]``."""
-    blended, left = blend(tiled, np.repeat(tiled.depths[:, None], 3, 1), np.zeros(3, np.float32))
-    return blended[..., 0] / np.maximum(1 - left, 1e-6), left
 
 
 def _fill_view(
@@ -286,7 +280,7 @@ def _see(gaussians: Gaussians, cameras: Cameras) -> Seen:
     splats = prepare(gaussians)
 
     def see(view: int) -> tuple[np.ndarray, np.ndarray]:
-        depths, left = _blend_depths(_tile(splats, cameras, view))
+        depths, left = blend_depths(_tile(splats, cameras, view))
         return cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8)), left > CLEAR
 
     shape = len(cameras), cameras.height, cameras.width
@@ -304,7 +298,7 @@ def _continue_surfaces(
     Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
     """
     tiled = _tile(prepare(gaussians), camera, 0)
-    depths, left = _blend_depths(tiled)
+    depths, left = blend_depths(tiled)
     solid, clear = left < SOLID, left > CLEAR
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))

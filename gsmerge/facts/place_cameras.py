@@ -84,6 +84,11 @@ def placed_views(steps: int) -> int:
     return FITTED_LONG if steps >= LONG else FITTED
 
 
+def count_placed(count: int) -> int:
+    """Return how many views :func:`draw_placed` adds."""
+    return 3 * count + count // 2
+
+
 def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """Add renders of a canonical scene: ``count`` each from afar, near by and where most shows, half of it on a walk.
 

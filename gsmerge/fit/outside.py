@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.geometry import middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, prepare, tile_view
-from gsmerge.raster.composite import blend
+from gsmerge.raster.composite import blend, blend_depths, depth_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import TiledView
@@ -86,7 +86,8 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
 
     def look(view: int) -> np.ndarray:
-        opacities, depths = _see(_tile(drawn, views, view, near[view]))
+        depths, left = blend_depths(_tile(drawn, views, view, near[view]))
+        opacities = 1 - left
         return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
 
     limits = np.stack(list(in_turn(look, range(len(views)))))
@@ -131,18 +132,6 @@ def _tile(splats: Splats, views: Photos, view: int, near: float, tiles: np.ndarr
     return tile_view(splats, **views.camera(view), near=near, tiles=tiles)
 
 
-def _blend_depths(tiled: TiledView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blend depths as if they were colours; return these ``[m,3]``, their picture ``[h,w,3]``, and what is left."""
-    depths = np.repeat(tiled.depths[:, None], 3, 1)
-    return depths, *blend(tiled, depths, np.zeros(3, np.float32))
-
-
-def _see(tiled: TiledView) -> tuple[np.ndarray, np.ndarray]:
-    """Return the opacities and mean depths ``[h,w]`` that a view sees."""
-    _, image, left = _blend_depths(tiled)
-    return 1 - left, image[..., 0] / np.maximum(1 - left, 1e-6)
-
-
 def _tiles_of(weights: np.ndarray) -> np.ndarray:
     """Return a mask ``[lines,columns]`` of the tiles with weighted pixels, since other tiles need not be drawn."""
     height, width = weights.shape
@@ -159,7 +148,8 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
     tiled = _tile(splats, views, view, outside.near[view], _tiles_of(views.weights[view]))
-    depths, image, left = _blend_depths(tiled)
+    depths = depth_colors(tiled)
+    image, left = blend(tiled, depths, np.zeros(3, np.float32))
     inverse = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
     hidden = 1 - left - image[..., 0] * inverse
     weights = np.where((hidden > MARGIN) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
@@ -175,7 +165,7 @@ def score_fog(splats: Splats, outside: Outside) -> float | None:
     fog, count = 0.0, 0
     for view in range(0, len(outside.views), -(-len(outside.views) // SCORED)):
         empty = np.isinf(outside.limits[view])
-        opacities, _ = _see(_tile(splats, outside.views, view, outside.near[view], _tiles_of(empty)))
-        fog += float(opacities[empty].sum(dtype=np.float64))
+        _, left = blend_depths(_tile(splats, outside.views, view, outside.near[view], _tiles_of(empty)))
+        fog += float((1 - left[empty]).sum(dtype=np.float64))
         count += int(empty.sum())
     return fog / count if count else None

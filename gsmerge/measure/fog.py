@@ -18,7 +18,7 @@ from gsmerge.fit.report import HAZE
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, prepare, tile_view
-from gsmerge.raster.composite import blend
+from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
@@ -32,7 +32,6 @@ MARGIN = 17  # pixels per side of the square that erodes what is empty
 FAR = 0.1  # of the width: distance from what the input shows from which fog is far
 VEIL = 0.7  # of the input's depth: what a result shows nearer than that is a veil
 VEILED = 0.08  # worst veil above which a result gets a note
-TINY = 1e-6  # least opacity that depths are divided by
 NEAREST = 0.25  # of the median depth of the view: what is nearer to a camera is drawn in neither picture of depth
 
 
@@ -119,15 +118,12 @@ def outside_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[st
 
 def look(splats: Splats, camera: Cameras, near: float, nearest: float) -> Sight:
     """Draw opacities beyond ``near``, and depths beyond ``nearest``, world units, of a scene in one camera."""
-    (opacities, _), (beyond, depths) = (_blend_depths(splats, camera, plane) for plane in (near, nearest))
-    return Sight(opacities, beyond, depths)
-
-
-def _blend_depths(splats: Splats, camera: Cameras, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Draw opacities and mean depths ``[h,w]`` beyond ``near``, world units."""
-    tiled = tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=near)
-    image, left = blend(tiled, np.repeat(tiled.depths[:, None], 3, 1), np.zeros(3, np.float32))
-    return 1 - left, image[..., 0] / np.maximum(1 - left, np.float32(TINY))
+    views = [
+        tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
+        for plane in (near, nearest)
+    ]
+    (_, left), (depths, left_beyond) = map(blend_depths, views)
+    return Sight(1 - left, 1 - left_beyond, depths)
 
 
 def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:

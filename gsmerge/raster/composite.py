@@ -16,6 +16,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
 from gsmerge.types import Cameras, Gaussians, as_array
 
+TINY = 1e-6  # least opacity that depths are divided by
 SHOWN = 4  # views of a rendering that a notebook shows
 
 
@@ -51,9 +52,20 @@ def blend(tiled: TiledView, colors: Array, background: Array) -> tuple[Array, Ar
     return image, transmittance
 
 
+def depth_colors(tiled: TiledView) -> Array:
+    """Return the depths of the Gaussians of a view as colours ``[m,3]``."""
+    return np.repeat(tiled.depths[:, None], 3, 1)
+
+
+def blend_depths(tiled: TiledView) -> tuple[Array, Array]:
+    """Blend the mean depth ``[h,w]``, camera z, of what a view sees, and the transmittance ``[h,w]``."""
+    blended, left = blend(tiled, depth_colors(tiled), np.zeros(3, np.float32))
+    return blended[..., 0] / np.maximum(1 - left, np.float32(TINY)), left
+
+
 def mean_depths(tiled: TiledView, alphas: Array) -> Array:
     """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are 0."""
-    weighted = blend(tiled, np.repeat(tiled.depths[:, None], 3, 1), np.zeros(3, np.float32))[0][..., 0]
+    weighted = blend(tiled, depth_colors(tiled), np.zeros(3, np.float32))[0][..., 0]
     return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > 0)
 
 

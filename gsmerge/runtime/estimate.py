@@ -84,13 +84,13 @@ def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
     return fits.get(options["method"], "none") if photos else "none"
 
 
-def memory_bytes(pixels: int, *, photos: bool, num_rest: int = 0, num_elsewhere: int = 0) -> int:
+def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> int:
     """Estimate the memory of a run in bytes, imports included.
 
     ``num_rest``: columns of higher harmonics; ``num_elsewhere``: Gaussians of a scene outside the block of ``pixels``
     in work.
     """
-    each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL * photos
+    each = BYTES_PER_GAUSSIAN + BYTES_PER_VALUE * num_rest + BYTES_PER_PIXEL
     return BYTES_FIXED + round(each * pixels + BYTES_ELSEWHERE * num_elsewhere)
 
 

@@ -47,7 +47,7 @@ def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     large, small = 10_000_000, 10_000
-    scenes, need = jobs(small, large, small, large, small), memory_bytes(large, photos=True)
+    scenes, need = jobs(small, large, small, large, small), memory_bytes(large)
 
     def count(share: float | None, **message: Any) -> int:
         machine(monkeypatch, 4, None if share is None else int(share * need / workload.FREE_MEMORY_SHARE) + 1)

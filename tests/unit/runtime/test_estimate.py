@@ -46,17 +46,17 @@ def test_threads_share_the_views() -> None:
 
 
 def test_higher_harmonics_are_counted_once() -> None:
-    plain, degree4 = (memory_bytes(10**7, photos=True, num_rest=num) for num in (0, 72))
+    plain, degree4 = (memory_bytes(10**7, num_rest=num) for num in (0, 72))
     assert 4 * 72 * 10**7 <= degree4 - plain <= 5 * 72 * 10**7
 
 
 def test_a_block_takes_less_memory_than_the_whole() -> None:
-    block = memory_bytes(10**6, photos=True, num_elsewhere=10**7)
-    assert memory_bytes(10**6, photos=True) < block < memory_bytes(10**7, photos=True)
+    block = memory_bytes(10**6, num_elsewhere=10**7)
+    assert memory_bytes(10**6) < block < memory_bytes(10**7)
 
 
 def test_the_papers_online_setting_fits_into_24_gb() -> None:
-    assert max(memory_bytes(84 * VIEW, photos=True, num_rest=num_rest) for num_rest in (0, 9, 24, 45, 72)) < 24 * 10**9
+    assert max(memory_bytes(84 * VIEW, num_rest=num_rest) for num_rest in (0, 9, 24, 45, 72)) < 24 * 10**9
 
 
 def test_what_does_not_fit_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
