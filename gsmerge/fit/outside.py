@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.geometry import middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, prepare, tile_view
-from gsmerge.raster.composite import blend, blend_depths, depth_colors
+from gsmerge.raster.composite import FARTHEST, blend, blend_depths, depth_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import TiledView
@@ -86,7 +86,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
 
     def look(view: int) -> np.ndarray:
-        depths, left = blend_depths(_tile(drawn, views, view, near[view]))
+        depths, left = blend_depths(_tile(drawn, views, view, near[view]), FARTHEST * near[view])
         opacities = 1 - left
         return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
 
@@ -148,7 +148,7 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
     tiled = _tile(splats, views, view, outside.near[view], _tiles_of(views.weights[view]))
-    depths = depth_colors(tiled)
+    depths = depth_colors(tiled, FARTHEST * outside.near[view])
     image, left = blend(tiled, depths, np.zeros(3, np.float32))
     inverse = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
     hidden = 1 - left - image[..., 0] * inverse

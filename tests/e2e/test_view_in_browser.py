@@ -459,7 +459,7 @@ def test_fingers_zoom_stills(opened: tuple[Browser, Any]) -> None:
 @pytest.mark.slow
 def test_moving_framing_and_turning_about_a_point(opened: tuple[Browser, Any]) -> None:
     tab, _ = opened
-    tab.run("set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
+    tab.run("delete solid.request; set('mode', 'blink'); choose(2); set('left', 2); set('solid', '1')")
     tab.wait(SETTLED)
     place = "solid.camera.matrix.elements.slice(12, 15)"
     ahead = np.array(tab.run("solid.camera.matrix.elements.slice(8, 11).map(value => -value)"))

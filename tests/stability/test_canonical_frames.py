@@ -26,17 +26,21 @@ def room() -> Scene:
 
 @sweep("settings", [{"fit_steps": 20}, {}, {"fit": "none"}, {"fit": "none", "match": "aabb"}], ids=str)
 def test_flyaways_do_not_disturb_the_rest(room: Scene, settings: dict) -> None:
-    means = room.gaussians.means.copy()
-    rows = np.random.default_rng(0).choice(len(means), 5, replace=False)
-    eyes = room.cameras.centres.repeat(room.pixels_per_view, 0)[rows]
-    means[rows] = eyes + 1e5 * (means[rows] - eyes)
-    scene = replace(room, gaussians=replace(room.gaussians, means=means))
-    assert scene_frame(scene).unit == scene_frame(room).unit
-    clean, actual = scenes.compacted(room, **settings), scenes.compacted(scene, **settings)
-    assert abs(len(actual.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
-    near = actual.gaussians[np.linalg.norm(actual.gaussians.means, axis=1) < 10]
-    assert len(near) >= len(actual.gaussians) - len(rows)
-    assert scenes.psnr_of(actual.gaussians, room) > scenes.psnr_of(clean.gaussians, room) - 0.7
+    """Means of three draws: one fit of so few Gaussians differs from another by half a decibel."""
+    scores = []
+    for seed in range(3):
+        means = room.gaussians.means.copy()
+        rows = np.random.default_rng(seed).choice(len(means), 5, replace=False)
+        eyes = room.cameras.centres.repeat(room.pixels_per_view, 0)[rows]
+        means[rows] = eyes + 1e5 * (means[rows] - eyes)
+        scene = replace(room, gaussians=replace(room.gaussians, means=means))
+        assert scene_frame(scene).unit == scene_frame(room).unit
+        clean, actual = scenes.compacted(room, seed=seed, **settings), scenes.compacted(scene, seed=seed, **settings)
+        assert abs(len(actual.gaussians) - len(clean.gaussians)) <= 2 * len(rows)
+        near = actual.gaussians[np.linalg.norm(actual.gaussians.means, axis=1) < 10]
+        assert len(near) >= len(actual.gaussians) - len(rows)
+        scores.append((scenes.psnr_of(actual.gaussians, room), scenes.psnr_of(clean.gaussians, room)))
+    assert np.subtract(*np.mean(scores, 0)) > -0.7
 
 
 # 37: coordinates of maps
