@@ -9,6 +9,7 @@ import pytest
 import scenes
 
 from gsmerge.io.formats.spz import COLOR_SCALE, spz_columns
+from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
 from gsmerge.types import SH_C0, Gaussians
 
@@ -31,7 +32,7 @@ def packed_looks(given: Gaussians, rows: np.ndarray, steps: tuple[int, ...], lev
 def some_gaussians(degree: int) -> Gaussians:
     rng = np.random.default_rng(degree)
     quats, rest = rng.normal(size=(N, 4)), rng.normal(0, 0.7, (N, (degree + 1) ** 2 - 1, 3))
-    scales, opacities, sh0 = np.exp(rng.normal(-3, 8, (N, 3))), rng.uniform(0, 1, N), rng.normal(0, 2, (N, 1, 3))
+    scales, opacities, sh0 = exp(rng.normal(-3, 8, (N, 3))), rng.uniform(0, 1, N), rng.normal(0, 2, (N, 1, 3))
     scales[0], quats[0] = 0, (-1, 0, 0, 0)
     columns = (rng.normal(size=(N, 3)), quats, scales, opacities, sh0, rest)
     return Gaussians(*(column.astype(np.float32) for column in columns))
@@ -68,7 +69,7 @@ def test_pixels_have_shifts_and_depths(each_target: Any) -> None:
     seen = (viewmats[views, :3, :3] @ means[rows, :, None])[..., 0] + viewmats[views, :3, 3]
     images = (Ks[views] @ seen[..., None])[..., 0]
     shifts = images[:, :2] / images[:, 2:] - np.stack([pixels % width, pixels // width], 1) - 0.5
-    expected = [rows, *np.round(8 * shifts.T), np.round(1024 * np.log(images[:, 2]))]
+    expected = [rows, *np.round(8 * shifts.T), np.round(1024 * log(images[:, 2]))]
     np.testing.assert_array_equal(numbers(out), expected)
     means[rows[7]] = -viewmats[0, :3, :3].T @ viewmats[0, :3, 3]  # where the camera is
     assert pack_pixels(*call) == 7
