@@ -64,10 +64,10 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
     """
     num = len(means)
     neighbors, means, most = np.empty((num, count), np.int64), np.ascontiguousarray(means), MOST * max(count, FEW)
-    tree = make_tree(means)
+    order, axes, splits = make_tree(means)
     with use_threads() as threads:
         parallel_map(
-            lambda span: nearest_of_others(means, views, *tree, *span, most, neighbors),
+            lambda span: nearest_of_others(means, views, order, axes, splits, *span, most, neighbors),
             pieces(num, threads),
         )
     return neighbors

@@ -67,12 +67,13 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     untested[rows] = False
     order = np.concatenate([rows, np.flatnonzero(untested)])
     points, sizes, ids = means[order], sizes[order], np.empty((len(means), NEIGHBORS), np.int64)
-    tree, nobody = make_tree(points), np.full(len(means), -1)  # every point is of another view than all others
+    tree, axes, splits = make_tree(points)
+    nobody = np.full(len(means), -1)  # every point is of another view than all others
     touched, nearest = np.empty(len(rows), bool), np.empty(len(rows))
 
     def measure(first: int) -> None:
         span = slice(first, min(first + ROWS, len(rows)))
-        nearest_of_others(points, nobody, *tree, span.start, span.stop, len(means), ids)
+        nearest_of_others(points, nobody, tree, axes, splits, span.start, span.stop, len(means), ids)
         distances = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
         touched[span] = (distances <= TOUCH * (sizes[span, None] + sizes[ids[span]])).any(1)
         nearest[span] = distances[:, 0]
