@@ -18,6 +18,7 @@ import numpy as np
 from gsmerge.facts.photo_change import PhotoChange, change_large, look_up
 from gsmerge.facts.place_cameras import sampled
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
@@ -26,7 +27,7 @@ from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_w
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
-from gsmerge.types import PicturedScene, Scene
+from gsmerge.types import PicturedScene
 
 # Differences are of colours in [0, 1]. Of 15 captures the photos differ from their pixels' own colours by 0.003 in the
 # median, and from drawings by 0.01 to 0.2; the order of the channels raises that by 8 % at the least.
@@ -242,10 +243,12 @@ def show_photos(scene: PicturedScene) -> Shown:
     longer = max(scene.cameras.width, scene.cameras.height)
     if scene.aligned:  # pixels are compared with their own rows: some of them will do
         step = -(-longer // SIDE)
-        weights = np.where(scene.valid, scene.gaussians.opacities.reshape(scene.valid.shape), 0)
+        some = slice(None), slice(None, None, step), slice(None, None, step)
+        opacities, colors = scene.gaussians.opacities, scene.gaussians.sh0.reshape(*scene.images.shape)
+        weights = np.where(scene.valid, opacities.reshape(scene.valid.shape), 0)[some]
         if scene.masks is not None:
-            weights = weights * scene.masks
-        photos, pictures, weights = (x[:, ::step, ::step] for x in (scene.images, row_pictures(scene), weights))
+            weights = weights * scene.masks[some]
+        photos, pictures = scene.images[some], sh0_to_rgb(colors[some]).clip(0, 1)
         return Shown(photos, pictures, weights, drawn=False)
     level = max(1.0, longer / DRAWN_SIDE)
     few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)

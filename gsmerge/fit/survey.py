@@ -17,9 +17,8 @@ from gsmerge.raster.photos import NEAR, Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
-
-LOOKS = 12  # photos in which a Gaussian is looked at, if so many may show it; and photos that judge a fit, at most
-FEWER = 0.01  # share of what a photo may show that is looked at in fewer
+JUDGES, ENOUGH = 12, 6  # photos that judge a fit, at most; in so many a Gaussian is looked at, if they may show it
+FEWER = 0.03  # share of what a photo may show that is looked at in fewer
 SAMPLES = 4096  # Gaussians by which photos are chosen
 
 
@@ -72,22 +71,22 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 
 
 def choose_looks(gaussians: Gaussians, photos: Photos) -> list[int]:
-    """Choose the photos of a survey: those that judge, and more where too much would be looked at in fewer than these."""
+    """Choose the photos of a survey: those that judge, and others of which much would be looked at in too few."""
     means = gaussians.means[:: max(1, len(gaussians) // SAMPLES)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
     chosen = judging_views(len(photos))
     looks = inside[chosen].sum(0)
     for view in spread_views(len(photos)):
-        if view not in chosen and (inside[view] & (looks < LOOKS)).sum() > FEWER * inside[view].sum():
+        if view not in chosen and (inside[view] & (looks < ENOUGH)).sum() > FEWER * inside[view].sum():
             chosen.append(view)
             looks += inside[view]
     return sorted(chosen)
 
 
 def judging_views(count: int) -> list[int]:
-    """Choose the photos out of ``count`` that judge a fit, at most ``LOOKS``."""
-    return sorted(spread_views(count)[:LOOKS])
+    """Choose the photos out of ``count`` that judge a fit, at most ``JUDGES``."""
+    return sorted(spread_views(count)[:JUDGES])
 
 
 def spread_views(count: int) -> list[int]:
@@ -117,7 +116,7 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 
 def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders of the judging photos, half-size, on held-out patches; NaN if none is held out."""
+    """Return the PSNR (dB) of renders of the judging half-size photos on held-out patches; NaN if none is held out."""
     options, views = plan.job.options, judging_views(len(half))
     if not options.judged:
         return float("nan")

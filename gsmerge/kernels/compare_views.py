@@ -10,8 +10,9 @@ COLUMNS = 10  # of scratch
 
 
 @native(
-    STATUS, points=f8("n", 3), greys=f4("n"), starts=i8("ends", least=0, most="n", ascending=True), pairs=i8("p", 2, least=0, below="v"),
-    viewmats=f8("v", 4, 4), given=f8("v", 4, 4), Ks=f8("v", 3, 3), pictures=f4("v", "h", "w", 3),
+    STATUS, points=f8("n", 3), greys=f4("n"), starts=i8("ends", least=0, most="n", ascending=True),
+    pairs=i8("p", 2, least=0, below="v"), viewmats=f8("v", 4, 4), given=f8("v", 4, 4), Ks=f8("v", 3, 3),
+    pictures=f4("v", "h", "w", 3),
     depths=f8("v", "h", "w"), near=f8(), border=f8(), scale=f8(), first=i8(least=0), last=i8(most="p"),
     scratch=f8("columns", "room", out=True), order=i8("room", out=True), curvatures=f8("p", 6, 6, out=True),
     slopes=f8("p", 6, out=True), costs=f8("p", out=True), flows=f8("p", out=True),
