@@ -33,6 +33,7 @@ _HALF_OPAQUE = 127
 ASPECT_TOLERANCE = 0.04  # of width over height: backbones round each side to a multiple of 14 by itself
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # marks of a file and of its scans, of which a progressive one has any number
+_EFFORT = 1  # of 6, of lossless pictures: more takes several times as long for 5 % less
 _PIXELS_PER_STEP = 50_000  # of a scan that changes nothing
 _MEMORY_PER_BYTE = 100  # of a photo or mask that is decoded by itself
 _COPIES = 2, 3  # of all pixels: OpenCV's, and at most those of Pillow and of what becomes of its image
@@ -429,11 +430,11 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 
 def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """Encode ``indices [h,w]`` uint8 into a palette ``colors [n,3]`` uint8 sRGB as a PNG; index 0 is transparent."""
-    image = Image.fromarray(indices).convert("P")
-    image.putpalette(colors.tobytes())
+    """Encode ``indices [h,w]`` into ``colors [n,3]`` uint8 sRGB as a lossless WebP; index 0 is transparent."""
+    palette = np.pad(colors, ((0, 0), (0, 1)), constant_values=255)
+    palette[0, 3] = 0
     content = io.BytesIO()
-    image.save(content, "PNG", transparency=0, optimize=True)
+    Image.fromarray(palette[indices]).save(content, "WEBP", lossless=True, quality=0, method=_EFFORT)
     return content.getvalue()
 
 

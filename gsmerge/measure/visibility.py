@@ -18,7 +18,7 @@ Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 _NEAR, _BEHIND = 0.01, 1.05  # times the median depth of a view; times a surface's depth, from which on it hides
 MAX_SAMPLES = 200_000  # Gaussians that a share is measured on
-_CHUNK = 1 << 18  # points at a time: all of them, in every thread, would take too much memory
+_CHUNK = 1 << 16  # points at a time: all of them, in every thread, would take too much memory
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 
 
@@ -55,15 +55,20 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 
     def one_view(view: int) -> NDArray[np.bool_]:
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
-        for first in range(0, len(points), _CHUNK):
+        seen = hit > 0
+        side = _side(Ks[view], sources)
+        own = len(points) * view // len(cameras)  # where, in most scenes, the view's own points begin: they come first
+        for first in (*range(own, len(points), _CHUNK), *range(0, own, _CHUNK)):
             chunk = points[first : first + _CHUNK]
             image = matmul(matmul(chunk, viewmats[view, :3, :3].T) + viewmats[view, :3, 3], Ks[view].T)
             image = image[image[:, 2] > near]
             pixels = np.floor(image[:, :2] / image[:, 2:])
             pixels = pixels[((pixels >= 0) & (pixels < size)).all(1)].astype(np.int64)
             hit[pixels[:, 1], pixels[:, 0]] = 1
-        side = _side(Ks[view], sources)
-        return cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
+            seen = cv2.dilate(hit, np.ones((side, side), np.uint8)) > 0
+            if seen.all():
+                break
+        return seen
 
     return np.stack(parallel_map(one_view, range(len(cameras))))
 

@@ -13,7 +13,7 @@ from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import Frame, scene_frame
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
-from gsmerge.io.photo_files import photo_array
+from gsmerge.io.photo_files import encode_indexed, photo_array
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import (
     INPUT,
@@ -26,10 +26,8 @@ from gsmerge.measure.evaluate import (
     evaluate,
     near_plane,
 )
-from gsmerge.measure.fog import ALL, Fog
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
-from gsmerge.measure.speed import time_in_turns
 from gsmerge.pages.drops import draw_drops, find_drops
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.raster import render
@@ -41,7 +39,6 @@ from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # the network of LPIPS where its weights are installed: 0.05 s a picture, the other one takes 0.8 s
 MAX_VIEWS = 32  # of more, some at equal intervals: each takes up to 300 kB
-LOSSLESS = 101  # quality of a WebP
 WEBP_QUALITY = 90  # stills are within 1 dB of the scores of lossless ones
 OUTLINE_SIDE = 1280  # pixels of the longer side of superpixels' outlines, at most
 OUTLINE_LEVELS = 5  # of each channel in their colours: with the transparent one they fit a byte
@@ -60,10 +57,9 @@ class Side:
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # of the harmonics that the page has
     file_sh_degree: int  # of those in the file
-    fog: Fog | None  # of a result
     covered_share: float | None  # of the pixels of these views, covered by the input
     covered: Quality  # over those
-    seconds: float  # that drawing a view took, on this processor
+    seconds: float  # that drawing a view took here, with all threads
     dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
     new_gain: float | None = None  # dB that new views are expected to gain; None: not known
 
@@ -82,7 +78,7 @@ class PageView:
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
     outlines: bytes | None = None  # borders of the photo's superpixels as WebP; None of held-out views
     outside: bool = False  # a camera where no photo is; it has no scores
-    drops: tuple[bytes | None, ...] = ()  # PNG, one for each side: what ``--drop`` would take, coloured
+    drops: tuple[bytes | None, ...] = ()  # WebP, one for each side: what ``--drop`` would take, coloured
 
 
 @dataclass(frozen=True)
@@ -146,7 +142,7 @@ def collect(
     """
     stills: Stills = {}
     nets = (LPIPS,) if lpips_available(LPIPS) else ()
-    options = EvaluateOptions(nets, None)
+    options = EvaluateOptions(nets, None, fog=False)
     evaluation = evaluate(
         scene, results, held_out, options, cameras=cameras, progress=progress, on_image=still_keeper(stills)
     )
@@ -189,14 +185,10 @@ def page_data(
     looked_at = [name for name in named if name != INPUT or not results]
     drops = {name: find_drops(entered[name], cameras, pictures if len(pictures) else None) for name in looked_at}
     split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
-    seconds = time_in_turns(entered, cameras[[len(cameras) // 2]], near)
     sides = [
-        _side(
-            result, size, split, _pack(entered[result.name], result.name, scene, cameras, light),
-            seconds[result.name], drops,
-        )
+        _side(result, size, split, _pack(entered[result.name], result.name, scene, cameras, light), drops)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
-    ]  # fmt: skip
+    ]
     means = entered[evaluation.results[:2][-1].name].means
     views = _page_views(splits, evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
@@ -302,10 +294,8 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     steps = np.array([OUTLINE_LEVELS**2, OUTLINE_LEVELS, 1], np.uint8)
     ids = 1 + (levels * steps).sum(1, dtype=np.uint8)
     every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
-    colors = np.pad(np.pad(every, ((0, 0), (0, 1)), constant_values=255), ((1, 0), (0, 0))).astype(np.uint8)
-    picture = colors[np.where(borders(enlarged), ids[enlarged], 0)][..., [2, 1, 0, 3]]
-    _, data = cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
-    return bytes(data.tobytes())
+    colors = np.pad(every, ((1, 0), (0, 0))).astype(np.uint8)
+    return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0), colors)
 
 
 def _pack(
@@ -331,12 +321,13 @@ def _side(
     file_bytes: int,
     split: str,
     packed: tuple[bytes | None, int, int],
-    seconds: float,
     drops: Mapping[str, Mapping[str, np.ndarray]],
 ) -> Side:
     counts = {word: int(mask.sum()) for word, mask in drops.get(result.name, {}).items()}
-    mean, fog, covered = result.mean(split)[1], result.fog.get(ALL), result.mean_covered(split)
-    return Side(result.name, result.num_gaussians, file_bytes, mean, *packed, fog, *covered, seconds, counts)
+    mean, covered = result.mean(split)[1], result.mean_covered(split)
+    return Side(
+        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds, counts
+    )  # fmt: skip
 
 
 def _shown(views: Sequence[PageView]) -> tuple[PageView, ...]:

@@ -33,7 +33,7 @@ def find_drops(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
 
 
 def draw_drops(gaussians: Gaussians, masks: Mapping[str, np.ndarray], camera: Cameras, near: float) -> bytes | None:
-    """Draw what the ``masks`` take, as a transparent PNG with a colour for each word; None if the view shows none."""
+    """Draw what the ``masks`` take, as a transparent WebP with a colour for each word; None if the view shows none."""
     words = list(COLORS)
     flags = np.stack([masks.get(word, np.zeros(len(gaussians), bool)) for word in (*words, "")], 1)
     marked = replace(gaussians, sh0=rgb_to_sh0(flags.astype(np.float32))[:, None], shN=gaussians.shN[:, :0])

@@ -16,7 +16,6 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.measure.scores import OUTSIDE
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Cameras
@@ -93,7 +92,7 @@ def view_page(data: ViewData) -> str:
         agreement=agreement_words(data),
         outlines=[view.outlines and data_uri(view.outlines, "image/webp") for view in data.shown],
         drops=[
-            [None] * photos + [one and data_uri(one, "image/png") for one in view.drops or [None] * len(data.sides)]
+            [None] * photos + [one and data_uri(one, "image/webp") for one in view.drops or [None] * len(data.sides)]
             for view in data.shown
         ],
         splats=splats,
@@ -204,8 +203,6 @@ def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:
     columns["Share"] = [f"{100 * side.num_gaussians / max(first.num_gaussians, 1):.1f} %" for side in data.sides]
     if data.lacks_pixels:
         columns["PSNR, covered"] = [_number(side.covered.psnr, 2) for side in data.sides]
-    for name, head in OUTSIDE.items():
-        columns[head.capitalize()] = [_number(getattr(side.fog, name, None), 3) for side in data.sides]
     filled = {head: cells for head, cells in columns.items() if set(cells) != {NONE}}
     return list(filled), [list(row) for row in zip(*filled.values(), strict=True)]
 

@@ -229,7 +229,7 @@ def test_what_would_be_dropped_is_shown_in_colour(opened: tuple[Browser, Any]) -
     assert tab.run("data.sources[3].dropped.floaters") > 0  # the one that reaches in from outside
     tab.run("choose(3); jump(data.views.findIndex((_, i) => drops[i][3])); set('drops', '1')")
     layer = "document.querySelector('#right-pane .drops')"
-    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/png')]") == [
+    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/webp')]") == [
         False,
         True,
     ]

@@ -306,9 +306,9 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     return gzip_bytes(b"".join([columns.header, *parts]))
 
 
-def gzip_bytes(data: bytes, level: int = 9) -> bytes:
+def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:
     """Compress to a gzip stream that is the same at any time, and on each system and version of Python."""
-    packer = zlib.compressobj(level, wbits=31)  # without a time
+    packer = zlib.compressobj(level, wbits=31, strategy=strategy)  # without a time
     packed = packer.compress(data) + packer.flush()
     return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]
 

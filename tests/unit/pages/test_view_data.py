@@ -92,12 +92,12 @@ def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
 
 def test_numbers_are_those_of_evaluate(actual: ViewData, scene: Scene, half: Gaussians, held_out: Views) -> None:
     nets = (data.LPIPS,) if lpips_available(data.LPIPS) else ()
-    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets))
+    expected = evaluate(scene, {"half": half}, held_out, EvaluateOptions(lpips=nets, fog=False))
     by_place = sorted(actual.views, key=lambda view: view.place)
     for side, result in enumerate(expected.results):
         assert [view.scores[side] for view in by_place] == [score.masked for score in result.scores]
         assert actual.sides[side].mean == result.mean("target")[1]
-        assert actual.sides[side].fog == result.fog.get("all")
+        assert actual.sides[side].seconds > 0
     assert [side.name for side in actual.sides] == ["input", "half", "all"]
     assert [side.file_bytes for side in actual.sides] == [300, 200, 100]
     assert [view.held_out for view in by_place] == [False, False, False, True, True]
@@ -211,7 +211,7 @@ def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
     assert all(view.drops[0] is None for view in shown.shown)
     assert any(view.drops[1] for view in shown.shown)
     near = near_plane(small) / frame.unit
-    mask = draw_drops(entered, {"sky": np.ones(len(half), bool)}, camera[[0]], near)
+    mask = draw_drops(entered, {"sky": np.arange(len(half)) < len(half) / 2}, camera[[0]], near)
     picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (small.cameras.height, small.cameras.width, 4)
     assert set(map(tuple, picture[picture[..., 3] > 0])) == {(255, 170, 20, 255)}
