@@ -170,7 +170,7 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
 
 
 def middle_depth(means: np.ndarray, camera: Cameras, share: float = 0.5) -> float:
-    """Measure the median, or another quantile, of the depths of points ``[n,3]`` in a camera's picture; 1 without any."""
+    """Measure the median, or another quantile, of depths of points ``[n,3]`` in a camera's picture; 1 without any."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
