@@ -17,8 +17,8 @@ import numpy as np
 
 from gsmerge.facts.photo_change import PhotoChange, change_large, look_up
 from gsmerge.facts.place_cameras import sampled
-from gsmerge.facts.row_colors import add_row_colors, fill_gaps
-from gsmerge.facts.views import camera_kinds, subset
+from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
@@ -27,7 +27,7 @@ from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_w
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
-from gsmerge.types import PicturedScene, Scene
+from gsmerge.types import PicturedScene
 
 # Differences are of colours in [0, 1]. Of 15 captures the photos differ from their pixels' own colours by 0.003 in the
 # median, and from drawings by 0.01 to 0.2; the order of the channels raises that by 8 % at the least.
@@ -183,37 +183,26 @@ def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     Gaussians drawn from its camera, which takes longer; a photo that looks as the drawing does not differ.
     """
 
-    def differ(pictures: np.ndarray, known: np.ndarray) -> np.ndarray:
-        def compare(view: int) -> np.ndarray:
-            weights = known[view].astype(np.float32)
-            away = (changes[view](scene.images[view]) - pictures[view]) * weights[..., None]
-            sums = _over_channels(np.add, np.abs(convolve(away, WINDOW, WINDOW))) / 3
-            far = known[view] & (sums > FAR * convolve(weights, WINDOW, WINDOW))
-            return fill_gaps(far[..., None], known[view])[..., 0]
+    def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
+        weights = known.astype(np.float32)
+        away = (changes[view](scene.images[view]) - picture) * weights[..., None]
+        sums = _over_channels(np.add, np.abs(convolve(away, WINDOW, WINDOW))) / 3
+        far = known & (sums > FAR * convolve(weights, WINDOW, WINDOW))
+        return fill_gaps(far[..., None], known)[..., 0]
 
-        return np.stack(parallel_map(compare, range(len(scene))))
+    def differ_drawn(views: np.ndarray, rows: RowPicture) -> None:
+        for view in views:
+            known = scene.stored[view] & inside[view] & rows.known  # what spills over from beside says nothing
+            pictures[view] = rows.picture
+            covers[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
 
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     pictures = row_pictures(scene)
-    opaque = scene.gaussians.opacities.reshape(inside.shape) > FAINT
-    covers = differ(pictures, scene.stored & opaque & inside)
+    known = scene.stored & (scene.gaussians.opacities.reshape(inside.shape) > FAINT) & inside
+    covers = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
     if covers.any() or not inside.all():
-        with record_part(silent=True):
-            colored = add_row_colors(scene)
-        pictures, known = colored.images, scene.stored & inside  # what spills over from beside says nothing
-        known = known if colored.masks is None else known & colored.masks
-        covers = differ(pictures, known) & differ(_draw_own(scene), known)
+        picture_rows(scene, differ_drawn)
     return covers, pictures
-
-
-def _draw_own(scene: Scene) -> np.ndarray:
-    """Draw the Gaussians of each camera's own pixels ``[v,h,w,3]``."""
-    kinds, drawn = camera_kinds(scene.cameras), np.empty((*scene.valid.shape, 3), np.float32)
-    for kind in range(kinds.max() + 1):
-        views = np.flatnonzero(kinds == kind).tolist()  # its layers
-        part = subset(scene, views)
-        drawn[views] = np.asarray(render(part.gaussians, part.cameras[[0]]).images).clip(0, 1)
-    return drawn
 
 
 def find_tones(shown: Shown, names: Sequence[str]) -> list[PhotoChange]:
@@ -254,10 +243,12 @@ def show_photos(scene: PicturedScene) -> Shown:
     longer = max(scene.cameras.width, scene.cameras.height)
     if scene.aligned:  # pixels are compared with their own rows: some of them will do
         step = -(-longer // SIDE)
-        weights = np.where(scene.valid, scene.gaussians.opacities.reshape(scene.valid.shape), 0)
+        some = slice(None), slice(None, None, step), slice(None, None, step)
+        opacities, colors = scene.gaussians.opacities, scene.gaussians.sh0.reshape(*scene.images.shape)
+        weights = np.where(scene.valid, opacities.reshape(scene.valid.shape), 0)[some]
         if scene.masks is not None:
-            weights = weights * scene.masks
-        photos, pictures, weights = (x[:, ::step, ::step] for x in (scene.images, row_pictures(scene), weights))
+            weights = weights * scene.masks[some]
+        photos, pictures = scene.images[some], sh0_to_rgb(colors[some]).clip(0, 1)
         return Shown(photos, pictures, weights, drawn=False)
     level = max(1.0, longer / DRAWN_SIDE)
     few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)

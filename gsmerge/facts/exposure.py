@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.facts.photo_change import CLIPPED, PhotoChange, change_large
-from gsmerge.geometry import camera_centres, camera_depths, correlation, project, rgb_to_sh0, sh0_to_rgb
+from gsmerge.geometry import camera_centres, correlation, rgb_to_sh0, sh0_to_rgb
+from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve_symmetric
 from gsmerge.raster.photos import NEAR
@@ -165,15 +166,10 @@ class _Pixels:
 
     def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
         """Find which of the pixels ``rows`` of a view have the same surface in another view, and its pixels."""
-        width, height = self.cameras.width, self.cameras.height
-        (pixels,), (z,) = project(self.means[view, rows], self.cameras[[other]])
-        x, y = np.floor(np.nan_to_num(pixels, nan=-1.0).clip(-1, max(width, height))).astype(np.int64).T
-        inside = (z > NEAR) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        places = np.where(inside, y * width + x, 0)
-        both = np.flatnonzero(inside & self.valid[other, places])
-        depths = camera_depths(self.means[other, places[both]], self.cameras.viewmats[other])
-        same = np.abs(log(np.maximum(z[both], NEAR) / np.maximum(depths, NEAR))) < SAME_DEPTH
-        return both[same], places[both[same]]
+        poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
+        return find_surfaces(
+            self.means[view], rows, self.means[other], self.valid[other], *poses, self.cameras.width, NEAR, SAME_DEPTH
+        )
 
 
 def _pixels_of(scene: Scene) -> _Pixels:

@@ -7,6 +7,10 @@ faint that their colours mean little, the drawing takes their place if it is sol
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
 import cv2
 import numpy as np
 
@@ -30,6 +34,7 @@ FAINT = 0.1  # opacity of a pixel's Gaussians below which their colours mean lit
 # after one of 2 pixels, where Gaussians of wrong depth hide others.
 BLUR = 8.0  # standard deviation, pixels
 DISAGREE = 0.2  # mean difference of blurred colours over the channels, sRGB, from which on the drawing is taken
+T = TypeVar("T")
 
 
 def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
@@ -37,12 +42,13 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
 
     ``given``: whether there are photos, which do not count.
     """
-    kinds, shape = camera_kinds(scene.cameras), scene.valid.shape
-    images, masks, num_drawn = np.zeros((*shape, 3), np.float32), np.full(shape, False), 0
-    groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]  # the layers of a view have one camera
-    for views, (picture, known, drawn) in zip(groups, in_turn(lambda ids: _picture(scene, ids), groups), strict=True):
-        images[views], masks[views] = picture, known
-        num_drawn += len(views) * int(drawn.sum())
+    images, masks = np.zeros((*scene.valid.shape, 3), np.float32), np.full(scene.valid.shape, False)
+
+    def keep(views: np.ndarray, rows: RowPicture) -> int:
+        images[views], masks[views] = rows.picture, rows.known
+        return len(views) * int(rows.by_drawing.sum())
+
+    num_drawn = sum(picture_rows(scene, keep))
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE else ""
     if detail or not given:  # else a note has said it
@@ -50,25 +56,40 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
     return PicturedScene.of(scene, images, None if masks.all() else masks)
 
 
-def _picture(scene: Scene, views: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Make the picture ``[h,w,3]`` of a camera from the Gaussians of all of its ``views``, which are layers.
+@dataclass(frozen=True, eq=False)
+class RowPicture:
+    """What the Gaussians of a camera's own pixels look like from there."""
 
-    Also returns masks ``[h,w]`` of the pixels that are known, and of the pixels that are drawn.
-    """
+    picture: np.ndarray  # [h,w,3] their colours, or the drawing where it takes the place of these
+    known: np.ndarray  # [h,w] pixels that one of the two shows
+    by_drawing: np.ndarray  # [h,w] pixels of the drawing
+    drawing: np.ndarray  # [h,w,3] before black
+
+
+def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T]) -> list[T]:
+    """Return ``use(views, picture)`` for every camera; its views are layers."""
+    kinds = camera_kinds(scene.cameras)
+    groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
+    return list(in_turn(lambda views: use(views, _picture(scene, views)), groups))
+
+
+def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
+    """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
     part = subset(scene, views.tolist())
     tiled = tile_view(prepare(part.gaussians), **blank_photos(part.cameras).camera(0))
     seen = view_colors(tiled)
-    drawn, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
+    drawing, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
     colors = sh0_to_rgb(part.gaussians.sh0[:, 0])
     colors[tiled.ids] = seen
     own, opacity = _front(part, colors.clip(0, 1))
     alpha = 1 - transmittance
-    drawn = (drawn / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
+    drawn = (drawing / np.maximum(alpha, np.float32(1e-3))[..., None]).clip(0, 1)
     agree = _blurred_difference(own, drawn, np.minimum(opacity, alpha)) < DISAGREE
     solid = transmittance < COVERED
     by_row = (opacity > 0) & ~(solid & ((opacity < FAINT) | ~agree))
     known = by_row | solid
-    return fill_gaps(np.where(by_row[..., None], own, drawn), known), known, known & ~by_row
+    picture = fill_gaps(np.where(by_row[..., None], own, drawn), known)
+    return RowPicture(picture, known, known & ~by_row, drawing.clip(0, 1))
 
 
 def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,11 +10,16 @@ import numpy as np
 from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
+from gsmerge.geometry import project
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
-from gsmerge.raster.photos import Photos, photo_errors, render_photos
+from gsmerge.raster.photos import NEAR, Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
+
+JUDGES, ENOUGH = 12, 6  # photos that judge a fit, at most; in so many a Gaussian is looked at, if they may show it
+FEWER = 0.03  # share of what a photo may show that is looked at in fewer
+SAMPLES = 4096  # Gaussians by which photos are chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +43,7 @@ class Survey:
 
 
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
-    """Draw Gaussians into the half-size photos of a fit, and collect what they show of each.
+    """Draw Gaussians into half-size photos of a fit, of many into some, and collect what they show of each.
 
     The other sizes, full size first, tell the size of the finest pixel.
     """
@@ -51,16 +56,42 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return drawn.ids, drawn.depths / focal, *survey(drawn, colors)
 
-    images, inside, peaks = [], np.zeros(count, bool), np.zeros(count, np.float32)
+    views, judges, images = choose_looks(gaussians, half), judging_views(len(half)), []
+    inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
     sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
-    for ids, sizes, image, weights, most in in_turn(one_view, range(len(half))):
-        images.append(image)
+    for view, (ids, sizes, image, weights, most) in zip(views, in_turn(one_view, views), strict=True):
+        if view in judges:
+            images.append(image)
         inside[ids] = True
         peaks[ids] = np.maximum(peaks[ids], most)
         pixels[ids] = np.minimum(pixels[ids], sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
     return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
+
+
+def choose_looks(gaussians: Gaussians, photos: Photos) -> list[int]:
+    """Choose the photos of a survey: those that judge, and others of which much would be looked at in too few."""
+    means = gaussians.means[:: max(1, len(gaussians) // SAMPLES)]
+    pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
+    inside = (depths > NEAR) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
+    chosen = judging_views(len(photos))
+    looks = inside[chosen].sum(0)
+    for view in spread_views(len(photos)):
+        if view not in chosen and (inside[view] & (looks < ENOUGH)).sum() > FEWER * inside[view].sum():
+            chosen.append(view)
+            looks += inside[view]
+    return sorted(chosen)
+
+
+def judging_views(count: int) -> list[int]:
+    """Choose the photos out of ``count`` that judge a fit, at most ``JUDGES``."""
+    return sorted(spread_views(count)[:JUDGES])
+
+
+def spread_views(count: int) -> list[int]:
+    """Order views so that however many come first are spread over all."""
+    return sorted(range(count), key=lambda view: f"{view:032b}"[::-1])
 
 
 def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.ndarray:
@@ -85,16 +116,17 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 
 def score_images(images: Sequence[np.ndarray], plan: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders on the held-out patches of the half-size photos; NaN if nothing is held out."""
-    options = plan.job.options
+    """Return the PSNR (dB) of renders of the judging half-size photos on held-out patches; NaN if none is held out."""
+    options, views = plan.job.options, judging_views(len(half))
     if not options.judged:
         return float("nan")
-    return holdout_psnr(images, half, plan.weights, options.tuning.min_gain)
+    return holdout_psnr(images, half[views], [plan.weights[view] for view in views], options.tuning.min_gain)
 
 
 def score_state(state: FitState, plan: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of a state on the held-out patches of the half-size photos; see :func:`score_images`."""
-    return score_images(render_photos(state.splats, half, colors=state.view_colors()), plan, half)
+    views = judging_views(len(half))
+    return score_images(render_photos(state.splats, half, colors=state.view_colors(), views=views), plan, half)
 
 
 def photo_error(gaussians: Gaussians, photos: Photos) -> float:

@@ -25,14 +25,6 @@ API void log10_each(const double *restrict values, double *restrict out, int64_t
   }
 }
 
-// log(1 + x) = log(u) + (x - (u - 1)) / u with u = 1 + x as it is rounded: what that loses is added.
-static inline double log1p8(double x) {
-  double u = 1.0 + x, lost = (x - (u - 1.0)) / u;
-  bool plain = u > 0.0 && u <= 1.7976931348623157e308;
-  double result = log8(u) + (plain ? lost : 0.0);
-  return x == 0.0 ? x : result;
-}
-
 API void log1p_each(const double *restrict values, double *restrict out, int64_t n) {
   for (int64_t i = 0; i < n; i++) out[i] = log1p8(values[i]);
 }

@@ -96,6 +96,14 @@ static inline double log8(double x) {
   return x >= 0.0 ? result : __builtin_nan("");
 }
 
+// log(1 + x) = log(u) + (x - (u - 1)) / u with u = 1 + x as it is rounded: what that loses is added.
+static inline double log1p8(double x) {
+  double u = 1.0 + x, lost = (x - (u - 1.0)) / u;
+  bool plain = u > 0.0 && u <= 1.7976931348623157e308;
+  double result = log8(u) + (plain ? lost : 0.0);
+  return x == 0.0 ? x : result;
+}
+
 // log Γ(x) in float64 for x from 0 on, within 1e-14 near its zeros at 1 and 2. Stirling's series from 12 on, below that
 // Γ(x) = Γ(x + 1) / x.
 static inline double lgamma8(double x) {

@@ -1,5 +1,5 @@
 // Filters and lookups in pictures of float32, channels last.
-#include "native.h"
+#include "bilinear.h"
 
 // Place of index i in a row of n that is mirrored at both ends without repeating them.
 static inline int64_t mirrored(int64_t i, int64_t n) {
@@ -58,35 +58,12 @@ API int32_t filter_picture(const float *restrict picture, const float *restrict 
   return 0;
 }
 
-// Places in a row and the share of the second for x in pixels, with its ends repeated outside.
-typedef struct {
-  int64_t first, second;
-  float share;
-} between;
-
-static inline between neighbours(float x, int64_t n) {
-  float last = (float)(n - 1);
-  x = x > 0.f ? x : 0.f;  // also for NaN
-  x = x < last ? x : last;
-  int64_t first = mini((int64_t)x, n - 1);
-  return (between){first, mini(first + 1, n - 1), x - (float)first};
-}
-
 // Looks up a picture at places (x, y) in pixels, whole ones in their middles; bilinear.
 API int32_t sample_picture(const float *restrict picture, const float *restrict x,
                            const float *restrict y, float *restrict out, int64_t height,
                            int64_t width, int64_t channels, int64_t n) {
   if (height == 0 || width == 0) return n == 0 ? 0 : OUTSIDE;
-  for (int64_t i = 0; i < n; i++) {
-    between h = neighbours(x[i], width), v = neighbours(y[i], height);
-    const float *top = picture + v.first * width * channels;
-    const float *bottom = picture + v.second * width * channels;
-    for (int64_t c = 0; c < channels; c++) {
-      float a = top[h.first * channels + c], b = top[h.second * channels + c];
-      float d = bottom[h.first * channels + c], e = bottom[h.second * channels + c];
-      float above = a + h.share * (b - a), below = d + h.share * (e - d);
-      out[i * channels + c] = above + v.share * (below - above);
-    }
-  }
+  for (int64_t i = 0; i < n; i++)
+    sample_at(picture, x[i], y[i], height, width, channels, out + i * channels);
   return 0;
 }

@@ -147,13 +147,9 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None until its renders show them
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those that its renders show
     reference: str  # what the pictures are: photos, or what stands in for them
     drawn: Gaussians | None = None  # the input, where its renders stand in
-
-    def with_covered(self, masks: NDArray[np.bool_]) -> _Split:
-        """Fill in the mask ``[v,h,w]`` of pixels that the input covers, unless it is known."""
-        return self if self.covered is not None else replace(self, covered=masks)
 
     def under(self, cameras: Cameras | None) -> _Split:
         """Move the views to a result's own cameras; renders of the input stay at the given cameras."""
@@ -227,7 +223,7 @@ def evaluate(
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
         reference = PHOTOS if scene is given else ROW_COLORS
-        splits, scores = _splits(scene, reference, inputs, targets, renderer), []
+        splits = _splits(scene, reference, inputs, targets, renderer)
         named = {INPUT: inputs, **results} if options.own else results
         fogs = options.fog and bool(results)
         fog = measure_fog(inputs, results, scene.cameras, renderer.near, progress) if fogs else {}
@@ -238,12 +234,14 @@ def evaluate(
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that no result's time contains that
-        for name, gaussians in named.items():
-            mine = {kind: part.under(cameras.get(name)) if kind == "context" else part for kind, part in splits.items()}
-            score, opaque = _score_result(name, gaussians, len(inputs), mine, renderer, keep)
-            if name == INPUT:
-                splits = {kind: part.with_covered(opaque[kind]) for kind, part in splits.items()}
-            scores.append(replace(score, fog=fog.get(name, {})))
+        parts = [
+            _score_split(kind, split, named, cameras if kind == "context" else {}, renderer, keep)
+            for kind, split in splits.items()
+        ]
+    scores = [
+        ResultScores(name, len(gaussians), len(gaussians) / max(len(inputs), 1), *_join(name, parts), fog.get(name, {}))
+        for name, gaussians in named.items()
+    ]
     counts = {name: len(split.views.names) for name, split in splits.items()}
     notes = tuple(_notes(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
@@ -304,46 +302,53 @@ def _splits(
         context = replace(split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
     if scene.missing is not None:
         stored = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.stored])
-        context = context.with_covered(stored)
+        context = replace(context, covered=stored)
     return {"context": context, **target}
 
 
-def _score_result(
-    name: str,
-    gaussians: Gaussians,
-    num_input: int,
-    splits: Mapping[str, _Split],
+def _score_split(
+    kind: str,
+    split: _Split,
+    named: Mapping[str, Gaussians],
+    cameras: Mapping[str, Cameras],
     renderer: _Renderer,
     on_image: OnImage,
-) -> tuple[ResultScores, dict[str, NDArray[np.bool_]]]:
-    """Score a result in all views; also return by split a mask ``[v,h,w]`` of the pixels in which it is opaque."""
-    scores, seconds, options = list[ViewScore](), 0.0, renderer.options
-    opaque: dict[str, list[np.ndarray]] = {kind: [] for kind in splits}
-    for kind, split in splits.items():
-        views = split.views
-        perceptual = pick_views(len(views.names), options.lpips_views or len(views.names))
-        for i, view in enumerate(views.names):
+) -> dict[str, list[tuple[float, ViewScore]]]:
+    """Draw and score all results in one view after the other; return by result the seconds and the score of each."""
+    options, names = renderer.options, split.views.names
+    perceptual = pick_views(len(names), options.lpips_views or len(names))
+    mine = {name: split.under(cameras.get(name)) for name in named}
+    scores: dict[str, list[tuple[float, ViewScore]]] = {name: [] for name in named}
+    for view in range(len(names)):
+        covered = None if split.covered is None else split.covered[view]
+        for name, gaussians in named.items():
             start = time.perf_counter()
-            image, solid = renderer.draw(gaussians, views.cameras, i)
-            seconds += time.perf_counter() - start
-            on_image(name, kind, i, image)
-            opaque[kind].append(solid)
-            seen, nets = split.visible[i], options.lpips if i in perceptual else ()
-            both = _both(image, views.images[i], seen, nets)
-            sizes = () if options.zoom == (1,) else options.zoom
-            full, masked = (replace(quality, lpips_vgg=None, lpips_alex=None) for quality in both)
+            image, opaque = renderer.draw(gaussians, mine[name].views.cameras, view)
+            seconds = time.perf_counter() - start
+            on_image(name, kind, view, image)
+            if name == INPUT and covered is None:
+                covered = opaque
+            nets = options.lpips if view in perceptual else ()
+            full, masked = _both(image, split.views.images[view], split.visible[view], nets)
+            score = ViewScore(kind, names[view], float(split.visible[view].mean()), full, masked)
+            full, masked = (replace(quality, lpips_vgg=None, lpips_alex=None) for quality in (full, masked))
             zooms = {
-                zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, split, i, zoom, renderer)
-                for zoom in sizes
+                zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, mine[name], view, zoom, renderer)
+                for zoom in (() if options.zoom == (1,) else options.zoom)
             }
-            score = ViewScore(kind, view, float(seen.mean()), *both, zooms=zooms)
-            if split.covered is not None or name == INPUT:
-                share, covered = _covered(image, views.images[i], solid if split.covered is None else split.covered[i])
-                score = replace(score, covered_share=share, covered=covered or full)
-            scores.append(score)
-    ratio = len(gaussians) / max(num_input, 1)
-    result = ResultScores(name, len(gaussians), ratio, seconds / max(len(scores), 1), tuple(scores))
-    return result, {kind: np.stack(masks) for kind, masks in opaque.items()}
+            if covered is not None:
+                share, quality = _covered(image, split.views.images[view], covered)
+                score = replace(score, covered_share=share, covered=quality or full)
+            scores[name].append((seconds, replace(score, zooms=zooms)))
+    return scores
+
+
+def _join(
+    name: str, parts: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
+) -> tuple[float, tuple[ViewScore, ...]]:
+    """Return the mean seconds of a result's views, and their scores, of all splits."""
+    rows = [row for part in parts for row in part[name]]
+    return sum(seconds for seconds, _ in rows) / max(len(rows), 1), tuple(score for _, score in rows)
 
 
 def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:

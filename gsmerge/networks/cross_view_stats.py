@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gsmerge.kernels.elementary import log
-from gsmerge.kernels.gaussians.cross_view import COLUMNS, LEAF, build_tree, nearest_of_others, sum_cross_view
+from gsmerge.kernels.gaussians.cross_view import COLUMNS, make_tree, nearest_of_others, sum_cross_view
 from gsmerge.pooling import Members
 from gsmerge.raster.tiled_view import pieces
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -63,11 +63,8 @@ def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> 
     below 0 counts as another view.
     """
     num = len(means)
-    num_nodes = 4 << (num // LEAF).bit_length()
-    order, neighbors = np.arange(num), np.empty((num, count), np.int64)
-    axes, splits = np.empty(num_nodes, np.int8), np.empty(num_nodes)
-    means, most = np.ascontiguousarray(means), MOST * max(count, FEW)
-    build_tree(means, order, axes, splits)
+    neighbors, means, most = np.empty((num, count), np.int64), np.ascontiguousarray(means), MOST * max(count, FEW)
+    order, axes, splits = make_tree(means)
     with use_threads() as threads:
         parallel_map(
             lambda span: nearest_of_others(means, views, order, axes, splits, *span, most, neighbors),

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import zlib
+from math import prod
 from typing import Any
 
 import numpy as np
 
 from gsmerge.io.formats import spz
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
+from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # more take a browser too long to load and a page too many bytes: their stills alone
 MAX_SPZ_BYTES = 40_000_000  # before compression: 2 million without harmonics, fewer with them
@@ -36,68 +38,49 @@ def pack_splats(
     drawn = gaussians.opacities >= MIN_OPACITY
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
         drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
-    count = int(drawn.sum())
+    rows, means = np.flatnonzero(drawn), np.ascontiguousarray(gaussians.means, np.float32)
+    count = len(rows)
     if count > MAX_GAUSSIANS:
         return None, 0
     highest = min(highest_degree(gaussians.shN), spz.MAX_DEGREE)
     degree = max((d for d in range(highest + 1) if (20 + 3 * ((d + 1) ** 2 - 1)) * count <= MAX_SPZ_BYTES), default=0)
     steps, levels = COARSE if count > MANY else EXACT
-    stored = spz.spz_columns(gaussians[drawn], degree, fine=FINE)
-    means, opacities, colors, scales, _, harmonics = stored.parts
-    head: dict[str, Any] = {"count": count, "degree": degree, "fraction": stored.header[13]}
+    fixed, fraction = spz.fix_means(means[rows], FINE)
+    head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     places = None
     if cameras is not None and pixel_ids is not None:
-        places = _pixel_places(gaussians.means[drawn], cameras, pixel_ids[drawn])
+        places = _pixel_places(rows, means, cameras, pixel_ids)
+    if places is None:
+        moved = np.diff(fixed, axis=0, prepend=np.zeros((1, 3), np.int32)).T
+        places = np.where(moved < 0, -2 * moved - 1, 2 * moved).astype("<u4")
+    elif cameras is not None:
         head["cameras"] = [
             {"viewmat": viewmat.reshape(-1).tolist(), "K": K.reshape(-1)[[0, 4, 2, 5]].tolist()}
             for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
         ]
         head |= {"width": cameras.width, "height": cameras.height, "parts": [PIXEL_PARTS, DEPTH_PARTS]}
-    if places is None:
-        head.pop("cameras", None)
-        places = np.pad(means.reshape(-1, 3, 3), ((0, 0), (0, 0), (1, 0))).view("<i4")[..., 0] >> 8
-    opacity, color, scale = (
-        np.round(values / step).astype(np.int64)  # halves to even numbers: no bias
-        for values, step in zip((opacities, colors, scales), steps, strict=True)
-    )
-    color[:, 0::2] -= color[:, 1:2]  # from green, which says most of the others
-    turns = np.round(levels * _stereographic(gaussians.quats[drawn])).astype(np.int64)
-    values = np.concatenate([places, opacity, color, scale, turns, harmonics.astype(np.int64)], axis=1)
-    planes, sizes = [], []
-    for column in values.T:
-        moved = np.diff(column, prepend=0)
-        signed = np.where(moved < 0, -2 * moved - 1, 2 * moved).astype("<u4")
-        size = max(1, -(-int(signed.max(initial=0)).bit_length() // 8))
-        planes.append(signed.view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes())
-        sizes.append(size)
-    line = json.dumps(head | {"steps": steps, "levels": levels, "sizes": sizes}).encode() + b"\n"
+    looks = np.empty((LOOKS + 3 * ((degree + 1) ** 2 - 1), count), np.uint32)
+    parts = (gaussians.opacities, gaussians.sh0, gaussians.scales, gaussians.quats, gaussians.shN)
+    columns = (np.ascontiguousarray(part.reshape(len(part), prod(part.shape[1:])), np.float32) for part in parts)
+    pack_looks(rows, *columns, SH_C0, spz.COLOR_SCALE, np.array(steps, np.int32), levels, looks)
+    planes, head = [], head | {"steps": steps, "levels": levels, "sizes": []}
+    for column in (*places, *looks):
+        size = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
+        planes.append(column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes())
+        head["sizes"].append(size)
+    line = json.dumps(head).encode() + b"\n"
     return spz.gzip_bytes(line + b"".join(planes), 1, zlib.Z_RLE), degree  # differences seldom repeat longer runs
 
 
-def _pixel_places(means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
-    """Return for each row ``[n,4]`` its pixel, shifts from its middle, and the logarithm of its depth, all in steps.
+def _pixel_places(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
+    """Return pixels, shifts from their middles, and logarithms of depths, ``[4,m]``, of ``rows [m]`` with ``ids [n]``.
 
-    ``ids [n]`` rise. None if a row is not in front of its camera.
+    None if a row is not in front of its camera.
     """
-    size = cameras.width * cameras.height
-    seen = np.empty((len(ids), 3))
-    for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
-        rows = slice(*np.searchsorted(ids, (view * size, (view + 1) * size)))  # ids rise
-        seen[rows] = (means[rows] @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
-    depths = seen[:, 2]
-    if not (depths > 0).all():
-        return None
-    middles = np.stack([ids % cameras.width, ids % size // cameras.width], 1) + 0.5
-    shifts = seen[:, :2] / depths[:, None] - middles
-    stepped = [PIXEL_PARTS * shifts[:, 0], PIXEL_PARTS * shifts[:, 1], DEPTH_PARTS * np.log(depths)]
-    return np.stack([ids.astype(np.int64), *(np.round(part).astype(np.int64) for part in stepped)], 1)
-
-
-def _stereographic(quats: np.ndarray) -> np.ndarray:
-    """Project rotations ``[n,4]`` wxyz to ``[n,3]`` in [-1, 1]: tangents of a quarter of the angle, along the axis."""
-    unit = quats.astype(np.float64) / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
-    unit *= np.where(unit[:, :1] < 0, -1, 1)
-    return np.asarray(unit[:, 1:] / (1 + unit[:, :1]))
+    places = np.empty((4, len(rows)), np.uint32)
+    viewmats, Ks = (np.ascontiguousarray(part, np.float64) for part in (cameras.viewmats, cameras.Ks))
+    sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)
+    return places if pack_pixels(rows, ids, means, viewmats, Ks, *sizes, places) == len(rows) else None
 
 
 def highest_degree(harmonics: np.ndarray) -> int:

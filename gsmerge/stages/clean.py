@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from gsmerge.geometry import turn_by
+from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import matmul
-from gsmerge.runtime.threads import use_threads
+from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
 from gsmerge.types import Gaussians, PicturedScene
@@ -16,6 +17,7 @@ from gsmerge.types import Gaussians, PicturedScene
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
 NEIGHBORS = 8  # nearest Gaussians, of which a floater touches none
+ROWS = 1 << 14  # Gaussians per task
 TOUCH = 3.0  # Gaussians touch within so many of their largest scales together
 APART = 3.0  # times the median distance of nearest Gaussians: a floater's own is larger
 # Second and largest scale, as shares of half the diagonal of the scene's box, from which on a Gaussian hangs across the
@@ -61,28 +63,25 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     means, sizes = gaussians.means.astype(np.float64), gaussians.scales.max(1).astype(np.float64)
     if len(means) <= NEIGHBORS:
         return np.zeros(len(rows), bool)
-    from scipy.spatial import cKDTree  # loads slowly, and is seldom needed
+    untested = np.ones(len(means), bool)
+    untested[rows] = False
+    order = np.concatenate([rows, np.flatnonzero(untested)])
+    points, sizes, ids = means[order], sizes[order], np.empty((len(means), NEIGHBORS), np.int64)
+    tree, axes, splits = make_tree(points)
+    nobody = np.full(len(means), -1)  # every point is of another view than all others
+    touched, nearest = np.empty(len(rows), bool), np.empty(len(rows))
 
-    spread = spread_rows(means, NEIGHBORS + 1)  # equal points share a leaf, which every search goes through
-    tree = cKDTree(means[spread], balanced_tree=False, compact_nodes=False)
-    with use_threads() as threads:
-        distances, ids = tree.query(means[rows], k=NEIGHBORS + 1, workers=threads)
-    distances, ids = distances[:, 1:], spread[ids[:, 1:]]  # the first is the Gaussian itself
-    touched = (distances <= TOUCH * (sizes[rows][:, None] + sizes[ids])).any(1)
-    apart = distances[:, 0] > APART * np.median(distances[:, 0])
-    return np.asarray(~touched & apart) | beyond_scene(means[rows], means) | curtains(gaussians, rows)
+    def measure(first: int) -> None:
+        span = slice(first, min(first + ROWS, len(rows)))
+        nearest_of_others(points, nobody, tree, axes, splits, span.start, span.stop, len(means), ids)
+        distances = np.sqrt(((points[ids[span]] - points[span, None]) ** 2).sum(2))
+        touched[span] = (distances <= TOUCH * (sizes[span, None] + sizes[ids[span]])).any(1)
+        nearest[span] = distances[:, 0]
 
-
-def spread_rows(points: np.ndarray, most: int) -> np.ndarray:
-    """Return the rising rows of points ``[n,3]``; of equal points only the first ``most`` are included."""
-    rows = np.arange(len(points))
-    keys = np.sort(points[:, 0] + 2**0.5 * points[:, 1] + 3**0.5 * points[:, 2])  # equal for equal points
-    if not (keys[most:] == keys[:-most]).any():
-        return rows
-    order = np.lexsort(points.T)
-    starts = np.flatnonzero((np.diff(points[order], axis=0, prepend=np.nan) != 0).any(1))
-    ranks = rows - np.repeat(starts, np.diff(starts, append=len(rows)))
-    return np.sort(order[ranks < most])
+    with use_threads():
+        parallel_map(measure, range(0, len(rows), ROWS))
+    isolated = ~touched & (nearest > APART * np.median(nearest))
+    return np.asarray(isolated) | beyond_scene(means[rows], means) | curtains(gaussians, rows)
 
 
 def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
-from gsmerge.kernels.gaussians.cross_view import LEAF, build_tree
+from gsmerge.kernels.gaussians.cross_view import make_tree
 from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
 from gsmerge.pooling import MAX_OPACITY, principal_axes
 from gsmerge.runtime.record import stage
@@ -111,10 +111,7 @@ def _divide(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     starts = np.array([0, count])
     while (starts[1:] - starts[:-1]).max() > CELL:  # as the tree halves its runs
         starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
-    nodes = 4 << (count // LEAF).bit_length()
-    order = np.arange(count)
-    build_tree(means, order, np.zeros(nodes, np.int8), np.zeros(nodes))
-    return order, starts
+    return make_tree(means)[0], starts
 
 
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:

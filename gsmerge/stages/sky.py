@@ -84,18 +84,25 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
     """Return a mask ``[h,w]`` of smooth blue or white regions at a photo's upper border; empty if they are small."""
     height, width = photo.shape[:2]
     scale = max(height, width) / SIDE
-    soft = blur(photo, max(1.5 * scale, 0.5))
+    sigma = max(1.5 * scale, 0.5)
+    upper = photo[: round(4 * sigma) + 3]  # what the upper border depends on
+    if _like_sky(blur(upper, sigma), scale)[0].mean() < LEAST_TOP:
+        return np.zeros((height, width), bool)
+    soft = blur(photo, sigma)
+    _, labels = cv2.connectedComponents(_like_sky(soft, scale).astype(np.uint8), connectivity=4)
+    region = np.isin(labels, np.setdiff1d(labels[0], 0))
+    warm = region.mean() < LEAST_AREA or np.percentile((soft[..., 2] - soft[..., 0])[region], 10) < -WARM
+    return np.zeros_like(region) if warm else region
+
+
+def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
+    """Return a mask ``[h,w]`` of what is smooth and blue or white in a blurred photo."""
     right, down = (np.abs(slope).max(2) / 8 for slope in sobel(soft))
     red, green, blue = np.moveaxis(soft, 2, 0)
     bright = soft.max(2)
     is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK)
     is_white = (bright > WHITE) & (bright - soft.min(2) < GREY)
-    candidates = (np.sqrt(right * right + down * down) * scale < SMOOTH) & (is_blue | is_white)
-    _, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
-    region = np.isin(labels, np.setdiff1d(labels[0], 0))
-    small = region.mean() < LEAST_AREA or region[0].mean() < LEAST_TOP
-    warm = small or np.percentile((blue - red)[region], 10) < -WARM
-    return np.zeros_like(region) if warm else region
+    return np.asarray((np.sqrt(right * right + down * down) * scale < SMOOTH) & (is_blue | is_white))
 
 
 def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:

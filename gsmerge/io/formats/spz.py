@@ -256,11 +256,11 @@ def _octave(size: float) -> int:
 
 def round_means(means: np.ndarray) -> np.ndarray:
     """Return means ``[n,3]`` as a ``.spz`` of them holds them."""
-    fixed, fraction = _fix_means(means, FINE)
+    fixed, fraction = fix_means(means, FINE)
     return fixed / 2.0**fraction
 
 
-def _fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
+def fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
     """Quantise means; also returns the bits behind the point, by the scene's size and its farthest Gaussian."""
     fraction = 0
     if len(means):
@@ -271,10 +271,10 @@ def _fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
     return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4"), fraction
 
 
-def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False, fine: int = FINE) -> SpzColumns:
-    """Quantise Gaussians, positions to ``fine`` bits within the scene; ValueError if there is NaN or inf."""
+def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> SpzColumns:
+    """Quantise Gaussians; ValueError if there is NaN or inf."""
     columns = arrays.to_columns(gaussians, max_degree)
-    fixed, fraction = _fix_means(columns.means, fine)
+    fixed, fraction = fix_means(columns.means, FINE)
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     # rotations from the top: index of the largest of xyzw, then sign and magnitude of the others

@@ -29,6 +29,14 @@ def build_tree(points, order, axes, splits):
     """
 
 
+def make_tree(points):
+    """Return order, axes and splits of the tree of finite points ``[n,3]`` in C order."""
+    nodes = 4 << (len(points) // LEAF).bit_length()
+    order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
+    build_tree(points, order, axes, splits)
+    return order, axes, splits
+
+
 _search_tree = declare(
     "search_tree", STATUS, points=f8("n", 3), views=i8("n"), order=i8("m"), axes=i1("nodes"), splits=f8("nodes"),
     first=i8(least=0), last=i8(), most=i8(), distances=f8("k", out=True), out=i8("n", "k", out=True),

@@ -14,7 +14,7 @@ from gsmerge.fit.color import draw, fit_colors
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import look_outside, score_fog
-from gsmerge.fit.survey import score_images, survey_photos, visible_mask
+from gsmerge.fit.survey import JUDGES, choose_looks, judging_views, score_images, survey_photos, visible_mask
 from gsmerge.raster import composite, contributions, prepare, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
@@ -123,3 +123,21 @@ def test_shown(photos: Pair) -> None:
     )  # fmt: skip
     made.scales[-3:] = 0.02
     assert visible_mask(made, photos[1], 1 / 255)[-3:].tolist() == [False, True, True]
+
+
+def test_many_photos_are_surveyed_by_some_that_look_everywhere(truth: Gaussians) -> None:
+    def photos_of(shifts: np.ndarray) -> Photos:
+        viewmats = np.tile(np.eye(4), (len(shifts), 1, 1))
+        viewmats[:, 0, 3] = -shifts
+        K = np.array([[20.0, 0, 10], [0, 20, 10], [0, 0, 1]])
+        return Photos(np.zeros((len(shifts), 20, 20, 3), np.float32), viewmats, np.tile(K, (len(shifts), 1, 1)), 0.3)
+
+    places = np.zeros((500, 3), np.float32)
+    places[:, 0], places[:, 2] = np.linspace(-0.4, 40, 500), 2
+    points = replace(truth[np.zeros(500, int)], means=places)
+    assert choose_looks(points, photos_of(np.zeros(9))) == list(range(9))
+    near = choose_looks(points, photos_of(np.linspace(0, 0.001, 40)))
+    assert near == judging_views(40)
+    assert len(near) == JUDGES
+    assert np.diff(near).max() <= 8
+    assert choose_looks(points, photos_of(np.arange(40.0))) == list(range(40))  # each surface is in two

@@ -1,0 +1,30 @@
+// Lookups between the pixels of a picture of float32, channels last.
+#pragma once
+#include "native.h"
+
+// Places in a row and the share of the second for x in pixels, with its ends repeated outside.
+typedef struct {
+  int64_t first, second;
+  float share;
+} between;
+
+static inline between neighbours(float x, int64_t n) {
+  float last = (float)(n - 1);
+  x = x > 0.f ? x : 0.f;  // also for NaN
+  x = x < last ? x : last;
+  int64_t first = mini((int64_t)x, n - 1);
+  return (between){first, mini(first + 1, n - 1), x - (float)first};
+}
+
+// The channels of a picture at (x, y) in pixels, whole ones in their middles.
+static inline void sample_at(const float *restrict picture, float x, float y, int64_t height, int64_t width,
+                             int64_t channels, float *restrict out) {
+  between h = neighbours(x, width), v = neighbours(y, height);
+  const float *top = picture + v.first * width * channels, *bottom = picture + v.second * width * channels;
+  for (int64_t c = 0; c < channels; c++) {
+    float a = top[h.first * channels + c], b = top[h.second * channels + c];
+    float d = bottom[h.first * channels + c], e = bottom[h.second * channels + c];
+    float above = a + h.share * (b - a), below = d + h.share * (e - d);
+    out[c] = above + v.share * (below - above);
+  }
+}

@@ -1,0 +1,121 @@
+"""Comparison of the pixels of views, against plain formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsmerge.geometry import camera_depths, motion_matrices, project_points
+from gsmerge.kernels.compare_views import COLUMNS, compare_views, find_surfaces
+from gsmerge.kernels.elementary import log, log1p
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import sample_bilinear
+
+NEAR, BORDER, SCALE = 0.1, 2, 3.0
+MIN_SEEN, SAME_DEPTH, DOUBT, MIN_DOUBT, CLEAR = 50, 0.15, 1.5, 0.01, 0.03
+HEIGHT, WIDTH, VIEWS, POINTS = 30, 40, 4, 300
+PAIRS = np.array([[0, 1], [1, 0], [2, 0], [3, 1], [1, 3]])
+
+
+class Views:
+    """Random pixels of views that stand close to each other; the last one has few."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.K = np.array([[35.0, 0, 20], [0, 36, 15], [0, 0, 1]])
+        self.Ks = np.tile(self.K, (VIEWS, 1, 1))
+        self.given = motion_matrices(rng.normal(0, 0.03, (VIEWS, 6)))
+        self.viewmats = matmul(self.given, motion_matrices(rng.normal(0, 0.01, (VIEWS, 6))))
+        counts = [POINTS, POINTS - 1, POINTS // 2, 40]
+        self.starts = np.cumsum([0, *counts])
+        pixels = rng.uniform((0, 0), (WIDTH, HEIGHT), (sum(counts), 2))
+        rays = np.concatenate([(pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]], np.ones((len(pixels), 1))], 1)
+        self.points = rays * rng.uniform(1.7, 2.3, (len(pixels), 1))
+        self.greys = rng.random(len(pixels), np.float32)
+        self.pictures = rng.random((VIEWS, HEIGHT, WIDTH, 3), np.float32)
+        self.depths = rng.uniform(1.8, 2.2, (VIEWS, HEIGHT, WIDTH))
+        self.depths[:, 3] = np.nan
+
+    def places(self, viewmats: np.ndarray, a: int, b: int) -> tuple[np.ndarray, ...]:
+        points = self.points[self.starts[a] : self.starts[a + 1]]
+        world = matmul(points - viewmats[a, :3, 3], viewmats[a, :3, :3])
+        x, y, z = (matmul(world, viewmats[b, :3, :3].T) + viewmats[b, :3, 3]).T
+        z, K = np.maximum(z, NEAR), self.K
+        return x / z, y / z, z, K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2], world
+
+    def compared(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Curvature, slope, cost and flow of one pair, by arrays."""
+        x, y, z, u, v, world = self.places(self.viewmats, a, b)
+        inside = (z > NEAR) & (u > BORDER) & (u < WIDTH - BORDER) & (v > BORDER) & (v < HEIGHT - BORDER)
+        rows, columns = v.clip(0, HEIGHT - 1).astype(int), u.clip(0, WIDTH - 1).astype(int)
+        inside &= np.abs(log(self.depths[b, rows, columns] / z)) < SAME_DEPTH
+        if inside.sum() < MIN_SEEN:
+            return np.zeros((6, 6)), np.zeros(6), 0.0, 0.0
+        first = self.places(self.given, a, b)
+        flow = SCALE * float(np.median(np.sqrt((u - first[3]) ** 2 + (v - first[4]) ** 2)[inside]))
+        x, y, z, u, v, world = (values[inside] for values in (x, y, z, u, v, world))
+        grey, right, down = sample_bilinear(self.pictures[b], u - 0.5, v - 0.5).T.astype(np.float64)
+        residual = grey - self.greys[self.starts[a] : self.starts[a + 1]][inside]
+        residual -= np.median(residual)
+        doubt = max(MIN_DOUBT, DOUBT * float(np.median(np.abs(residual))))
+        weights = 1 / (doubt**2 + residual**2)
+        right, down = right * self.K[0, 0] / z, down * self.K[1, 1] / z
+        slopes = matmul(np.stack([right, down, -(right * x + down * y)], 1), self.viewmats[b, :3, :3])
+        ways = np.concatenate([np.cross(world, slopes), slopes], 1)
+        weighted = ways * weights[:, None]
+        cost = float(log1p((residual / CLEAR) ** 2).mean())
+        return matmul(weighted.T, ways), matmul(weighted.T, residual), cost, flow
+
+    def compare(self, pairs: np.ndarray = PAIRS, room: int = POINTS) -> list[np.ndarray]:
+        count = len(pairs)
+        out = [np.full((count, 6, 6), np.nan), np.full((count, 6), np.nan), *np.full((2, count), np.nan)]
+        for first, last in ((0, 2), (2, count)):
+            compare_views(
+                self.points, self.greys, self.starts, pairs, self.viewmats, self.given, self.Ks, self.pictures,
+                self.depths, NEAR, BORDER, SCALE, first, last, np.empty((COLUMNS, room)), np.empty(room, np.int64),
+                *out,
+            )  # fmt: skip
+        return out
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_pairs_are_those_of_the_formula_bit_for_bit(seed: int) -> None:
+    views = Views(seed)
+    curvatures, slopes, costs, flows = views.compare()
+    for row, (a, b) in enumerate(PAIRS):
+        curvature, slope, cost, flow = views.compared(a, b)
+        assert np.array_equal(curvatures[row], curvature)
+        assert np.array_equal(slopes[row], slope)
+        assert flows[row] == flow
+        assert costs[row] == pytest.approx(cost, rel=1e-12)  # NumPy adds in another order
+        assert (flow == 0) == (a == 3)  # too few pixels
+
+
+def test_a_view_that_is_not_there_and_too_little_room_are_refused() -> None:
+    views = Views(0)
+    with pytest.raises(ValueError, match="compare_views"):
+        views.compare(np.array([[0, 1], [1, VIEWS]]))
+    with pytest.raises(ValueError, match="compare_views"):
+        views.compare(room=POINTS - 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_surfaces_are_those_of_the_formula(seed: int) -> None:
+    rng, pixels = np.random.default_rng(seed), HEIGHT * WIDTH
+    means, others = (rng.uniform((-1.5, -1, 1.8), (1.5, 1, 2.4), (pixels, 3)).astype(np.float32) for _ in range(2))
+    means[:2], valid = np.nan, rng.random(pixels) < 0.8
+    viewmat, K = motion_matrices(rng.normal(0, 0.1, (1, 6)))[0], np.array([[35.0, 0, 20], [0, 36, 15], [0, 0, 1]])
+    rows = rng.permutation(pixels)[: pixels // 2]
+    ids, places = find_surfaces(means, rows, others, valid, viewmat, K, WIDTH, NEAR, 0.05)
+    with np.errstate(all="ignore"):
+        at, depths = project_points(means[rows].astype(np.float64), viewmat, K)
+    inside = (depths > NEAR) & (at >= 0).all(1) & (at < (WIDTH, HEIGHT)).all(1)
+    x, y = np.where(inside[:, None], at, 0).astype(int).T
+    there = y * WIDTH + x
+    apart = np.abs(log(np.maximum(depths, NEAR) / np.maximum(camera_depths(others[there], viewmat), NEAR)))
+    expected = np.flatnonzero(inside & valid[there] & (apart < 0.05))
+    assert np.array_equal(ids, expected)
+    assert np.array_equal(places, there[expected])
+    assert 20 < len(ids) < pixels // 3
+    with pytest.raises(ValueError, match="find_surfaces"):
+        find_surfaces(means, rows + pixels, others, valid, viewmat, K, WIDTH, NEAR, 0.05)
