@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -39,6 +39,7 @@ from gsmerge.settings.stages import Engine
 if TYPE_CHECKING:
     from gsmerge.scene.exporters import ReadHints
     from gsmerge.scene.files import SceneFiles
+    from gsmerge.scene.read import Loaded
 
 VIEWED = (".ply", ".spz", ".sog", ".splat", ".glb")  # endings that a page shows
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
@@ -77,17 +78,20 @@ def look(args: opt.Args) -> None:
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
         words = shlex.join(["gsmerge", "view", *map(str, shown)])
         raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
-    _compact(args, shown=True)
+    loads = list["Loaded"]()
+    _compact(args, loads.append)
     if args.dry_run or args.output.suffix.lower() not in VIEWED:
         return
     from gsmerge.cli.view_command import view
 
     before, *after = shown
     cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "hint"))
-    opt.call(view, before=before, after=after, **cameras, open=not args.json, quiet=args.silent)
+    loaded = replace(loads[0], notes=()) if after else None  # which were said
+    opt.call(view, before=before, after=after, **cameras, open=not args.json, quiet=args.silent, loaded=loaded)
 
 
-def _compact(args: opt.Args, *, shown: bool = False) -> None:
+def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:
+    """Run ``compact``; ``on_read`` is called with the scene, which a page shows later."""
     start = perf_counter()
     features = _features_in(args.scenes)
     if features is not None:
@@ -141,9 +145,9 @@ def _compact(args: opt.Args, *, shown: bool = False) -> None:
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
         document = compact_files(
             files, settings, outputs, opacity=args.opacity, hints=hints, progress=progress,
-            hashed=args.json, seconds_before=seconds_before,
+            hashed=args.json, seconds_before=seconds_before, on_read=on_read or (lambda _: None),
         )  # fmt: skip
-    _say_result(args, document, out, shown=shown)
+    _say_result(args, document, out, shown=on_read is not None)
 
 
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:

@@ -137,10 +137,18 @@ class Args(SimpleNamespace):
         return replace(first, more=tuple(others))
 
     def load(self, files: SceneFiles, **defaults: Any) -> Loaded:
-        """Read the scene of ``files``; ``defaults``: hints to use unless the user gave others."""
+        """Read the scene of ``files``, or take it from the command that called this one and has ``loaded`` it.
+
+        ``defaults``: hints to use unless the user gave others.
+        """
         from gsmerge.scene.read import load_files
 
-        return load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
+        loaded: Loaded | None = vars(self).get("loaded")
+        return (
+            loaded
+            if loaded and loaded.files == files
+            else load_files(files, opacity=self.opacity, hints=self.hints(**defaults))
+        )
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -60,10 +60,12 @@ def compact_files(
     progress: Progress | None = None,
     hashed: bool = False,
     seconds_before: Mapping[str, float] | None = None,
+    on_read: Callable[[Loaded], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
     ``hashed``: hash the input for the report. ``seconds_before``: wall time by name of the caller's earlier steps.
+    ``on_read`` is called with the scene.
 
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written, UsageError if the settings need what the scene does not have.
@@ -73,6 +75,7 @@ def compact_files(
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         first = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
+        on_read(load)
         check_colmap(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]

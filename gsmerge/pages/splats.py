@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
+from functools import reduce
 from math import prod
 from typing import Any
 
@@ -37,7 +38,7 @@ def pack_splats(
     """
     drawn = gaussians.opacities >= MIN_OPACITY
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= np.isfinite(values).reshape(len(values), -1).all(1)
+        drawn &= reduce(np.logical_and, np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T, True)
     rows, means = np.flatnonzero(drawn), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
     if count > MAX_GAUSSIANS:

@@ -18,6 +18,7 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -264,7 +265,7 @@ def fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
     """Quantise means; also returns the bits behind the point, by the scene's size and its farthest Gaussian."""
     fraction = 0
     if len(means):
-        size = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
+        size = np.median(reduce(np.maximum, np.abs(means - np.median(means, axis=0)).T))
         enough = fine - _octave(max(size, 1e-6))
         room = _octave(LARGEST / max(np.abs(means).max(), 1e-6))
         fraction = int(np.clip(min(enough, room), 0, MAX_FRACTION))
