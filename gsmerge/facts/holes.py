@@ -27,7 +27,7 @@ from gsmerge.raster import Splats, TiledView, prepare, tile_view
 from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.images import tile_views
 from gsmerge.raster.photos import NEAR
-from gsmerge.runtime.record import note
+from gsmerge.runtime.record import note, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 
@@ -210,6 +210,7 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
     return chosen
 
 
+@stage("fill")
 def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -> Gaussians:
     """Put Gaussians where cameras between and just beside those of the photos see nothing; faint ones make room.
 

@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.geometry import middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, prepare, tile_view
-from gsmerge.raster.composite import FARTHEST, blend, blend_depths, depth_colors
+from gsmerge.raster.composite import blend, blend_depths, depth_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import TiledView
@@ -34,6 +34,9 @@ PLACES = 42  # views outside, at most, or as many as there are photos
 SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
 ROWS = 4000  # Gaussians of the input for each photo that stand for all, made as much larger as they are fewer
 NEAREST = 0.25  # of the depth of what a view sees: nearer to a camera nothing is looked at
+# Quantile of the depths of what a view sees, and times that, from which on all depths count as one: a flyaway that
+# shimmers through would move the mean depth of its pixel
+LAST, FARTHEST = 0.98, 4.0
 EMPTY, SOLID = 0.15, 0.9  # opacities of the input: below it a pixel is empty, above it shows a surface
 # Distance from what the input shows, as a share of the width, within which nothing is asked: what stands beside the
 # outline fills what the foreground uncovers in new views
@@ -56,6 +59,7 @@ class Outside:
     views: Photos  # black; weights [v,h,w] of the pixels of which something is asked
     limits: np.ndarray  # [v,h,w] camera z before which nothing is to stand: infinite where nothing is to be at all
     near: np.ndarray  # [v] camera z from which on a view looks
+    far: np.ndarray  # [v] camera z at which what is farther counts as being
 
     def contradict(self, points: np.ndarray, share: float) -> np.ndarray:
         """Return a mask ``[n]`` of points ``[n,3]`` that some view sees before a ``share`` of its limit."""
@@ -81,12 +85,15 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     points = rows.means[:: max(1, len(rows) // SAMPLE)]
     placed = outside_cameras(points, cameras, min(looks, max(PLACES, len(photos))), LOW, HIGH)
-    depths = [middle_depth(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
-    near = NEAREST * np.resize(depths, len(placed))
+    used = [cameras[[view]] for view in range(min(len(placed), len(cameras)))]
+    near, far = (
+        scale * np.resize([middle_depth(points, camera, share) for camera in used], len(placed))
+        for scale, share in ((NEAREST, 0.5), (FARTHEST, LAST))
+    )
     views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
 
     def look(view: int) -> np.ndarray:
-        depths, left = blend_depths(_tile(drawn, views, view, near[view]), FARTHEST * near[view])
+        depths, left = blend_depths(_tile(drawn, views, view, near[view]), far[view])
         opacities = 1 - left
         return np.where(mark_empty(opacities), np.inf, np.where(opacities > SOLID, depths, 0)).astype(np.float32)
 
@@ -94,7 +101,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     weight = np.float32(np.clip(len(start) / (MANY * len(photos)), LIGHT, 1.0))
     weights = weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL, 0)).astype(np.float32)
     kept = np.flatnonzero((limits > 0).mean((1, 2)) > LEAST).tolist()
-    return Outside(replace(views[kept], weights=weights[kept]), limits[kept], near[kept]) if kept else None
+    return Outside(replace(views[kept], weights=weights[kept]), limits[kept], near[kept], far[kept]) if kept else None
 
 
 def _sample(scene: Scene, count: int) -> Gaussians:
@@ -148,7 +155,7 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     views, limits = outside.views, outside.limits[view]
     assert views.weights is not None
     tiled = _tile(splats, views, view, outside.near[view], _tiles_of(views.weights[view]))
-    depths = depth_colors(tiled, FARTHEST * outside.near[view])
+    depths = depth_colors(tiled, outside.far[view])
     image, left = blend(tiled, depths, np.zeros(3, np.float32))
     inverse = np.where(limits > 0, 1 / np.maximum(limits, np.float32(1e-12)), np.float32(0))
     hidden = 1 - left - image[..., 0] * inverse

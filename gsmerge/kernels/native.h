@@ -18,19 +18,27 @@ typedef float v8f __attribute__((vector_size(32), aligned(4)));
 typedef float v4f __attribute__((vector_size(16), aligned(4)));
 typedef float v2f __attribute__((vector_size(8), aligned(4)));
 typedef int32_t v4i __attribute__((vector_size(16), aligned(4)));
+typedef int32_t v8i __attribute__((vector_size(32), aligned(4)));
 typedef int32_t v16i __attribute__((vector_size(64), aligned(4)));
 
 static inline v16f splat(float x) { return x - (v16f){0}; }
+static inline v8f splat8(float x) { return x - (v8f){0}; }
 
 // a where the mask is set, b elsewhere. Masks are what comparisons give: all bits or none.
 static inline v16f sel(v16i mask, v16f a, v16f b) {
   return (v16f)((mask & (v16i)a) | (~mask & (v16i)b));
 }
 
+static inline v8f sel8(v8i mask, v8f a, v8f b) { return (v8f)((mask & (v8i)a) | (~mask & (v8i)b)); }
+
 static inline v16f load(const float *p) { return *(const v16f *)p; }
 static inline void store(float *p, v16f v) { *(v16f *)p = v; }
+static inline v8f load8(const float *p) { return *(const v8f *)p; }
+static inline void store8(float *p, v8f v) { *(v8f *)p = v; }
 
 #define PICK __builtin_shufflevector
+
+static inline v16f join8(v8f a, v8f b) { return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15); }
 
 // The sum of sixteen lanes, halves first.
 static inline float total(v16f v) {
@@ -60,8 +68,6 @@ static inline v8f totals(const v16f v[8]) {
   v16f b = add_halves4(add_halves8(v[4], v[5]), add_halves8(v[6], v[7])), c = add_halves2(a, b);
   return PICK(c, c, 0, 2, 4, 6, 8, 10, 12, 14) + PICK(c, c, 1, 3, 5, 7, 9, 11, 13, 15);
 }
-
-static inline void store8(float *p, v8f v) { *(v8f *)p = v; }
 
 static inline float minf(float a, float b) { return a < b ? a : b; }
 static inline float maxf(float a, float b) { return a > b ? a : b; }

@@ -18,7 +18,7 @@ from gsmerge.fit.report import HAZE
 from gsmerge.geometry import middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, prepare, tile_view
-from gsmerge.raster.composite import FARTHEST, blend_depths
+from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
@@ -122,7 +122,7 @@ def look(splats: Splats, camera: Cameras, near: float, nearest: float) -> Sight:
         tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
         for plane in (near, nearest)
     ]
-    (_, left), (depths, left_beyond) = (blend_depths(tiled, FARTHEST * nearest) for tiled in views)
+    (_, left), (depths, left_beyond) = map(blend_depths, views)
     return Sight(1 - left, 1 - left_beyond, depths)
 
 

@@ -16,9 +16,6 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
 from gsmerge.types import Cameras, Gaussians, as_array
 
-# Times the nearest depth that a look from outside takes in, from which on all depths count as one: a flyaway that
-# shimmers through would move the mean depth of its pixel
-FARTHEST = 40
 TINY = 1e-6  # least opacity that depths are divided by
 SHOWN = 4  # views of a rendering that a notebook shows
 
@@ -61,7 +58,7 @@ def depth_colors(tiled: TiledView, farthest: float = np.inf) -> Array:
 
 
 def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Array]:
-    """Blend the mean depth ``[h,w]``, camera z, at most ``farthest``, that a view sees, and the transmittance."""
+    """Blend the mean of the depths ``[h,w]``, each at most ``farthest``, that a view sees, and the transmittance."""
     blended, left = blend(tiled, depth_colors(tiled, farthest), np.zeros(3, np.float32))
     return blended[..., 0] / np.maximum(1 - left, np.float32(TINY)), left
 

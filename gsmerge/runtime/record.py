@@ -20,7 +20,7 @@ Progress = Callable[[str, int, int], None]
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "join", "fit", "score", "input",
+    "cover", "decode", "join", "fit", "fill", "score", "input",
 )  # fmt: skip
 
 

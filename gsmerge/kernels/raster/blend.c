@@ -6,53 +6,66 @@
 
 enum { CHANNELS = 4 };  // channels that one walk of weighted_sums adds up
 
-// Sum and largest of the weights of one Gaussian, by column.
-typedef struct { v16f sum, peak; } Weights;
-
-static inline Weights add_weights(Weights w, v16f weight) {
-  return (Weights){w.sum + weight, sel(weight > w.peak, weight, w.peak)};
-}
+// Sum and largest of the weights of one Gaussian over rows, by column.
+typedef struct { v8f sum, peak; } Weights;
 
 static inline v4f max4(v4f a, v4f b) { return (v4f)(((a > b) & (v4i)a) | (~(a > b) & (v4i)b)); }
 
-// Add a sum to own[0]; raise own[1] to the peak.
-static inline void add_total(float *own, Weights w) {
-  v16f p = w.peak;
-  v4f a = max4(PICK(p, p, 0, 1, 2, 3), PICK(p, p, 4, 5, 6, 7));
-  v4f b = max4(a, max4(PICK(p, p, 8, 9, 10, 11), PICK(p, p, 12, 13, 14, 15)));
-  own[0] += total(w.sum);
-  own[1] = maxf(own[1], maxf(maxf(b[0], b[1]), maxf(b[2], b[3])));
+// Add the sums of both halves of a tile to own[0]; raise own[1] to their peak.
+static inline void add_total(float *own, const Weights w[2]) {
+  v4f peaks[2];
+  for (int i = 0; i < 2; i++)
+    peaks[i] = max4(PICK(w[i].peak, w[i].peak, 0, 1, 2, 3), PICK(w[i].peak, w[i].peak, 4, 5, 6, 7));
+  v4f peak = max4(peaks[0], peaks[1]);
+  own[0] += total(join8(w[0].sum, w[1].sum));
+  own[1] = maxf(own[1], maxf(maxf(peak[0], peak[1]), maxf(peak[2], peak[3])));
 }
 
-// Blend Gaussian j of a batch over rows y0 to y1; planes 1 to 3 collect the colour -> its weights, if anybody asks.
-static inline Weights blend_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
-  Curve curve = curve_of(b, (int)j);
+// Blend Gaussian j of a batch over rows y0 to y1 of eight columns; planes 1 to 3 collect the colour, if there are such ->
+// its weights, if anybody asks.
+static inline Weights blend_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
+                                 bool colored) {
   Weights weights = {{0}, {0}};
   float red = b->red[j], green = b->green[j], blue = b->blue[j];
   for (int32_t y = y0; y <= y1; y++) {
-    float *row = state + y * TILE;
-    Share s = take_share(load(row), exponents(&curve, (float)y - curve.my));
-    store(row, s.left);
-    store(row + PLANE, load(row + PLANE) + s.weight * red);
-    store(row + 2 * PLANE, load(row + 2 * PLANE) + s.weight * green);
-    store(row + 3 * PLANE, load(row + 3 * PLANE) + s.weight * blue);
-    weights = add_weights(weights, s.weight);
+    float *row = columns + y * TILE;
+    Share s = take_share(load8(row), alphas[y]);
+    store8(row, s.left);
+    if (colored) {
+      store8(row + PLANE, load8(row + PLANE) + s.weight * red);
+      store8(row + 2 * PLANE, load8(row + 2 * PLANE) + s.weight * green);
+      store8(row + 3 * PLANE, load8(row + 3 * PLANE) + s.weight * blue);
+    }
+    weights.sum += s.weight;
+    weights.peak = sel8(s.weight > weights.peak, s.weight, weights.peak);
   }
   return weights;
 }
 
-// Blend Gaussian j over half a tile's columns, two rows at a time: the same bits.
-static inline void blend_pairs(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
-  Curve curve = pair_curve_of(b, (int)j);
-  float red = b->red[j], green = b->green[j], blue = b->blue[j];
-  for (int32_t y = first_pair(y0, y1); y <= y1; y += 2) {
-    float *row = state + y * TILE + b->x0[j];
-    Share s = take_share(load_pair(row), pair_exponents(&curve, y, y0, y1));
-    store_pair(row, s.left);
-    store_pair(row + PLANE, load_pair(row + PLANE) + s.weight * red);
-    store_pair(row + 2 * PLANE, load_pair(row + 2 * PLANE) + s.weight * green);
-    store_pair(row + 3 * PLANE, load_pair(row + 3 * PLANE) + s.weight * blue);
+// Blend Gaussian j of a batch over the eight columns in which it shows, or over both halves of the tile.
+static inline void blend_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
+  Curve curve;
+  v8f alphas[TILE];
+  trace(&curve, b, j);
+  bool wide = b->x0[j] == WIDE;
+  for (int32_t x = wide ? 0 : b->x0[j]; x <= (wide ? HALF : b->x0[j]); x += HALF) {
+    fill_alphas(alphas, &curve, x, y0, y1);
+    blend_rows(state + x, alphas, b, j, y0, y1, true);
   }
+}
+
+// Blend Gaussian j of a batch over the whole tile, and add its weights to a row of totals.
+static inline void survey_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, bool colored,
+                              float *own) {
+  Curve curve;
+  v8f alphas[TILE];
+  Weights weights[2];
+  trace(&curve, b, j);
+  for (int half = 0; half < 2; half++) {
+    fill_alphas(alphas, &curve, half * HALF, y0, y1);
+    weights[half] = blend_rows(state + half * HALF, alphas, b, j, y0, y1, colored);
+  }
+  add_total(own, weights);
 }
 
 API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_ids,
@@ -74,11 +87,7 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++) {
         int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
-        if (y0 > y1) continue;
-        if (batch.x0[j] == WIDE)
-          blend_rows(state, &batch, j, y0, y1);
-        else
-          blend_pairs(state, &batch, j, y0, y1);
+        if (y0 <= y1) blend_one(state, &batch, j, y0, y1);
       }
       narrow_tile(&t, state);
     }
@@ -97,15 +106,19 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
 // Weights of Gaussian j times the planes of some channels, summed over the tile.
 static inline void sum_weights(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, int channels,
                                float *slot) {
-  v16f sums[CHANNELS] = {{0}};
-  Curve curve = curve_of(b, (int)j);
-  for (int32_t y = y0; y <= y1; y++) {
-    float *row = state + y * TILE;
-    Share s = take_share(load(row), exponents(&curve, (float)y - curve.my));
-    store(row, s.left);
-    for (int c = 0; c < channels; c++) sums[c] += s.weight * load(row + (c + 1) * PLANE);
+  v8f sums[2][CHANNELS] = {{{0}}}, alphas[TILE];
+  Curve curve;
+  trace(&curve, b, j);
+  for (int half = 0; half < 2; half++) {
+    fill_alphas(alphas, &curve, half * HALF, y0, y1);
+    for (int32_t y = y0; y <= y1; y++) {
+      float *row = state + y * TILE + half * HALF;
+      Share s = take_share(load8(row), alphas[y]);
+      store8(row, s.left);
+      for (int c = 0; c < channels; c++) sums[half][c] += s.weight * load8(row + (c + 1) * PLANE);
+    }
   }
-  for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(sums[c]) : 0.f;
+  for (int c = 0; c < CHANNELS; c++) slot[c] = c < channels ? total(join8(sums[0][c], sums[1][c])) : 0.f;
 }
 
 API int32_t weighted_sums(const float *restrict conics, const int32_t *restrict flatten_ids,
@@ -175,8 +188,8 @@ API int32_t survey(const float *restrict conics, const int32_t *restrict flatten
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       gather_colors(&batch, colors, flatten_ids, start, stop, end);
       for (int64_t j = 0; j < stop - start; j++)
-        add_total(totals + 2 * (int64_t)flatten_ids[start + j],
-                  blend_rows(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j)));
+        survey_one(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), true,
+                   totals + 2 * (int64_t)flatten_ids[start + j]);
       narrow_tile(&t, state);
     }
     for (int y = 0; y < t.num_y; y++)
@@ -202,16 +215,9 @@ API int32_t contributions(const float *restrict conics, const int32_t *restrict 
       int64_t stop = mini(end, start + BATCH);
       if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
       for (int64_t i = start; i < stop; i++) __builtin_prefetch(totals + 2 * (int64_t)flatten_ids[i]);
-      for (int64_t j = 0; j < stop - start; j++) {
-        Curve curve = curve_of(&batch, (int)j);
-        Weights weights = {{0}, {0}};
-        for (int32_t y = first_row(&t, &batch, j); y <= last_row(&t, &batch, j); y++) {
-          Share s = take_share(load(state + y * TILE), exponents(&curve, (float)y - curve.my));
-          store(state + y * TILE, s.left);
-          weights = add_weights(weights, s.weight);
-        }
-        add_total(totals + 2 * (int64_t)flatten_ids[start + j], weights);
-      }
+      for (int64_t j = 0; j < stop - start; j++)
+        survey_one(state, &batch, j, first_row(&t, &batch, j), last_row(&t, &batch, j), false,
+                   totals + 2 * (int64_t)flatten_ids[start + j]);
       narrow_tile(&t, state);
     }
   }

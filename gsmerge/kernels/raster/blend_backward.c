@@ -13,61 +13,58 @@ enum { SUMS = 9 };
 
 // Sums over rows, by column, of what pixels want of one Gaussian: v are the gradients of ln alpha.
 typedef struct {
-  v16f red, green, blue, v, vy, vyy;
+  v8f red, green, blue, v, vy, vyy;
 } Wants;
 
-// Take the share of a Gaussian off sixteen pixels, with gradients of their colours, and add what they want of it.
-static inline v16f take_back(Wants *w, Share s, v16f rest, const v16f g[3], const float color[3], v16f dy) {
-  v16f own = s.weight * (color[0] * g[0] + color[1] * g[1] + color[2] * g[2]);
-  rest = rest - own;
-  v16f v = own - s.alpha * rest / (1.f - s.alpha);
-  v = sel(s.goes & s.unclamped, v, splat(0.f));
-  v16f vy = v * dy;
-  w->red += s.weight * g[0];
-  w->green += s.weight * g[1];
-  w->blue += s.weight * g[2];
-  w->v += v;
-  w->vy += vy;
-  w->vyy += vy * dy;
-  return rest;
+// Take Gaussian j of a batch off the pixels of rows y0 to y1, or of every second, of eight columns -> what they want.
+static inline Wants walk_rows(float *columns, const v8f *alphas, const Batch *b, int64_t j, int32_t y0, int32_t y1,
+                              int32_t step) {
+  float my = b->my[j], red = b->red[j], green = b->green[j], blue = b->blue[j];
+  Wants w = {{0}, {0}, {0}, {0}, {0}, {0}};
+  for (int32_t y = y0; y <= y1; y += step) {
+    float *row = columns + y * TILE, dy = (float)y - my;
+    Share s = take_share(load8(row), alphas[y]);
+    v8f g0 = load8(row + 2 * PLANE), g1 = load8(row + 3 * PLANE), g2 = load8(row + 4 * PLANE);
+    v8f own = s.weight * (red * g0 + green * g1 + blue * g2), rest = load8(row + PLANE) - own;
+    v8f v = sel8(s.goes & s.unclamped, own - s.alpha * rest / (1.f - s.alpha), splat8(0.f)), vy = v * dy;
+    store8(row, s.left);
+    store8(row + PLANE, rest);
+    w.red += s.weight * g0;
+    w.green += s.weight * g1;
+    w.blue += s.weight * g2;
+    w.v += v;
+    w.vy += vy;
+    w.vyy += vy * dy;
+  }
+  return w;
 }
 
 // Add all columns; x is the same in all rows of a lane, so its moments wait until here.
-static inline void add_columns(const Wants *w, v16f dx, float *slot) {
-  v16f vx = w->v * dx;
-  store8(slot, totals((v16f[8]){w->red, w->green, w->blue, w->v, vx, w->vy, vx * dx, w->vy * dx}));
-  slot[8] = total(w->vyy);
+static inline void add_columns(Wants a, Wants b, v16f dx, float *slot) {
+  v16f v = join8(a.v, b.v), vy = join8(a.vy, b.vy), vx = v * dx;
+  v16f sums[8] = {join8(a.red, b.red), join8(a.green, b.green), join8(a.blue, b.blue), v, vx, vy, vx * dx, vy * dx};
+  store8(slot, totals(sums));
+  slot[8] = total(join8(a.vyy, b.vyy));
 }
 
-// Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it.
-static inline void walk_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
-  Curve curve = curve_of(b, (int)j);
-  float color[3] = {b->red[j], b->green[j], b->blue[j]};
-  Wants wants = {{0}, {0}, {0}, {0}, {0}, {0}};
-  for (int32_t y = y0; y <= y1; y++) {
-    float *row = state + y * TILE, dy = (float)y - curve.my;
-    Share s = take_share(load(row), exponents(&curve, dy));
-    v16f g[3] = {load(row + 2 * PLANE), load(row + 3 * PLANE), load(row + 4 * PLANE)};
-    store(row, s.left);
-    store(row + PLANE, take_back(&wants, s, load(row + PLANE), g, color, splat(dy)));
+// Take Gaussian j of a batch off the pixels of rows y0 to y1 and write what they want of it. Sixteen sums are kept by
+// column: of both halves of the tile, or of the even and the odd rows of the eight columns in which it shows.
+static inline void walk_one(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
+  Curve curve;
+  v8f alphas[TILE];
+  trace(&curve, b, j);
+  if (b->x0[j] == WIDE) {
+    fill_alphas(alphas, &curve, 0, y0, y1);
+    Wants left = walk_rows(state, alphas, b, j, y0, y1, 1);
+    fill_alphas(alphas, &curve, HALF, y0, y1);
+    add_columns(left, walk_rows(state + HALF, alphas, b, j, y0, y1, 1), COLUMNS - b->mx[j], slot);
+  } else {
+    int32_t odd = y0 > 0 && (y1 - y0) % 2 == 0, x = b->x0[j];  // whether the rows begin with the second of a pair
+    fill_alphas(alphas, &curve, x, y0, y1);
+    Wants first = walk_rows(state + x, alphas, b, j, y0 + odd, y1, 2);
+    Wants second = walk_rows(state + x, alphas, b, j, y0 + 1 - odd, y1, 2);
+    add_columns(first, second, PAIR_COLUMNS + (float)x - b->mx[j], slot);
   }
-  add_columns(&wants, COLUMNS - curve.mx, slot);
-}
-
-// The same over half a tile's columns, two rows at a time.
-static inline void walk_pairs(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1, float *slot) {
-  Curve curve = pair_curve_of(b, (int)j);
-  float color[3] = {b->red[j], b->green[j], b->blue[j]};
-  Wants wants = {{0}, {0}, {0}, {0}, {0}, {0}};
-  for (int32_t y = first_pair(y0, y1); y <= y1; y += 2) {
-    float *row = state + y * TILE + b->x0[j];
-    Share s = take_share(load_pair(row), pair_exponents(&curve, y, y0, y1));
-    v16f g[3] = {load_pair(row + 2 * PLANE), load_pair(row + 3 * PLANE), load_pair(row + 4 * PLANE)};
-    v16f dy = splat_pair((float)y - curve.my, (float)(y + 1) - curve.my);
-    store_pair(row, s.left);
-    store_pair(row + PLANE, take_back(&wants, s, load_pair(row + PLANE), g, color, dy));
-  }
-  add_columns(&wants, PAIR_COLUMNS + (float)b->x0[j] - curve.mx, slot);
 }
 
 API int32_t blend_backward(const float *restrict conics, const int32_t *restrict flatten_ids,
@@ -104,10 +101,8 @@ API int32_t blend_backward(const float *restrict conics, const int32_t *restrict
         float *slot = slots + SUMS * (start + j);
         if (y0 > y1)
           for (int c = 0; c < SUMS; c++) slot[c] = 0.f;
-        else if (batch.x0[j] == WIDE)
-          walk_rows(state, &batch, j, y0, y1, slot);
         else
-          walk_pairs(state, &batch, j, y0, y1, slot);
+          walk_one(state, &batch, j, y0, y1, slot);
       }
       narrow_tile(&t, state);
     }

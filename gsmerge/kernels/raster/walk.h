@@ -1,4 +1,4 @@
-// A Gaussian of a batch over the rows of a tile, sixteen pixels at a time: what the blending kernels share.
+// A Gaussian of a batch over the rows of a tile, eight pixels at a time: what the blending kernels share.
 //
 // A tile's state lives in planes of 16 x 16 floats. The weights are gsplat's: alpha clamped at 0.99, cut below 1/255,
 // and a pixel stops before the Gaussian that would take its transmittance to 1e-4 or below. Plane 0 of the state is the
@@ -16,6 +16,7 @@ enum { TILE = 16, HALF = TILE / 2, PLANE = TILE * TILE, BATCH = 32, CONIC = 8, S
 
 static const v16f COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 static const v16f PAIR_COLUMNS = {0, 1, 2, 3, 4, 5, 6, 7, 0, 1, 2, 3, 4, 5, 6, 7};  // of two rows of half a tile
+static const v8f EIGHT = {0, 1, 2, 3, 4, 5, 6, 7};
 
 // Gaussians relative to the tile's first pixel centre: ln w = lnop - (rate (x - mx - slope (y - my)))^2 - decay (y - my)^2.
 typedef struct {
@@ -25,11 +26,11 @@ typedef struct {
   int32_t x0[BATCH];  // first of the eight columns in which each shows; WIDE where these are more
 } Batch;
 
-// Part of the light of sixteen pixels that a Gaussian takes.
+// Part of the light of eight pixels of a row that a Gaussian takes.
 typedef struct {
-  v16f alpha, weight;  // alpha times the transmittance; 0 where the pixel stops
-  v16f left;           // transmittance behind it; negative where the pixel stopped
-  v16i unclamped, goes;  // alpha is below 0.99; the pixel does not stop here or before
+  v8f alpha, weight;  // alpha times the transmittance; 0 where the pixel stops
+  v8f left;           // transmittance behind it; negative where the pixel stopped
+  v8i unclamped, goes;  // alpha is below 0.99; the pixel does not stop here or before
 } Share;
 
 // The tile on which a kernel works.
@@ -40,67 +41,41 @@ typedef struct {
 } Tile;
 
 // exp(p) = poly(p)^8 on [ln(1/255), 0]: minimax of relative error 8e-8 for exp(p / 8), coefficients scaled by 8^-k.
-static inline Share take_share(v16f t, v16f p) {
-  v16f e = 0.99999992f
+static inline v8f alphas_at(v8f p) {
+  v8f e = 0.99999992f
       + p * (0.12499907f + p * (0.0078106653f + p * (3.2416797e-4f + p * (9.7100983e-6f + p * 1.7842896e-7f))));
   e = e * e;
   e = e * e;
   e = e * e;
-  Share s;
-  s.unclamped = e < MAX_ALPHA;
-  s.alpha = sel(p >= LN_CUT, sel(s.unclamped, e, splat(MAX_ALPHA)), splat(0.f));
-  s.weight = s.alpha * t;
+  return sel8(p >= LN_CUT, sel8(e < MAX_ALPHA, e, splat8(MAX_ALPHA)), splat8(0.f));
+}
+
+static inline Share take_share(v8f t, v8f alpha) {
+  Share s = {alpha, alpha * t, t, alpha < MAX_ALPHA, {0}};
   s.left = t - s.weight;
   s.goes = s.left > MIN_TRANSMITTANCE;
-  s.weight = sel(s.goes, s.weight, splat(0.f));
-  s.left = sel(s.goes, s.left, (v16f)((v16i)t | INT32_MIN));
+  s.weight = sel8(s.goes, s.weight, splat8(0.f));
+  s.left = sel8(s.goes, s.left, (v8f)((v8i)t | INT32_MIN));
   return s;
 }
 
-// What the rows of Gaussian j need: p of row y in two steps.
-typedef struct { v16f across; float mx, my, rate, slope, decay, lnop; } Curve;
+// The exponents of Gaussian j of a batch: top - (rate x - base)^2 in each row of the tile, never positive beyond lnop.
+typedef struct { float base[TILE], top[TILE], rate; } Curve;
 
-static inline Curve curve_of(const Batch *b, int j) {
-  float rate = b->rate[j];
-  return (Curve){rate * COLUMNS, b->mx[j], b->my[j], rate, b->slope[j], b->decay[j], b->lnop[j]};
+static inline void trace(Curve *c, const Batch *b, int64_t j) {
+  v16f dy = COLUMNS - b->my[j];
+  store(c->base, b->rate[j] * (b->mx[j] + b->slope[j] * dy));
+  store(c->top, b->lnop[j] - b->decay[j] * dy * dy);
+  c->rate = b->rate[j];
 }
 
-// Exponents of the sixteen pixels of the row dy below the mean; never positive beyond lnop.
-static inline v16f exponents(const Curve *c, float dy) {
-  v16f d = c->across - c->rate * (c->mx + c->slope * dy);
-  return (c->lnop - c->decay * dy * dy) - d * d;
-}
-
-// Eight pixels of a row, and those below them.
-static inline v16f load_pair(const float *p) {
-  v8f upper = *(const v8f *)p, lower = *(const v8f *)(p + TILE);
-  return PICK(upper, lower, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
-}
-static inline void store_pair(float *p, v16f v) {
-  *(v8f *)p = PICK(v, v, 0, 1, 2, 3, 4, 5, 6, 7);
-  *(v8f *)(p + TILE) = PICK(v, v, 8, 9, 10, 11, 12, 13, 14, 15);
-}
-static inline v16f splat_pair(float upper, float lower) {
-  v16f a = splat(upper), b = splat(lower);
-  return PICK(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
-}
-
-// The curve over eight columns from x0 on, twice.
-static inline Curve pair_curve_of(const Batch *b, int j) {
-  Curve curve = curve_of(b, j);
-  curve.across = curve.rate * (PAIR_COLUMNS + (float)b->x0[j]);
-  return curve;
-}
-
-// First row of the pairs that cover y0 to y1 and, where their number is odd, a row of the tile beside them.
-static inline int32_t first_pair(int32_t y0, int32_t y1) { return y0 > 0 && (y1 - y0) % 2 == 0 ? y0 - 1 : y0; }
-
-// Exponents of rows y and y + 1 by the same arithmetic as exponents(); far below the cut outside of y0 to y1.
-static inline v16f pair_exponents(const Curve *c, int32_t y, int32_t y0, int32_t y1) {
-  float dy = (float)y - c->my, below = (float)(y + 1) - c->my;
-  float upper = c->lnop - c->decay * dy * dy, lower = c->lnop - c->decay * below * below;
-  v16f d = c->across - splat_pair(c->rate * (c->mx + c->slope * dy), c->rate * (c->mx + c->slope * below));
-  return splat_pair(y < y0 ? HIDDEN : upper, y < y1 ? lower : HIDDEN) - d * d;
+// Alphas of rows y0 to y1 over the eight columns from x on.
+static inline void fill_alphas(v8f *alphas, const Curve *c, int32_t x, int32_t y0, int32_t y1) {
+  v8f across = c->rate * (EIGHT + (float)x);
+  for (int32_t y = y0; y <= y1; y++) {
+    v8f d = across - c->base[y];
+    alphas[y] = alphas_at(c->top[y] - d * d);
+  }
 }
 
 static inline float clamp_column(float x) {
@@ -160,28 +135,47 @@ static inline bool lists_are_sound(const Lists *l, int64_t first, int64_t last) 
   return true;
 }
 
+// Rows become columns.
+static inline void transpose8(v8f r[8]) {
+  v8f a[8], b[8];
+  for (int k = 0; k < 8; k += 2) {
+    a[k] = PICK(r[k], r[k + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+    a[k + 1] = PICK(r[k], r[k + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+  }
+  for (int k = 0; k < 8; k += 4)
+    for (int q = 0; q < 2; q++) {
+      b[k + 2 * q] = PICK(a[k + q], a[k + q + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+      b[k + 2 * q + 1] = PICK(a[k + q], a[k + q + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+    }
+  for (int q = 0; q < 4; q++) {
+    r[q] = PICK(b[q], b[q + 4], 0, 1, 2, 3, 8, 9, 10, 11);
+    r[q + 4] = PICK(b[q], b[q + 4], 4, 5, 6, 7, 12, 13, 14, 15);
+  }
+}
+
 // Copy the conics of the intersections start to stop into the batch, and call for those of the next batch -> whether
 // there are such conics.
 static inline bool gather(Batch *b, const Tile *tile, const Lists *l, int64_t start, int64_t stop, int64_t end) {
   float left = (float)tile->left + 0.5f, top = (float)tile->top + 0.5f;
-  const float *conics = l->conics;
-  const int32_t *flatten_ids = l->flatten_ids;
-  for (int64_t i = start; i < stop; i++) {
-    if ((uint64_t)(int64_t)flatten_ids[i] >= (uint64_t)l->m) return false;
-    const float *f = conics + CONIC * (int64_t)flatten_ids[i];
-    int64_t j = i - start;
-    b->mx[j] = f[0] - left;
-    b->my[j] = f[1] - top;
-    b->rate[j] = f[2];
-    b->slope[j] = f[3];
-    b->decay[j] = f[4];
-    b->lnop[j] = f[5];
-    b->first[j] = f[6] - (float)tile->top;
-    b->last[j] = f[7] - (float)tile->top;
+  const int32_t *ids = l->flatten_ids;
+  bool outside = false;
+  for (int64_t i = start; i < stop; i++) outside |= (uint64_t)(int64_t)ids[i] >= (uint64_t)l->m;
+  if (outside) return false;
+  for (int64_t j = 0; j < stop - start; j += 8) {
+    v8f r[8];
+    for (int k = 0; k < 8; k++) r[k] = load8(l->conics + CONIC * (int64_t)ids[mini(start + j + k, stop - 1)]);
+    transpose8(r);
+    store8(b->mx + j, r[0] - left);
+    store8(b->my + j, r[1] - top);
+    store8(b->rate + j, r[2]);
+    store8(b->slope + j, r[3]);
+    store8(b->decay + j, r[4]);
+    store8(b->lnop + j, r[5]);
+    store8(b->first + j, r[6] - (float)tile->top);
+    store8(b->last + j, r[7] - (float)tile->top);
   }
   narrow_rows(b);
-  for (int64_t i = stop; i < end && i < stop + BATCH; i++)
-    __builtin_prefetch(conics + CONIC * (int64_t)flatten_ids[i]);
+  for (int64_t i = stop; i < end && i < stop + BATCH; i++) __builtin_prefetch(l->conics + CONIC * (int64_t)ids[i]);
   return true;
 }
 
@@ -230,11 +224,17 @@ static inline int32_t last_row(const Tile *tile, const Batch *b, int64_t j) {
 
 // Blend Gaussian j of a batch over rows y0 to y1; plane 1 receives its weights.
 static inline void weigh_rows(float *state, const Batch *b, int64_t j, int32_t y0, int32_t y1) {
-  Curve curve = curve_of(b, (int)j);
-  for (int32_t y = y0; y <= y1; y++) {
-    Share s = take_share(load(state + y * TILE), exponents(&curve, (float)y - curve.my));
-    store(state + y * TILE, s.left);
-    store(state + PLANE + y * TILE, s.weight);
+  Curve curve;
+  v8f alphas[TILE];
+  trace(&curve, b, j);
+  for (int32_t x = 0; x < TILE; x += HALF) {
+    fill_alphas(alphas, &curve, x, y0, y1);
+    for (int32_t y = y0; y <= y1; y++) {
+      float *row = state + y * TILE + x;
+      Share s = take_share(load8(row), alphas[y]);
+      store8(row, s.left);
+      store8(row + PLANE, s.weight);
+    }
   }
 }
 
