@@ -11,6 +11,7 @@ from messages import says
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.compaction import files
 
 from .conftest import Run, assert_refused, listing
 
@@ -30,7 +31,11 @@ def pages_in(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.html"))
 
 
-def test_a_scene_alone_is_compacted_and_shown(smallest_copy: Path, run: Run, opened: list[str]) -> None:
+def test_a_scene_alone_is_compacted_and_shown(
+    smallest_copy: Path, run: Run, opened: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert files.load_files  # which reads the scene, once
+    monkeypatch.setattr("gsmerge.scene.read.load_files", lambda *_, **__: pytest.fail("the page reads it again"))
     said = run(smallest_copy / "scene.ply", *FAST, code=0)
     (page,) = pages_in(smallest_copy)
     assert opened == [page.as_uri()]
