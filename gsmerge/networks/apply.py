@@ -16,7 +16,7 @@ from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
-from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, WIDE, NetworkOptions
 from gsmerge.networks.tokens import (
     GroupFeatures,
     compute_group_features,
@@ -71,7 +71,7 @@ class NetworkContext(Corrector):
     def decode_covars(self, features: FeatureGaussians) -> Array:
         """Run the head for K = 1; return the covariances ``[g,3,3]`` of its Gaussians."""
         described = self.describe(features)
-        decoded = decode_with_group_features(described.base, np.arange(len(features)), described, self)
+        decoded = decode_gaussians(described.base, np.arange(len(features)), described, self)
         return covariances(decoded.quats, decoded.scales)
 
     def merge(
@@ -92,7 +92,7 @@ class NetworkContext(Corrector):
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Run the heads, see :func:`decode_gaussians`."""
-        return decode_gaussians(children, parents, features, self)
+        return decode_gaussians(children, parents, self.describe(features), self)
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
         """Decode every Feature Gaussian into one Gaussian."""
@@ -226,21 +226,14 @@ def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: Netwo
 
 
 def decode_gaussians(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, context: NetworkContext
+    children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Gaussians:
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
-    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``features``, ascending. Three children
-    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own, which
-    heads with absolute outputs cannot do.
+    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``group_features``, ascending. Three
+    children use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its
+    own, which heads with absolute outputs cannot do.
     """
-    return decode_with_group_features(children, parents, context.describe(features), context)
-
-
-def decode_with_group_features(
-    children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
-) -> Gaussians:
-    """Correct children as :func:`decode_gaussians` does, from group features that were computed before."""
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
     return move_gaussians(children, residuals, parents, group_features.frames)
@@ -285,7 +278,7 @@ def run_heads(
         outputs.append(_run_head(children, (owners[rows], ids, mask), group_features, context))
         places[ids[mask]] = total + np.flatnonzero(mask)
         total += mask.size
-    return scale_outputs(concat_rows(outputs)[places], options.head_bounds)
+    return scale_outputs(concat_rows(outputs)[places], WIDE if options.makes_children else options.bounds)
 
 
 def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

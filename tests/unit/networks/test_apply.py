@@ -11,7 +11,6 @@ from gsmerge.geometry import covariances
 from gsmerge.networks.apply import (
     NetworkContext,
     decode_gaussians,
-    decode_with_group_features,
     encode_features,
     find_neighbors,
     refine_features,
@@ -148,9 +147,9 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     few = take(encoded, large)
     children, parents = divide(few, scene.members, np.full(len(few), 6))
     assert np.bincount(parents).tolist() == [6] * len(few)
-    together = decode_gaussians(children, parents, few, context)
+    together = context.decode(children, parents, few)
     for half in (np.arange(len(parents)) % 6 < 3, np.arange(len(parents)) % 6 >= 3):
-        assert_close(together[half], decode_gaussians(children[half], parents[half], few, context))
+        assert_close(together[half], context.decode(children[half], parents[half], few))
     assert not np.array_equal(together.means, children.means)
 
 
@@ -285,14 +284,14 @@ def test_heads_of_the_paper_read_latent_mass_and_base_colour_alone(scene: Made) 
     parents, changed = np.arange(len(features)), described.group.copy()
     changed[:, [i for i in range(GROUP) if i not in PAPER_NUMBERS]] += 1
     before, after = (
-        decode_with_group_features(described.base, parents, replace(described, group=group), context)
+        decode_gaussians(described.base, parents, replace(described, group=group), context)
         for group in (described.group, changed)
     )
     assert_close(before, after)
     for column in PAPER_NUMBERS:
         changed = described.group.copy()
         changed[:, column] += 1
-        other = decode_with_group_features(described.base, parents, replace(described, group=changed), context)
+        other = decode_gaussians(described.base, parents, replace(described, group=changed), context)
         assert not np.array_equal(other.scales, before.scales)
 
 
