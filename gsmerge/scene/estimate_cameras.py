@@ -128,7 +128,8 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     choices = [(number, list(chosen)) for number in range(len(fits)) for chosen in in_order]
     choices += [(number, alike[:, number].argmax(0).tolist()) for number in range(len(fits))]
     options = [(alike[chosen, number, range(views)], number, chosen) for number, chosen in choices]
-    options = [option for option in options if len(set(option[2])) == views and _show(option[0])]
+    options = [option for option in options if len(set(option[2])) == views]
+    options = [option for option in options if option[0].mean() >= _MIN_ALIKE and option[0].min() >= _MIN_ALIKE_EACH]
     if not options:
         return None
     best = max(float(each.mean()) for each, _, _ in options)
@@ -136,11 +137,6 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     _, number, chosen = max(near or options, key=lambda option: round(float(option[0].mean()), 3))
     trim, transform = fits[number]
     return PhotoMatch(chosen, size, transform, trim)
-
-
-def _show(alike: np.ndarray) -> bool:
-    """Return whether photos with these correlations to the views ``[v]`` show them."""
-    return bool(alike.mean() >= _MIN_ALIKE and alike.min() >= _MIN_ALIKE_EACH)
 
 
 def _transforms(size: Size, width: int, height: int) -> list[PhotoTransform]:
