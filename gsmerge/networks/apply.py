@@ -77,13 +77,56 @@ class NetworkContext(Corrector):
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:
-        """Run the merger, see :func:`merge_features`."""
-        return merge_features(pooled, parts, order, cuts, self)
+        """Correct c merged Feature Gaussians with the merger (paper section 4.4).
+
+        Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
+        paper the merger corrects the first of these rows instead of the pooled one.
+        """
+        options = self.options
+        if not options.merger:
+            return pooled
+        if options.merger_start == "first":
+            first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
+            pooled = replace(pooled, **first)
+        group_features, base = self.describe(pooled), self.make_base(parts)
+        sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
+        from_means, means = as_array(parts.means), as_array(pooled.means)
+
+        def run(rows: np.ndarray, width: int) -> Array:
+            positions, owners = group_rows(cuts[rows], sizes[rows])
+            keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
+            sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
+            ids = order[positions][sample.reshape(-1)]
+            relative = self.make_tokens(base, ids, np.repeat(rows, width), group_features)
+            tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
+            return self.networks.run("merger", tokens, mask, group_features.group[rows])
+
+        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run)
+        return _apply_outputs(group_features, outputs, self)
 
     @stage("refine")
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the refiner, see :func:`refine_features`."""
-        return refine_features(features, self)
+        """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
+        options = self.options
+        if len(features) == 0 or not options.refiner:
+            return features
+        group_features, views = self.describe(features), features.views
+        neighbors = find_neighbors(as_array(features.means), options.neighbors)
+        count, width = len(features), neighbors.shape[1] + 1
+        table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
+
+        def run(rows: np.ndarray, _: int) -> Array:
+            ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
+            mask = ids >= 0
+            ids = np.where(mask, ids, owners)
+            relative = self.make_tokens(group_features.base, ids, owners, group_features)
+            same = (views[ids] == views[owners]).astype(np.float32)[:, None]
+            tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
+            return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
+
+        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
+        outputs = self.run_tables(np.full(count, width), max_width, columns, run)
+        return _apply_outputs(group_features, outputs, self)
 
     @property
     def makes_children(self) -> bool:
@@ -152,61 +195,6 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     zeros = np.zeros((len(features), FEATURE - 3), np.float32)
     residuals = scale_outputs(concat_columns([encoded[:, -3:], zeros]), options.bounds, HALF)
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
-
-
-def merge_features(
-    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
-) -> FeatureGaussians:
-    """Correct c merged Feature Gaussians with the merger (paper section 4.4).
-
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
-    paper the merger corrects the first of these rows instead of the pooled one.
-    """
-    options = context.options
-    if not options.merger:
-        return pooled
-    if options.merger_start == "first":
-        first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
-        pooled = replace(pooled, **first)
-    group_features, base = context.describe(pooled), context.make_base(parts)
-    sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), context.seed)
-    from_means, means = as_array(parts.means), as_array(pooled.means)
-
-    def run(rows: np.ndarray, width: int) -> Array:
-        positions, owners = group_rows(cuts[rows], sizes[rows])
-        keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
-        sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
-        ids = order[positions][sample.reshape(-1)]
-        relative = context.make_tokens(base, ids, np.repeat(rows, width), group_features)
-        tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
-        return context.networks.run("merger", tokens, mask, group_features.group[rows])
-
-    outputs = context.run_tables(sizes, options.members, FEATURE + options.latent, run)
-    return _apply_outputs(group_features, outputs, context)
-
-
-def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
-    options = context.options
-    if len(features) == 0 or not options.refiner:
-        return features
-    group_features, views = context.describe(features), features.views
-    neighbors = find_neighbors(as_array(features.means), options.neighbors)
-    count, width = len(features), neighbors.shape[1] + 1
-    table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
-
-    def run(rows: np.ndarray, _: int) -> Array:
-        ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
-        mask = ids >= 0
-        ids = np.where(mask, ids, owners)
-        relative = context.make_tokens(group_features.base, ids, owners, group_features)
-        same = (views[ids] == views[owners]).astype(np.float32)[:, None]
-        tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
-        return context.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
-
-    max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
-    outputs = context.run_tables(np.full(count, width), max_width, columns, run)
-    return _apply_outputs(group_features, outputs, context)
 
 
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:

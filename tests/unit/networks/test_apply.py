@@ -13,7 +13,6 @@ from gsmerge.networks.apply import (
     decode_gaussians,
     encode_features,
     find_neighbors,
-    refine_features,
     run_heads,
 )
 from gsmerge.networks.corrector import ANALYTIC
@@ -161,8 +160,8 @@ def test_refiner_reads_the_neighbours(scene: Made) -> None:
     for row, same in ((int(near[0, 0]), False), (far, True)):
         latents = encoded.latents.copy()
         latents[row] += 1
-        refined = refine_features(replace(encoded, latents=latents), context)
-        assert np.array_equal(refined.means[0], refine_features(encoded, context).means[0]) is same
+        refined = context.refine(replace(encoded, latents=latents))
+        assert np.array_equal(refined.means[0], context.refine(encoded).means[0]) is same
 
 
 def test_nearest_by_hand(scene: Made) -> None:
@@ -228,7 +227,7 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
         base = feature_to_gaussians(scene.features)[parents]
         total = total + run_heads(base, parents, group_features, context).square().sum()
     merged = merge(features, pairs(features), context)
-    total = total + refine_features(merged, context).latents.square().sum()
+    total = total + context.refine(merged).latents.square().sum()
     total.backward()
     for name, parameter in networks.named_parameters():
         if name.startswith("encoder.shift"):  # of means, which are arrays here
