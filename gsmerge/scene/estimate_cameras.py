@@ -49,11 +49,8 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile 
     paths = list_images(folder)
     size = image_size(paths[0]) if paths else (0, 0)
     names = [photo.relative_to(folder).as_posix() for photo in paths]
-    rows = ply.gaussians, ply.valid
-    cameras = alignment.estimate_cameras(path, *rows, names, *size)
-    if cameras is not None:
-        return cameras
-    return estimate_grid(ply, path, paths, folder)
+    cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, *size)
+    return estimate_grid(ply, path, paths, folder) if cameras is None else cameras
 
 
 def estimate_grid(
