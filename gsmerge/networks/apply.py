@@ -6,6 +6,7 @@ in place of the methods of :class:`NetworkContext`, so that gradients pass from 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -106,7 +107,7 @@ class NetworkContext(Corrector):
 
     @stage("refine")
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
+        """Correct Feature Gaussians, or the largest, with the refiner, which reads neighbours (paper section 4.5)."""
         options = self.options
         if len(features) == 0 or not options.refiner:
             return features
@@ -114,8 +115,11 @@ class NetworkContext(Corrector):
         neighbors = find_neighbors(as_array(features.means), options.neighbors)
         count, width = len(features), neighbors.shape[1] + 1
         table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
+        pixels = as_array(group_features.sizes) / group_features.footprints
+        refined = np.sort(np.argsort(-pixels, kind="stable")[: math.ceil(self.networks.refined * count)])
 
-        def run(rows: np.ndarray, _: int) -> Array:
+        def run(numbers: np.ndarray, _: int) -> Array:
+            rows = refined[numbers]
             ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
@@ -125,7 +129,12 @@ class NetworkContext(Corrector):
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
         max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
-        outputs = self.run_tables(np.full(count, width), max_width, columns, run)
+        outputs = self.run_tables(np.full(len(refined), width), max_width, columns, run)
+        if len(refined) < count:
+            outputs = concat_rows([outputs, np.zeros((1, columns), np.float32)])
+            places = np.full(count, len(refined))
+            places[refined] = np.arange(len(refined))
+            outputs = outputs[places]
         return _apply_outputs(group_features, outputs, self)
 
     @property

@@ -25,6 +25,7 @@ class NetworkWeights:
 
     options: NetworkOptions
     arrays: Mapping[str, np.ndarray]
+    refined: float = 1.0  # share of the Feature Gaussians that are refined, the largest
 
     in_parallel = True  # tables of groups may run in several threads
 
@@ -33,8 +34,10 @@ class NetworkWeights:
         """Number of weights."""
         return sum(array.size for array in self.arrays.values())
 
-    def heads_alone(self) -> NetworkWeights:
-        """Return a copy with only the decoder heads; the other networks take ten times as long."""
+    def refining(self, share: float) -> NetworkWeights:
+        """Return a copy that refines a share of the Feature Gaussians; 0: with only the heads, a tenth of the time."""
+        if share:
+            return replace(self, refined=share)
         options = replace(self.options, encoder=False, merger=False, refiner=False)
         return NetworkWeights(
             options, {name: array for name, array in self.arrays.items() if name.startswith("heads.")}

@@ -73,7 +73,7 @@ class CompactOptions(Settings):
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
         "analytic stages.")  # fmt: skip
     new_views: bool | None = setting(None, "Estimate what a new viewpoint gains, from photos that a short fit leaves "
-        "out.", "By default where at least four views have photos, but not in a draft.")  # fmt: skip
+        "out.", "By default where at least four views have photos, but not in a draft or without a fit.")  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
         "Runs with one seed are bit-identical.", least=0)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,

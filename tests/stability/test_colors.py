@@ -101,7 +101,7 @@ def test_base_colours_outside_the_range_are_kept(room: Scene) -> None:
     images = scenes.images_of(offset.gaussians, offset.cameras)[0].clip(0, 1)
     offset = replace(offset, images=images.astype(np.float32))
     result, usual = (compacted(s, fit="none") for s in (offset, scene))
-    assert result.report.psnr_after > usual.report.psnr_after - 1.0  # type: ignore[operator]
+    assert result.report.psnr_after > usual.report.psnr_after - 1.25  # type: ignore[operator]
     full = compacted(offset, fit_steps=30)
     assert full.report.choices["fit"]["method"] == "full"
     assert full.report.psnr_after > result.report.psnr_after + 1.0  # type: ignore[operator]

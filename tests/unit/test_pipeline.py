@@ -211,7 +211,7 @@ def test_wrong_settings_are_refused(scene: Scene) -> None:
 
 
 def test_networks_correct_what_no_fit_corrects(scene: Scene) -> None:
-    for settings, learned in (({"fit": "none"}, True), ({"fit_steps": 12}, False)):
+    for settings, learned in (({"fit": "none", "effort": "best"}, True), ({"fit_steps": 12}, False)):
         actual = scenes.compacted(scene, **settings)
         assert ("networks" in actual.report.choices) == learned
         alone = scenes.compacted(scene, **settings, checkpoint="shipped" if learned else "none")

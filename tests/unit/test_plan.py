@@ -125,6 +125,15 @@ def test_quick_efforts_run_the_heads_alone(scene: Scene) -> None:
         assert any(name.startswith("refiner") for name in networks.arrays) is refines
 
 
+def test_without_a_fit_the_default_costs_no_more_than_a_draft(scene: Scene) -> None:
+    plan, own = plan_of(scene, fit="none"), plan_of(scene, fit="none", match="overlap", rectangles=2.0, new_views=True)
+    assert (plan.match.match, plan.superpixels.options.rectangles, plan.new_views) == ("none", 1.0, False)
+    assert (own.match.match, own.superpixels.options.rectangles, own.new_views) == ("overlap", 2.0, True)
+    assert plan.networks.refined == 0.5
+    assert plan_of(scene, fit="none", effort="best").networks.refined == 1
+    assert plan_of(scene, fit="none", checkpoint="shipped").networks.refined == 1
+
+
 def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(IN_PACKAGE, "shipped", Path("missing.safetensors"))
     with record_run() as record:

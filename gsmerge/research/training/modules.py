@@ -194,6 +194,7 @@ class Networks(nn.Module):
         self.refiner = Refiner(chosen) if chosen.refiner else None
         self.heads = nn.ModuleDict({str(slots): Head(slots, chosen) for slots in SLOTS})
 
+    refined = 1.0  # share of the Feature Gaussians that are refined
     in_parallel = False  # gradients of one group after the other
 
     def run(self, name: str, *inputs: Array) -> Tensor:

@@ -86,7 +86,7 @@ def test_cameras_of_repeated_views_and_of_views_that_share_one(small: Scene) -> 
     viewmats = small.cameras.viewmats.copy()
     viewmats[1] = viewmats[0]  # of other Gaussians and another photo
     shared = scenes.take_views(replace(small, cameras=replace(small.cameras, viewmats=viewmats)), [0, 1, 0, 2])
-    options = CompactOptions().with_settings({"fit": "none", "poses": "fixed"})
+    options = CompactOptions().with_settings({"fit": "none", "poses": "fixed", "effort": "best"})
     prepared = prepare(shared, options.prepare)
     assert prepared.repeated == (0, 1, 0, 2)
     assert prepared.final_cameras() is shared.cameras

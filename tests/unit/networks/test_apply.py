@@ -164,6 +164,18 @@ def test_refiner_reads_the_neighbours(scene: Made) -> None:
         assert np.array_equal(refined.means[0], context.refine(encoded).means[0]) is same
 
 
+def test_a_share_of_the_features_is_refined_the_largest_in_pixels(scene: Made) -> None:
+    context = scene.networks(noisy())
+    encoded = encode_features(scene.features, context)
+    all_refined, pixels = context.refine(encoded), context.describe(encoded).sizes / encoded.footprints
+    some = replace(context, networks=context.networks.refining(0.5))
+    half = some.refine(encoded)
+    large = pixels >= np.sort(pixels)[len(pixels) // 2]
+    assert np.array_equal(half.latents[large], all_refined.latents[large])
+    assert np.array_equal(half.latents[~large], encoded.latents[~large])
+    assert np.array_equal(half.covars[~large], encoded.covars[~large])
+
+
 def test_nearest_by_hand(scene: Made) -> None:
     features = take(scene.features, np.arange(6))
     line = np.array([0, 1, 3, 7, 7.5, 9], np.float32)
