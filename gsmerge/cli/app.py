@@ -18,7 +18,7 @@ import typer
 from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.usage import FORMER_COMMANDS, LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
+from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -126,7 +126,7 @@ def _command_of(words: list[str]) -> str | None:
 
 def _is_scene(word: str) -> bool:
     """Return whether a first word is a scene in place of a command: a path that exists, or a name of such files."""
-    if word.startswith("-") or word in FORMER_COMMANDS or _command_of([word]) is not None:
+    if word.startswith("-") or _command_of([word]) is not None:
         return False
     if os.path.lexists(word) or "." not in word:
         return os.path.lexists(word)

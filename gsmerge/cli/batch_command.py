@@ -90,7 +90,7 @@ def batch(args: opt.Args) -> None:
 
 def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions) -> None:
     """Compact all scenes, report each, and sum up."""
-    from gsmerge.batch.workload import choose_concurrency
+    from gsmerge.batch.run import choose_concurrency
 
     totals, stdout = Totals(len(jobs)), sys.stdout
     say(f"{len(jobs):,} scenes, {choose_concurrency(jobs, options)}", quiet=args.silent)
@@ -239,7 +239,7 @@ def print_plan(
     args: opt.Args, jobs: Sequence[Job], options: BatchOptions, unit: str = "scenes", notes: Sequence[str] = ()
 ) -> None:
     """Print what a run would do; ``unit``: word for the jobs."""
-    from gsmerge.batch.workload import choose_concurrency, pending_jobs
+    from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.report import document_head
 
     out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)

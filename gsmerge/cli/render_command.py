@@ -14,7 +14,6 @@ from gsmerge.errors import UsageError
 
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
-# Endings by which a name means a file that cannot be written, and no folder
 SIDES = (16, 16384)  # pixels of a picture
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from gsmerge.cli.parameters import SEED, listed_settings
+from gsmerge.cli.parameters import listed_settings
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
 from gsmerge.settings.setting import flat_settings
@@ -39,29 +39,6 @@ OTHER_OPTIONS = {
     "cameras": ("camera", "poses", "transforms", "colmap"),
 }
 FORMAT_WORDS = ("format", "to", "type", "ext", "extension")
-# Commands and options of 0.1 -> what to type instead; to be left out after the next release
-FORMER_COMMANDS = {
-    "encode": "gsmerge extend room.gsm SCENE", "decode": "gsmerge compact room.gsm --k 2", "check": "gsmerge inspect",
-    **{name: f"gsmerge lab {name}" for name in ("chart", "generate", "stress", "train")},
-}  # fmt: skip
-FORMER_OPTIONS = {
-    "rerun": "use --overwrite", "max_memory": "use --jobs", "retries": "a second call makes what failed",
-    "timeout": "end the run, and a second call goes on", "device": "all runs on the processor",
-    "align": "views are scored as they are", "help_all": "use --help", "report": "use --json > FILE",
-    "save_cameras": "they are in NAME.cameras.json beside the result",
-    "embed_cameras": "they are in NAME.cameras.json beside the result",
-    **dict.fromkeys(("up", "scale", "rotate", "translate"), "use gsmerge convert for it"),
-    "threads": "use the environment: GSMERGE_THREADS=2", "seed": f"use the environment: {SEED}=1",
-    "methods": "use --grid method=A,B", "budgets": "use --grid budget=A,B", "efforts": "use --grid effort=A,B",
-    "segmentations": "use --grid segmentation=A,B", "matches": "use --grid match=A,B", "fixed": "use --set",
-    "target_images": "photos beside the cameras of --targets are found", "masks": "masks beside the photos are found",
-    "config": "use --set NAME=VALUE for each setting in it",
-    "draw_only": "a call without scenes draws what the folder holds",
-    "as": "the name of -o decides: .png is a panel, .mp4 a clip, a folder pictures", "set": "no settings are left",
-    "frame_of": "name the cameras with --cameras", "fps": "--frames says how long a clip is",
-    "antialiased": "gsmerge.render in Python has it", "superpixels": "gsmerge.superpixels in Python has them",
-    "dry_run": "no file of yours is replaced unless you say so", "overwrite": "what gsmerge made is replaced",
-}  # fmt: skip
 BUDGET_WORDS = (
     "ratio", "percent", "percentage", "share", "fraction", "factor", "keep", "count", "num", "number", "gaussians",
     "num_gaussians", "max_gaussians", "num_points", "target_count", "size", "max_size",
@@ -140,8 +117,6 @@ def usage_message(error: Any, make_command: Callable[[], Any]) -> str:
     elif match := re.match(r"No such command '(\w+)'", message):
         if match[1] == "help":
             return f"help is no command: use {PROGRAM} --help, or {PROGRAM} COMMAND --help"
-        if match[1] in FORMER_COMMANDS:
-            return f"{match[1]} is no command any more: use {FORMER_COMMANDS[match[1]]}"
         near = next((name for name, words in OTHER_WORDS.items() if match[1] in words), None)
         message = message if near is None else f"{match[0]}. Did you mean '{near}'?"
     return f"{message}; see '{place} --help'"
@@ -170,9 +145,6 @@ def _suggest(option: str, command: Any, place: str, make_command: Callable[[], A
         more = f", or --grid {positive}=A,B for several" if "grid" in names else ""
         return f"{option} is no option: use --set {positive}={value}{more}"
     same = [known for known, words in OTHER_OPTIONS.items() if name in words]
-    for former in (name, *same):
-        if former in FORMER_OPTIONS and former not in names:
-            return f"{option} is no option{' any more' * (former == name)}: {FORMER_OPTIONS[former]}"
     if command.name == "convert" and ("output" in same or name in ("output", *FORMAT_WORDS)):
         return f"{option} is no option: the last file is what is written, by its name: gsmerge convert a.ply x.spz"
     if name in FORMAT_WORDS and "output" in names:

@@ -72,9 +72,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     else:
         inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))
         seconds = wall_seconds(
-            at_once * choices.blocks, len(scene), settings, threads=threads, photos=True, fit_steps=steps,
-            num_drawn=drawn * inside,
-        )  # fmt: skip
+            at_once * choices.blocks, len(scene), settings, threads=threads, fit_steps=steps, num_drawn=drawn * inside
+        )
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
@@ -87,7 +86,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "method": options.method,
         "superpixels_per_view": 0 if merges_pairs(size, options) else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
-        "fit": fit_of(settings | {"fit": choices.fit.fit}, photos=True),
+        "fit": fit_of(settings | {"fit": choices.fit.fit}),
         "fit_steps": choices.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),

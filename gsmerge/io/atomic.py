@@ -18,12 +18,11 @@ import sys
 import time
 import uuid
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import groupby, takewhile
 from pathlib import Path, PurePath
-from typing import Protocol
 
 from gsmerge.errors import SceneError
 from gsmerge.types import StrPath
@@ -37,6 +36,7 @@ _BOOT = "/proc/sys/kernel/random/boot_id"
 _TEMPORARY = re.compile(r"\.gsmerge-(?P<place>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?", re.DOTALL)
 _RESERVED = re.compile(r"(?is)(con|prn|aux|nul|com\d|lpt\d) *(\..*)?|.*[<>:\"|?*\x00-\x1f].*|(?!\.\.?$).*[ .]")
 
+AddOutput = Callable[[Path], Path]  # opens one more file of :func:`atomic_outputs`, and returns the one to write
 _written: set[str] = set()  # the temporary files of this process
 
 
@@ -50,13 +50,6 @@ def atomic_output(path: StrPath, *, overwrite: bool = False) -> Iterator[Path]:
     """
     with atomic_outputs(overwrite=overwrite) as add:
         yield add(Path(path))
-
-
-class AddOutput(Protocol):
-    """Function that opens one more file of :func:`atomic_outputs`."""
-
-    def __call__(self, path: Path) -> Path:
-        """Return the temporary file to write."""
 
 
 @contextmanager

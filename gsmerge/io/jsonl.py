@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
+from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
 from gsmerge.io.locks import lock_folder
 
 
@@ -24,15 +24,12 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
     if not path.exists():
         return
     budget = read_budget(path)
-    try:
-        with path.open("rb") as file:
-            end = file.seek(start)
-            for line in file:
-                if line.endswith(b"\n"):
-                    end += len(line)
-                    yield end, _parse(line, budget)
-    except OSError as error:
-        raise SceneError(path, f"cannot be read ({error.strerror})") from error
+    with read_errors(path), path.open("rb") as file:
+        end = file.seek(start)
+        for line in file:
+            if line.endswith(b"\n"):
+                end += len(line)
+                yield end, _parse(line, budget)
 
 
 def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:

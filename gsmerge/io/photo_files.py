@@ -165,11 +165,6 @@ def photo_array(images: np.ndarray | None) -> np.ndarray:
     return NO_IMAGES if images is None else images
 
 
-def select_photos(images: np.ndarray, ids: Sequence[int]) -> np.ndarray:
-    """Select photos ``[c,h,w,3]`` by their numbers; an empty array stays empty."""
-    return images[list(ids)] if len(images) else images
-
-
 def same_shape(size: Size, other: Size) -> bool:
     """Return whether two sizes have the same aspect ratio, up to rounding."""
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE

@@ -16,7 +16,7 @@ from gsmerge.geometry import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
 from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
-from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, NetworkOptions
+from gsmerge.networks.options import CORRECTED, FEATURE, MEMBER, PART, RESIDUAL, SLOTS, WIDE, NetworkOptions
 from gsmerge.networks.tokens import (
     GroupFeatures,
     compute_group_features,
@@ -71,19 +71,62 @@ class NetworkContext(Corrector):
     def decode_covars(self, features: FeatureGaussians) -> Array:
         """Run the head for K = 1; return the covariances ``[g,3,3]`` of its Gaussians."""
         described = self.describe(features)
-        decoded = decode_with_group_features(described.base, np.arange(len(features)), described, self)
+        decoded = decode_gaussians(described.base, np.arange(len(features)), described, self)
         return covariances(decoded.quats, decoded.scales)
 
     def merge(
         self, pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     ) -> FeatureGaussians:
-        """Run the merger, see :func:`merge_features`."""
-        return merge_features(pooled, parts, order, cuts, self)
+        """Correct c merged Feature Gaussians with the merger (paper section 4.4).
+
+        Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
+        paper the merger corrects the first of these rows instead of the pooled one.
+        """
+        options = self.options
+        if not options.merger:
+            return pooled
+        if options.merger_start == "first":
+            first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
+            pooled = replace(pooled, **first)
+        group_features, base = self.describe(pooled), self.make_base(parts)
+        sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
+        from_means, means = as_array(parts.means), as_array(pooled.means)
+
+        def run(rows: np.ndarray, width: int) -> Array:
+            positions, owners = group_rows(cuts[rows], sizes[rows])
+            keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
+            sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
+            ids = order[positions][sample.reshape(-1)]
+            relative = self.make_tokens(base, ids, np.repeat(rows, width), group_features)
+            tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
+            return self.networks.run("merger", tokens, mask, group_features.group[rows])
+
+        outputs = self.run_tables(sizes, options.members, FEATURE + options.latent, run)
+        return _apply_outputs(group_features, outputs, self)
 
     @stage("refine")
     def refine(self, features: FeatureGaussians) -> FeatureGaussians:
-        """Run the refiner, see :func:`refine_features`."""
-        return refine_features(features, self)
+        """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
+        options = self.options
+        if len(features) == 0 or not options.refiner:
+            return features
+        group_features, views = self.describe(features), features.views
+        neighbors = find_neighbors(as_array(features.means), options.neighbors)
+        count, width = len(features), neighbors.shape[1] + 1
+        table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
+
+        def run(rows: np.ndarray, _: int) -> Array:
+            ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
+            mask = ids >= 0
+            ids = np.where(mask, ids, owners)
+            relative = self.make_tokens(group_features.base, ids, owners, group_features)
+            same = (views[ids] == views[owners]).astype(np.float32)[:, None]
+            tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
+            return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
+
+        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
+        outputs = self.run_tables(np.full(count, width), max_width, columns, run)
+        return _apply_outputs(group_features, outputs, self)
 
     @property
     def makes_children(self) -> bool:
@@ -92,7 +135,7 @@ class NetworkContext(Corrector):
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
         """Run the heads, see :func:`decode_gaussians`."""
-        return decode_gaussians(children, parents, features, self)
+        return decode_gaussians(children, parents, self.describe(features), self)
 
     def make_base(self, features: FeatureGaussians) -> Gaussians:
         """Decode every Feature Gaussian into one Gaussian."""
@@ -154,61 +197,6 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     return replace(context.correct_features(group_features, residuals), latents=encoded[:, :-3])
 
 
-def merge_features(
-    pooled: FeatureGaussians, parts: FeatureGaussians, order: np.ndarray, cuts: np.ndarray, context: NetworkContext
-) -> FeatureGaussians:
-    """Correct c merged Feature Gaussians with the merger (paper section 4.4).
-
-    Cluster i was pooled from the rows ``order[cuts[i] : cuts[i + 1]]`` of the n Feature Gaussians ``parts``. In the
-    paper the merger corrects the first of these rows instead of the pooled one.
-    """
-    options = context.options
-    if not options.merger:
-        return pooled
-    if options.merger_start == "first":
-        first = {name: getattr(parts, name)[order[cuts]] for name in OWN}
-        pooled = replace(pooled, **first)
-    group_features, base = context.describe(pooled), context.make_base(parts)
-    sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), context.seed)
-    from_means, means = as_array(parts.means), as_array(pooled.means)
-
-    def run(rows: np.ndarray, width: int) -> Array:
-        positions, owners = group_rows(cuts[rows], sizes[rows])
-        keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
-        sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
-        ids = order[positions][sample.reshape(-1)]
-        relative = context.make_tokens(base, ids, np.repeat(rows, width), group_features)
-        tokens = concat_columns([relative, parts.latents[ids]]).reshape(*mask.shape, -1)
-        return context.networks.run("merger", tokens, mask, group_features.group[rows])
-
-    outputs = context.run_tables(sizes, options.members, FEATURE + options.latent, run)
-    return _apply_outputs(group_features, outputs, context)
-
-
-def refine_features(features: FeatureGaussians, context: NetworkContext) -> FeatureGaussians:
-    """Correct Feature Gaussians with the refiner, which reads their neighbours (paper section 4.5)."""
-    options = context.options
-    if len(features) == 0 or not options.refiner:
-        return features
-    group_features, views = context.describe(features), features.views
-    neighbors = find_neighbors(as_array(features.means), options.neighbors)
-    count, width = len(features), neighbors.shape[1] + 1
-    table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
-
-    def run(rows: np.ndarray, _: int) -> Array:
-        ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
-        mask = ids >= 0
-        ids = np.where(mask, ids, owners)
-        relative = context.make_tokens(group_features.base, ids, owners, group_features)
-        same = (views[ids] == views[owners]).astype(np.float32)[:, None]
-        tokens = concat_columns([relative, same, features.latents[ids]]).reshape(len(rows), width, -1)
-        return context.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
-
-    max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent
-    outputs = context.run_tables(np.full(count, width), max_width, columns, run)
-    return _apply_outputs(group_features, outputs, context)
-
-
 def find_neighbors(means: np.ndarray, count: int) -> np.ndarray:
     """Find the nearest neighbours ``[g,count]`` int64 of points ``[g,3]``; -1 where there are fewer."""
     means, neighbors = means.astype(np.float64), np.full((len(means), count), -1, np.int64)
@@ -226,21 +214,14 @@ def _apply_outputs(group_features: GroupFeatures, outputs: Array, context: Netwo
 
 
 def decode_gaussians(
-    children: Gaussians, parents: np.ndarray, features: FeatureGaussians, context: NetworkContext
+    children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
 ) -> Gaussians:
     """Correct the children of Feature Gaussians with the decoder head for their number (paper section 4.3).
 
-    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``features``, ascending. Three children
-    use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its own, which
-    heads with absolute outputs cannot do.
+    Children of one Feature Gaussian are adjacent; ``parents [n]`` are rows of ``group_features``, ascending. Three
+    children use three slots of the head for four. Five to eight are corrected in two halves, each as a group of its
+    own, which heads with absolute outputs cannot do.
     """
-    return decode_with_group_features(children, parents, context.describe(features), context)
-
-
-def decode_with_group_features(
-    children: Gaussians, parents: np.ndarray, group_features: GroupFeatures, context: NetworkContext
-) -> Gaussians:
-    """Correct children as :func:`decode_gaussians` does, from group features that were computed before."""
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))
     return move_gaussians(children, residuals, parents, group_features.frames)
@@ -285,7 +266,7 @@ def run_heads(
         outputs.append(_run_head(children, (owners[rows], ids, mask), group_features, context))
         places[ids[mask]] = total + np.flatnonzero(mask)
         total += mask.size
-    return scale_outputs(concat_rows(outputs)[places], options.head_bounds)
+    return scale_outputs(concat_rows(outputs)[places], WIDE if options.makes_children else options.bounds)
 
 
 def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

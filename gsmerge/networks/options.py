@@ -89,11 +89,6 @@ class NetworkOptions(Settings):
         """
         return SLOTS[-1] if self.makes_children else 2 * SLOTS[-1]
 
-    @property
-    def head_bounds(self) -> Bounds:
-        """Largest corrections of the heads."""
-        return WIDE if self.makes_children else self.bounds
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.width % self.heads:

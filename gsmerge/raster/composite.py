@@ -63,12 +63,6 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
     return blended[..., 0] / np.maximum(1 - left, np.float32(TINY)), left
 
 
-def mean_depths(tiled: TiledView, alphas: Array) -> Array:
-    """Return the mean blended depth ``[h,w]``, camera z; 0 where ``alphas [h,w]`` are 0."""
-    weighted = blend(tiled, depth_colors(tiled), np.zeros(3, np.float32))[0][..., 0]
-    return np.divide(weighted, alphas, out=np.zeros_like(weighted), where=alphas > 0)
-
-
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 
@@ -183,7 +177,7 @@ def draw_views(
         images[view], transmittance = blend(tiled, view_colors(tiled), background)
         alphas[view, ..., 0] = 1 - transmittance
         if depths is not None:
-            depths[view, ..., 0] = mean_depths(tiled, alphas[view, ..., 0])
+            depths[view, ..., 0] = blend_depths(tiled)[0]
 
     parallel_map(one, range(shape[0]))  # of one view alone, the pieces share the pool
     return Rendering(images, alphas, depths)

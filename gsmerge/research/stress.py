@@ -22,6 +22,7 @@ from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.views import even_views, subset
 from gsmerge.geometry import move_views
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
+from gsmerge.runtime.record import Progress
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import SH_C0, Cameras, Gaussians, Scene, Views, grid_ids
@@ -49,7 +50,6 @@ FIT_SLACK = 1.0  # dB more after a full fit, whose result rounding alone changes
 SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference, and ratio, of counts
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 _FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -296,12 +296,9 @@ def _check_result(case: Case, base: _Result, result: _Result, slack: float) -> t
     if case.check == "bits":
         same = all(np.array_equal(getattr(base.gaussians, n), getattr(result.gaussians, n)) for n in _FIELDS)
         return same, "equal" if same else f"differs: {both}"
-    if case.check == "near":
-        return result.after >= base.after - MAX_NEAR - slack, both
-    near = result.after >= base.after - MAX_SAME - slack
-    if case.check == "once":
-        return near and count <= ONCE_COUNT * former, both
-    return near and abs(count - former) <= max(1, SAME_COUNT * former), both
+    fits = {"once": count <= ONCE_COUNT * former, "same": abs(count - former) <= max(1, SAME_COUNT * former)}
+    most = MAX_NEAR if case.check == "near" else MAX_SAME
+    return fits.get(case.check, True) and result.after >= base.after - most - slack, both
 
 
 def _check_again(setup: StressScene, base: _Result, options: CompactOptions) -> tuple[bool, str]:

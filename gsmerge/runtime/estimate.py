@@ -18,7 +18,6 @@ COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform
 # Of a step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.15  # per million Gaussians that it draws
-USUAL_DRAWN = 0.3  # Gaussians of the result per pixel of a view that lie in it, where the scene is not known
 
 # Where views are placed, per million Gaussians of the input:
 COST_READ = 3.0  # of reading and judging
@@ -41,22 +40,19 @@ def work_seconds(
     view_pixels: float,
     options: Mapping[str, Any],
     *,
-    photos: bool,
     fit_steps: int,
-    num_drawn: float | None = None,
+    num_drawn: float,
 ) -> float:
     """Estimate the processor seconds of compacting a scene, without imports.
 
     ``pixels``: pixels of all views together, or the number of Gaussians if that is larger; ``view_pixels``: pixels of
-    one view; ``options``: all settings by flat name, with the checkpoint in use; ``photos``: whether there are photos
-    to fit to and to score on; ``num_drawn``: average number of Gaussians in a view of the fit, None: the usual number.
+    one view; ``options``: all settings by flat name, with the checkpoint in use; ``num_drawn``: average number of
+    Gaussians in a view of the fit.
     """
-    method, fits = options["method"], fit_of(options, photos=photos) == "full"
-    work = COST_MERGE + COST_SCORE * photos + COST_FIT * fits
+    method, fits = options["method"], fit_of(options) == "full"
+    work = COST_MERGE + COST_SCORE + COST_FIT * fits
     work += COST_SLOW.get(options["segmentation"] if method == "gsmerge" else method, 0.0)
     work += COST_NETWORKS * (method == "gsmerge" and options["checkpoint"] != "none")
-    if num_drawn is None:
-        num_drawn = pixels if method == "unmerged-fit" else USUAL_DRAWN * view_pixels
     step = COST_STEP * view_pixels + COST_DRAWN * num_drawn
     return (pixels * work + fit_steps * fits * step) / 1e6
 
@@ -78,10 +74,9 @@ def placed_seconds(num_input: int, num_drawn: float, *, threads: int, fit_steps:
     return IMPORT_SECONDS + work / (1.0 if threads == 1 else 1.3)  # little of it runs on several
 
 
-def fit_of(options: Mapping[str, Any], *, photos: bool) -> str:
+def fit_of(options: Mapping[str, Any]) -> str:
     """Return the kind of fit that will run: ``"full"`` or ``"none"``."""
-    fits = {"gsmerge": options["fit"], "unmerged-fit": "full"}
-    return fits.get(options["method"], "none") if photos else "none"
+    return {"gsmerge": str(options["fit"]), "unmerged-fit": "full"}.get(options["method"], "none")
 
 
 def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -29,6 +30,11 @@ class LazyFunction:
     def load(self) -> Any:
         """Import the function."""
         return getattr(import_module(self.module), self.name)
+
+
+def lazy_functions(package: str) -> Callable[[str], LazyFunction]:
+    """Return what names functions of a package by "module.name", to be imported when they are called."""
+    return lambda place: LazyFunction(f"{package}.{place.split('.')[0]}", place.split(".")[1])
 
 
 @cache

@@ -57,8 +57,7 @@ def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[R
 
     With a ``title``, all its stages are reported as steps of one stage of that name.
     """
-    outer = _current.get()
-    progress = None if silent or outer is None else outer.progress
+    progress = None if silent else current_record().progress
     if progress is not None and title is not None:
         progress = _titled(progress, title)
     with _write_to(Record(progress)) as record:
@@ -99,35 +98,30 @@ def stage(name: str) -> Iterator[None]:
 
 def note(text: str) -> None:
     """Add a sentence for the user to the current record."""
-    record = _current.get()
-    if record is not None:
-        record.notes.append(text)
+    current_record().notes.append(text)
 
 
 def choose(**choices: Any) -> None:
     """Add decisions of a stage to the current record, by name."""
-    record = _current.get()
-    if record is not None:
-        record.choices |= choices
+    current_record().choices.update(choices)
 
 
 def add_seconds(seconds: Mapping[str, float]) -> None:
     """Add the wall time of stages to the current record, by name."""
-    record = _current.get()
-    if record is not None:
-        for name, value in seconds.items():
-            record.seconds[name] = record.seconds.get(name, 0.0) + value
+    record = current_record()
+    for name, value in seconds.items():
+        record.seconds[name] = record.seconds.get(name, 0.0) + value
 
 
 def adopt(part: Record) -> None:
     """Copy choices and notes of a part's record into the current record."""
-    choose(**part.choices)
-    for text in part.notes:
-        note(text)
+    record = current_record()
+    record.choices |= part.choices
+    record.notes += part.notes
 
 
 def report_progress(text: str, done: int, total: int) -> None:
     """Report progress of a stage, or of a step as ``"stage: detail"``, to the caller of the current run."""
-    record = _current.get()
-    if record is not None and record.progress is not None:
-        record.progress(text, done, total)
+    progress = current_record().progress
+    if progress is not None:
+        progress(text, done, total)

@@ -49,11 +49,8 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path) -> CameraFile 
     paths = list_images(folder)
     size = image_size(paths[0]) if paths else (0, 0)
     names = [photo.relative_to(folder).as_posix() for photo in paths]
-    rows = ply.gaussians, ply.valid
-    cameras = alignment.estimate_cameras(path, *rows, names, *size)
-    if cameras is not None:
-        return cameras
-    return estimate_grid(ply, path, paths, folder)
+    cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, *size)
+    return estimate_grid(ply, path, paths, folder) if cameras is None else cameras
 
 
 def estimate_grid(
@@ -128,7 +125,8 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     choices = [(number, list(chosen)) for number in range(len(fits)) for chosen in in_order]
     choices += [(number, alike[:, number].argmax(0).tolist()) for number in range(len(fits))]
     options = [(alike[chosen, number, range(views)], number, chosen) for number, chosen in choices]
-    options = [option for option in options if len(set(option[2])) == views and _show(option[0])]
+    options = [option for option in options if len(set(option[2])) == views]
+    options = [option for option in options if option[0].mean() >= _MIN_ALIKE and option[0].min() >= _MIN_ALIKE_EACH]
     if not options:
         return None
     best = max(float(each.mean()) for each, _, _ in options)
@@ -136,11 +134,6 @@ def match_photos(pictures: np.ndarray, paths: Sequence[Path]) -> PhotoMatch | No
     _, number, chosen = max(near or options, key=lambda option: round(float(option[0].mean()), 3))
     trim, transform = fits[number]
     return PhotoMatch(chosen, size, transform, trim)
-
-
-def _show(alike: np.ndarray) -> bool:
-    """Return whether photos with these correlations to the views ``[v]`` show them."""
-    return bool(alike.mean() >= _MIN_ALIKE and alike.min() >= _MIN_ALIKE_EACH)
 
 
 def _transforms(size: Size, width: int, height: int) -> list[PhotoTransform]:

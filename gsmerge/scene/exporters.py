@@ -6,7 +6,7 @@ of its own; ``python tasks.py reference`` renews docs/reference/exporters.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +15,7 @@ from gsmerge.alignment import ESTIMATED, MAY_BE_UNALIGNED, Layout
 from gsmerge.geometry import Similarity
 from gsmerge.io.cameras.json_files import FFGS
 from gsmerge.settings.reading import QuatChoice, ReadHints
+from gsmerge.settings.setting import join_words
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.read import FileInfo
@@ -31,13 +32,8 @@ def make_hints(values: dict[str, Any]) -> ReadHints:
     names = {field.name for field in fields(ReadHints)}
     unknown = sorted(values.keys() - names)
     if unknown:
-        raise ValueError(f"expected {_listed(sorted(names))}, got {unknown[0]!r}")
+        raise ValueError(f"expected {join_words(map(repr, sorted(names)))}, got {unknown[0]!r}")
     return ReadHints(**values)
-
-
-def _listed(names: Iterable[str]) -> str:
-    *first, last = (repr(name) for name in names)
-    return f"{', '.join(first)} or {last}"
 
 
 @dataclass(frozen=True)
@@ -447,7 +443,5 @@ def find_cameras_of_model(info: FileInfo) -> str:
 
 def exporter_names(exporters: Sequence[Exporter]) -> str:
     """Join the titles of exporters for a message."""
-    if not exporters:
-        return "none that is known by name"
-    titles = [model.title for exporter in exporters for model in exporter.models]
-    return titles[0] if len(titles) == 1 else f"{', '.join(titles[:-1])} or {titles[-1]}"
+    titles = join_words(model.title for exporter in exporters for model in exporter.models)
+    return titles or "none that is known by name"

@@ -169,7 +169,8 @@ def find_scene_files(
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     if cameras is None:
         places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
-        camera_path = _depths_cameras(ply) if ply.suffix == DEPTHS.ending else result_cameras(ply)
+        own = ply.parent.parent / POSES if is_frame(ply) else ply  # by which depth maps are placed
+        camera_path = own if ply.suffix == DEPTHS.ending else result_cameras(ply)
         camera_path = camera_path or next((place for place in places if place is not None), None)
     if images is None and is_frame(ply):
         image_path = ply
@@ -189,11 +190,6 @@ def find_scene_files(
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies, named=named)
-
-
-def _depths_cameras(path: Path) -> Path:
-    """Return the file of the cameras that depth maps are placed by."""
-    return path.parent.parent / POSES if is_frame(path) else path
 
 
 def scene_title(ply: Path) -> str:

@@ -32,7 +32,7 @@ from gsmerge.io.cameras.read import CAMERA_PLACES, holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size, select_photos
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
@@ -355,7 +355,7 @@ def _make_load(
     gaussians, pixel_ids, missing, more = _place_rows(ply, result)
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
-        cameras, images = cameras[views], select_photos(images, views)
+        cameras, images = cameras[views], images[views] if len(images) else images
     gaussians = _color_from_photos(gaussians, images, files)
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]

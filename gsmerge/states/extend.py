@@ -56,21 +56,11 @@ def extend(
     *,
     progress: Progress | None = None,
 ) -> tuple[Scene, BatchReport]:
-    """Add a batch of views to the results of earlier batches.
+    """Add a batch of views, in the same world, to the results of earlier batches; None before the first.
 
-    Args:
-        before: Results and views so far, which are not changed; None: these are the first.
-        scene: The new views, in the same world; tensors become arrays.
-        options: How the batch is compacted. Poses and exposures stay as they are, as in all other batches.
-        extend_options: How many views are kept.
-        progress: See :func:`gsmerge.compact`.
-
-    Returns:
-        An unaligned scene of all results, with the kept views at the size of the first batch's: each has its photo,
-        mended, or what stands in for it. And the report.
-
-    Raises:
-        ValueError: If a setting is impossible for the scene.
+    Poses and exposures of the batch stay as they are. Returns an unaligned scene of all results, with the kept views at
+    the size of the first batch's: each has its photo, mended, or what stands in for it. And the report. ValueError if a
+    setting is impossible for the scene.
     """
     prepare_options = replace(options.prepare, poses="fixed", exposure="fixed")
     options = replace(options, prepare=prepare_options, new_views=False)
@@ -83,7 +73,10 @@ def extend(
     if before is not None:
         if len(views) and max(shares_inside(replace(views, gaussians=before.gaussians), SAMPLES)) < SEEN:
             notes.append("no view of this batch sees the earlier Gaussians: are they in one world?")
-        gaussians, views = _join_gaussians(before.gaussians, gaussians), _join_views(before, views)
+        parts = before.gaussians, gaussians
+        num_higher = max(part.shN.shape[1] for part in parts)
+        gaussians = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
+        views = _join_views(before, views)
     joined = replace(subset(views, choose_far(views.cameras, extend_options.max_views)), gaussians=gaussians)
     report = BatchReport(
         num_views=len(scene),
@@ -110,12 +103,6 @@ def _keep_pictures(prepared: Prepared) -> Scene:
     images = prepared.scene.images[[places[view] for view in views]]
     cameras = in_float64(given.cameras[views])
     return Scene(none, cameras, images, None, tuple(given.names[view] for view in views))
-
-
-def _join_gaussians(first: Gaussians, second: Gaussians) -> Gaussians:
-    """Concatenate Gaussians; harmonics that one part lacks are zero."""
-    num_higher = max(part.shN.shape[1] for part in (first, second))
-    return Gaussians.concat([pad_harmonics(part, num_higher) for part in (first, second)])
 
 
 def _join_views(first: Scene, second: Scene) -> Scene:

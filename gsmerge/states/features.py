@@ -17,7 +17,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Frame, prepare
 from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
 from gsmerge.kernels.gaussians.cluster import connected_components
-from gsmerge.networks.apply import NetworkContext, decode_with_group_features
+from gsmerge.networks.apply import NetworkContext, decode_gaussians
 from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
@@ -156,7 +156,9 @@ def extend_features(
             saliency = group_saliency(merged, members, corners)
             made = _refine(merged, context, saliency, samples, prepared.frame, plan.unseen)
         else:
-            _check_degree(state, scene)
+            degree, own = scene.gaussians.sh_degree, state.unseen.sh_degree
+            if degree != own:
+                raise UsageError(f"expected Gaussians with harmonics of degree {own} as the state's, got {degree}")
             saliency = group_saliency(features, members, corners)
             made = _join(state, features, saliency, context, samples, plan.match)
             made = replace(made, unseen=Gaussians.concat([state.unseen, plan.unseen]))
@@ -180,12 +182,6 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
             " holds; leave the checkpoint out, or begin a new state"
         )
     return Checkpoint(state.networks, Path(stored), __version__, {})
-
-
-def _check_degree(state: FeatureState, scene: Scene) -> None:
-    degree, expected = scene.gaussians.sh_degree, state.unseen.sh_degree
-    if degree != expected:
-        raise UsageError(f"expected Gaussians with harmonics of degree {expected} as the state's, got degree {degree}")
 
 
 def sample_views(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
@@ -298,7 +294,7 @@ def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
     described = make_group_features(state.refined, state.views, state.group, state.cameras)
     nothing = gaussian_members(children[:0], np.zeros(0, np.float32))
     context = NetworkContext(state.networks, nothing, state.cameras)
-    gaussians = decode_with_group_features(children, parents, described, context)
+    gaussians = decode_gaussians(children, parents, described, context)
     gaussians = gaussians[gaussians.opacities >= options.min_opacity]
     return state.frame.leave(Gaussians.concat([gaussians, state.unseen]))
 

@@ -80,7 +80,6 @@ def test_an_empty_name_is_not_this_folder(
     [
         ("compact x.ply --force", "--overwrite"),
         ("x.ply --force", "--overwrite"),
-        ("view x.ply --force", "replaced"),
         ("compact x.ply --format spz", "-o x.spz"),
         ("convert x.ply y.ply --format spz", "x.spz"),
         ("convert x.ply y.ply --budget 3", "gsmerge compact has it"),

@@ -17,9 +17,9 @@ def spz4_bytes(gaussians: Gaussians, *, mip: bool = False) -> bytes:
     """A ``.spz`` of version 4: a header in the clear, a table of sizes, and a Zstandard stream for each column."""
     import zstandard
 
-    columns = spz_columns(gaussians, 4, mip=mip)
-    *_, count, degree, fraction, _, _ = HEADER.unpack(columns.header)
-    parts = [part.tobytes() for part in columns.parts if part.shape[1]]
+    header, columns = spz_columns(gaussians, 4, mip=mip)
+    *_, count, degree, fraction, _, _ = HEADER.unpack(header)
+    parts = [part.tobytes() for part in columns if part.shape[1]]
     packed = [zstandard.ZstdCompressor(level=12).compress(part) for part in parts]
     sizes = [struct.pack("<QQ", len(short), len(part)) for short, part in zip(packed, parts, strict=True)]
     header = HEADER.pack(MAGIC, 4, count, degree, fraction, MIP_FLAG * mip, len(parts))

@@ -42,7 +42,7 @@ def some_gaussians(degree: int) -> Gaussians:
 @pytest.mark.parametrize(("steps", "levels"), [((1, 1, 1), 255), ((16, 2, 2), 31)])
 def test_looks_are_those_of_the_columns(degree: int, steps: tuple[int, ...], levels: int, each_target: Any) -> None:
     given, rows = some_gaussians(3), np.arange(0, N, 2)
-    _, opacities, colors, scales, _, harmonics = spz_columns(given[rows], degree).parts
+    _, opacities, colors, scales, _, harmonics = spz_columns(given[rows], degree)[1]
     quats = given.quats[rows].astype(np.float64) / np.linalg.norm(given.quats[rows], axis=1, keepdims=True)
     quats *= np.where(quats[:, :1] < 0, -1, 1)
     turns = np.round(levels * (quats[:, 1:] / (1 + quats[:, :1])))

@@ -17,14 +17,12 @@ from gsmerge.io.bounds import MAX_MODEL_BYTES, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 
-# model: (id, name, number of parameters); the first focal lengths and principal point, then the distortion
-_MODELS = (
-    (0, "SIMPLE_PINHOLE", 3), (1, "PINHOLE", 4), (2, "SIMPLE_RADIAL", 4), (3, "RADIAL", 5), (4, "OPENCV", 8),
-    (5, "OPENCV_FISHEYE", 8), (6, "FULL_OPENCV", 12), (7, "FOV", 5), (8, "SIMPLE_RADIAL_FISHEYE", 4),
-    (9, "RADIAL_FISHEYE", 5), (10, "THIN_PRISM_FISHEYE", 12),
-)  # fmt: skip
-_NAMES = {number: name for number, name, _ in _MODELS}
-_NUM_PARAMS = {name: count for _, name, count in _MODELS}
+# number of parameters of each model, in the order of their ids; the first are focal lengths and principal point
+_NUM_PARAMS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+}  # fmt: skip
+_NAMES = dict(enumerate(_NUM_PARAMS))
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _FISHEYE = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
 _SAME_SHAPE, _SMALLER = 0.01, 0.9  # relative, of the sides of pictures of one shape, and of a smaller one

@@ -94,7 +94,8 @@ def transforms_views(path: Path, data: Any) -> list[StoredView]:
     for name, pose, values in entries:
         with _number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values)
-            K, size = (None, _stored_size(values)) if bare else _intrinsics(path, name, values, size_of)
+            size = round(values.get("w", 0)), round(values.get("h", 0))
+            K, size = (None, size) if bare else _intrinsics(path, name, values, size_of)
             views.append(StoredView(name, pose, K, size, lens))
     return views
 
@@ -123,11 +124,6 @@ def _array(values: Any) -> np.ndarray:
     if bool in set(map(type, np.array(values, object).flat)):
         raise TypeError("found true or false")
     return array
-
-
-def _stored_size(values: Mapping[str, float]) -> tuple[int, int]:
-    """Return (width, height) of a frame; 0 where the file has none."""
-    return round(values.get("w", 0)), round(values.get("h", 0))
 
 
 def _intrinsics(

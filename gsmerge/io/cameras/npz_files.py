@@ -32,7 +32,6 @@ _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz``
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
-READ_ARRAYS = frozenset((*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS, "c2w", "K", "order"))
 _MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
 _MAX_HEADER = 1 << 16  # bytes of an array's header
 _POINTS, _SAMPLES = "world_points", 1000  # of each view, by which poses are read

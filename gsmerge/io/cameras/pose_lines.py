@@ -20,7 +20,6 @@ from gsmerge.io.cameras.camera_file import StoredView, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.formats.table import FRAMES, POSES
-from gsmerge.io.photo_files import Size
 
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _FRAME = re.compile(r"frame_(\d{1,9})\.npz")
@@ -42,14 +41,15 @@ def read_poses(source: CameraSource) -> StoredCameras:
     ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the size is
     that of DA3-Streaming's frames, or of the images. SceneError if a line has another number of numbers.
     """
-    path, poses = source.path, _rows(source.path, _POSE_COLUMNS)
+    path, poses = source.path, _parse(source.path, read_lines(source.path), _POSE_COLUMNS)
     intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
     if intrinsics is None:
         return StoredCameras([StoredView(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
-    values = _rows(intrinsics, (4,))
+    values = _parse(intrinsics, read_lines(intrinsics), (4,))
     if len(values) not in (1, len(poses)):
         raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
-    size = _frame_size(path)
+    shape = array_shape(path.parent / FRAMES / "frame_0.npz", "depth")  # empty without frames
+    size = (shape[1], shape[0]) if len(shape) == 2 else (0, 0)
     Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
     views = [
         StoredView(f"{i:06d}", pose.reshape(-1, 4), K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))
@@ -84,16 +84,6 @@ def pose_of_frame(frame: Path) -> np.ndarray:
     if not poses:
         raise SceneError(path, f"expected {number + 1} poses or more, one for each frame, found fewer")
     return poses[0].reshape(-1, 4)
-
-
-def _frame_size(poses: Path) -> Size:
-    """Return (width, height) of the frames beside a file of poses; zeros without any."""
-    shape = array_shape(poses.parent / FRAMES / "frame_0.npz", "depth")
-    return (shape[1], shape[0]) if len(shape) == 2 else (0, 0)
-
-
-def _rows(path: Path, lengths: tuple[int, ...]) -> list[np.ndarray]:
-    return _parse(path, read_lines(path), lengths)
 
 
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], first: int = 1) -> list[np.ndarray]:

@@ -28,17 +28,11 @@ from gsmerge.io.cameras.json_files import (
     read_transforms,
     read_world_mirror,
 )
-from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import StrPath
 
-
-def _lazy(place: str) -> LazyFunction:
-    """Name a function of this package that is imported when a file of its format is met."""
-    module, name = place.split(".")
-    return LazyFunction(f"{__package__}.{module}", name)
-
-
+_lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # of re10k
 array_names, holds_poses = _lazy("npz_files.array_names"), _lazy("npz_files.holds_poses")
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")

@@ -27,6 +27,7 @@ from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
+HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
 COLOR_SPACE = "srgb_rec709_display"
 READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
@@ -91,12 +92,10 @@ def _attributes(columns: Columns) -> dict[str, np.ndarray]:
         f"{NAME}:ROTATION": np.rint(32767 * np.roll(columns.quats, -1, axis=1)).astype("<i2"),  # xyzw
         f"{NAME}:SCALE": exp(columns.log_scales).astype("<f4"),
         f"{NAME}:OPACITY": wide[:, :1],
-        f"{NAME}:SH_DEGREE_0_COEF_0": columns.sh0.astype("<f4"),
+        HARMONICS[0]: columns.sh0.astype("<f4"),
     }
-    for i in range(columns.harmonics.shape[1]):
-        degree = int((i + 1) ** 0.5)
-        name = f"{NAME}:SH_DEGREE_{degree}_COEF_{i + 1 - degree**2}"
-        values[name] = columns.harmonics[:, i].astype("<f4")
+    for name, harmonic in zip(HARMONICS[1:], columns.harmonics.transpose(1, 0, 2), strict=False):
+        values[name] = harmonic.astype("<f4")
     shown = np.concatenate([_to_linear(columns.colors.clip(0, 1)), columns.opacities[:, None]], 1)
     return values | {"COLOR_0": to_bytes(255 * shown)}
 
@@ -298,9 +297,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray
 
 def _harmonic_names(attributes: dict[str, Any]) -> list[str]:
     """List the attributes of harmonics up to the highest degree that a primitive contains; empty for drafts."""
-    names = [[f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)] for degree in range(MAX_DEGREE + 1)]
-    num_degrees = max((i for i, degree in enumerate(names, 1) if degree[0] in attributes), default=0)
-    return [name for degree in names[:num_degrees] for name in degree]
+    return HARMONICS[: max(((d + 1) ** 2 for d in range(MAX_DEGREE + 1) if HARMONICS[d**2] in attributes), default=0)]
 
 
 def _mover(place: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

@@ -49,10 +49,11 @@ _SIZES = {
 def read_rows(path: Path) -> arrays.StoredRows:
     """Open the rows of a PLY file, to be read by :func:`open_rows`; SceneError if it holds no Gaussians."""
     data = open_ply(path)
-    compressed = _is_compressed(data)
+    elements = {e.name: {p.name for p in e.properties} for e in data.elements}
+    compressed = "chunk" in elements and elements.get("vertex", set()) >= set(arrays.PACKED)
     rows = _PACKED_ROWS(path, data) if compressed else _vertex(path, data).data
-    others = tuple(e for e in data.elements if e.name != "vertex")
-    layers = [f"element {e.name}" for e in others if {"opacity", arrays.QUATS[0]} <= {p.name for p in e.properties}]
+    others = tuple(name for name in elements if name != "vertex")
+    layers = [f"element {name}" for name in others if {"opacity", arrays.QUATS[0]} <= elements[name]]
     unused = check_columns(path, rows.dtype, layers)
     names = tuple(rows.dtype.names or ())
     comments = (*data.comments, *(c for e in data.elements for c in e.comments))
@@ -68,7 +69,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         encoding="logit" if compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows)),
         comments=comments,
-        extra_elements=tuple(e.name for e in others),
+        extra_elements=others,
         notes=(*notes, *unused),
         adapt=partial(_with_log_scales, linear=linear) if notes else None,
     )
@@ -127,11 +128,6 @@ def _num_rest(path: Path, columns: tuple[str, ...]) -> int:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
         raise SceneError(path, f"expected columns {numbers} or none, found {len(names)} f_rest columns")
     return len(names)
-
-
-def _is_compressed(data: PlyData) -> bool:
-    """Return whether a PLY file holds packed Gaussians (``.compressed.ply``)."""
-    return "chunk" in data and "vertex" in data and {p.name for p in data["vertex"].properties} >= set(arrays.PACKED)
 
 
 def _layout_name(names: tuple[str, ...], num_rest: int, *, compressed: bool) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -19,11 +18,11 @@ from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, gather, make_array
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Gaussians, StrPath
 
 _READ_FRAMES = LazyFunction("gsmerge.io.formats.depth_maps", "read_frames")
 MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the scene
-OpacityChoice = Literal["auto", "logit", "raw"]
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
 FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
 _MIN_JUDGED = 100  # Gaussians whose scales say something

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,40 +49,26 @@ _CELLS = 1 << 11  # as many of equal width, and of equally many values
 _MAX_STEPS = 200
 
 
-class _Files(Protocol):
-    """The files of one ``.sog`` by name; a file larger than the limit for all of them is not read."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of all files as they are stored."""
-
-    def num_bytes(self, name: str) -> int:
-        """Return the bytes that a file takes."""
-
-    def member(self, name: str, limit: int) -> bytes:
-        """Read a file; ValueError if it has more bytes than ``limit``."""
-
-
 @dataclass(frozen=True)
 class _Bundle:
-    """The files in a zip."""
+    """The files of a ``.sog`` by name, in a zip; one of more bytes than all have as they are stored is not read."""
 
     archive: zipfile.ZipFile
-    size: int
+    size: int  # of all
 
     def num_bytes(self, name: str) -> int:
         return self.archive.getinfo(name).compress_size
 
-    def member(self, name: str, limit: int) -> bytes:
+    def member(self, name: str) -> bytes:
         info = self.archive.getinfo(name)
-        if info.file_size > limit:
+        if info.file_size > self.size:
             raise ValueError(f"{name} of {info.file_size} bytes")
         return read_member(self.archive, info)
 
 
 @dataclass(frozen=True)
 class _Folder:
-    """The files in a folder, and in no other."""
+    """The same in a folder, and in no other."""
 
     folder: Path
     size: int
@@ -94,11 +80,14 @@ class _Folder:
             raise ValueError(f"{name!r}, which leads out of the folder")
         return check_file(path)
 
-    def member(self, name: str, limit: int) -> bytes:
+    def member(self, name: str) -> bytes:
         size = self.num_bytes(name)
-        if size > limit:
+        if size > self.size:
             raise ValueError(f"{name} of {size} bytes")
         return (self.folder / name).read_bytes()
+
+
+_Files = _Bundle | _Folder
 
 
 @dataclass(frozen=True)
@@ -145,7 +134,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
-    meta = parse_json(files.member(META, files.size).decode("utf-8-sig"), budget)
+    meta = parse_json(files.member(META).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"
@@ -174,7 +163,7 @@ def _image_size(data: bytes) -> tuple[int, int]:
 
 def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> np.ndarray:
     """Decode ``[count,4]`` pixels RGBA of a texture; alpha is 255 if it has none."""
-    data = files.member(name, files.size)
+    data = files.member(name)
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")

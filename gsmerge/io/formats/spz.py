@@ -242,14 +242,6 @@ def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
     return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), smallest), 1, axis=1)
 
 
-@dataclass(frozen=True)
-class SpzColumns:
-    """The content of a ``.spz`` of n Gaussians, with ``parts [n,bytes]`` uint8 in the order of the file."""
-
-    header: bytes  # which version 3 compresses with the rest
-    parts: tuple[np.ndarray, ...]
-
-
 def _octave(size: float) -> int:
     """Return the exponent of the largest power of two up to a positive number."""
     return math.frexp(size)[1] - 1
@@ -272,8 +264,11 @@ def fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:
     return np.clip(np.round(means * 2.0**fraction), -LARGEST, LARGEST).astype("<i4"), fraction
 
 
-def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> SpzColumns:
-    """Quantise Gaussians; ValueError if there is NaN or inf."""
+def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> tuple[bytes, tuple[np.ndarray, ...]]:
+    """Quantise Gaussians; return the header, and columns ``[n,bytes]`` uint8 in the order of the file.
+
+    ValueError if there is NaN or inf.
+    """
     columns = arrays.to_columns(gaussians, max_degree)
     fixed, fraction = fix_means(columns.means, FINE)
     steps = np.where(np.arange(columns.harmonics.shape[1]) < 3, 8, 16)[:, None]  # of degree 1, and above
@@ -294,7 +289,7 @@ def spz_columns(gaussians: Gaussians, max_degree: int, *, mip: bool = False) -> 
         np.clip(stepped, 0, 255).astype(np.uint8).reshape(len(stepped), 3 * stepped.shape[1]),
     )
     degree = arrays.sh_degree(columns.harmonics.shape[1])
-    return SpzColumns(HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0), parts)
+    return HEADER.pack(MAGIC, VERSION, len(columns), degree, fraction, MIP_FLAG * mip, 0), parts
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
@@ -302,9 +297,8 @@ def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
 
     ValueError if there is NaN or inf.
     """
-    columns = spz_columns(gaussians, MAX_DEGREE, mip=arrays.MIP_COMMENT in comments)
-    parts = (part.tobytes() for part in columns.parts)
-    return gzip_bytes(b"".join([columns.header, *parts]))
+    header, parts = spz_columns(gaussians, MAX_DEGREE, mip=arrays.MIP_COMMENT in comments)
+    return gzip_bytes(b"".join([header, *(part.tobytes() for part in parts)]))
 
 
 def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRATEGY) -> bytes:

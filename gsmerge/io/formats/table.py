@@ -12,8 +12,9 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.runtime.plugins import LazyFunction
+from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.extend import SUFFIX
+from gsmerge.settings.setting import join_words
 from gsmerge.types import Gaussians, StrPath
 
 INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
@@ -44,12 +45,7 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
-def _lazy(place: str) -> LazyFunction:
-    """Name a function of this package that is imported when a file of its format is met."""
-    module, name = place.split(".")
-    return LazyFunction(f"{__package__}.{module}", name)
-
-
+_lazy = lazy_functions(__package__)
 _SOG = 13.0, 22.0, 36.5, 56.5
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
@@ -124,7 +120,6 @@ BY_PROGRAM = (  # which splat-transform reads or writes in our place
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
-FORMER_ENDINGS = ".compressed.ply", ".usda"  # which versions before 0.2 wrote
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
         Path(f"_{row.ending}").suffix
@@ -195,11 +190,8 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
         problem = "expected a format without cameras, got a COLMAP model"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if chosen is None:
-        *first, last = OUTPUT_FORMATS
         index = f", or the name {INDEX}" if levels else ""
         folder = f", a new folder for a web site, or one named {FOLDER}" if cameras else ""
-        former = next((ending for ending in FORMER_ENDINGS if Path(path).name.lower().endswith(ending)), None)
-        gone = "" if former is None else f"{former} is no longer written; "
-        raise UsageError(f"{path}: {gone}expected a name that ends in {', '.join(first)} or {last}{index}{folder}")
+        raise UsageError(f"{path}: expected a name that ends in {join_words(OUTPUT_FORMATS)}{index}{folder}")
     chosen.require()
     return chosen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -34,11 +35,6 @@ def own_gaussians(scene: Scene) -> Gaussians:
     return scene.gaussians
 
 
-def view_shares(count: int, num_views: int, max_per_view: int) -> list[int]:
-    """Divide ``count`` evenly among the views, at most ``max_per_view`` each; the first views get the rest."""
-    return [min(max_per_view, count // num_views + (view < count % num_views)) for view in range(num_views)]
-
-
 def most_important(importance: np.ndarray, count: int) -> np.ndarray:
     """Return the rising indices of the ``count`` most important Gaussians; among equal ones the first.
 
@@ -65,18 +61,14 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     return fit_scene(start, prepared.scene, prepared.reference.fit_views, options, plan.seed).gaussians
 
 
-def prune_by_opacity(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` most opaque Gaussians, unchanged and in order; among equal ones the first."""
+def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prepared, _: Plan, count: int) -> Gaussians:
+    """Keep the ``count`` Gaussians of the largest ``importance [n]``, unchanged, in order; among equal ones the first.
+
+    Importance is for instance opacity, or the contribution to the views (Mini-Splatting).
+    """
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
-        return gaussians[most_important(gaussians.opacities, count)]
-
-
-def prune_by_contribution(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` Gaussians with the largest contribution to the views (Mini-Splatting), unchanged, in order."""
-    gaussians = own_gaussians(prepared.scene)
-    with stage("reduce"):
-        return gaussians[most_important(summed_weights(gaussians, prepared.scene.cameras), count)]
+        return gaussians[most_important(importance(gaussians, prepared.scene.cameras), count)]
 
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
@@ -113,7 +105,8 @@ def merge_superpixels(
     states no opacity; the members' mean is taken.
     """
     scene = prepared.scene
-    counts = view_shares(count, len(scene), scene.pixels_per_view)
+    each, more = divmod(count, len(scene))
+    counts = [min(scene.pixels_per_view, each + (view < more)) for view in range(len(scene))]
     with stage("segment"):
         pictures, views = scene.images, range(len(scene))
         labels = parallel_map(lambda view: superpixels(pictures[view], counts[view], segmentation), views)

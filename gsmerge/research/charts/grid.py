@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.cameras.read import find_cameras, is_colmap
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.research.charts.lines import ONE_SIZE
+from gsmerge.research.charts.lines import ONE_SIZE, SIZES
 from gsmerge.research.charts.measure_run import INPUT, ChartRun, RunRecord, describe
 from gsmerge.scene.content_hash import cameras_of, content_hash, digest, filled, photos_of, read_files, stem_of
 from gsmerge.scene.files import find_scene_files
@@ -26,8 +26,7 @@ from gsmerge.settings.setting import Settings, join_words, setting, settings_of
 ALL = "all"  # word for all views
 FITTED = {"unmerged-fit": ("effort",)}  # settings of ours that baselines have, too
 NUMBERS = ("k", "budget", "superpixels", "views")  # lists whose values may be numbers
-SETTINGS = ("k", "segmentation", "fit", "effort", "match")  # whose lists are multiplied
-SIZES = ("budget", "superpixels")  # whose lists stand next to each other
+SETTINGS = ("k", "segmentation", "fit", "effort", "match")  # whose lists are multiplied; SIZES stand side by side
 MAX_NAME = 100  # characters of a run in names of files
 
 

@@ -64,7 +64,7 @@ def chart(args: opt.Args) -> None:
             raise UsageError("--dry-run: expected scenes to run, got none")
         _draw(args, [], 0)
         return
-    from gsmerge.batch.workload import pending_jobs
+    from gsmerge.batch.run import pending_jobs
 
     jobs, options, notes = _make_jobs(args, scenes)
     if args.dry_run:

@@ -5,17 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Settings, setting
-
-if TYPE_CHECKING:
-    from gsmerge.research.generate import GenerateOptions
-
 
 OPTIONS = LazyFunction("gsmerge.research.generate", "GenerateOptions")
 
@@ -39,12 +34,17 @@ class SeriesOptions(Settings):
 )  # fmt: skip
 def generate(args: opt.Args) -> None:
     """Make synthetic scenes to train and test with, as a feed-forward network would export them."""
-    (options, series), out = _settings(args), args.output
-    if out.exists() and not out.is_dir():
-        raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     from gsmerge.report import document_head
+    from gsmerge.research.generate import GenerateOptions
     from gsmerge.research.generate import generate as generate_scenes
 
+    sides, out = re.fullmatch(r"(\d{1,5})x(\d{1,5})", args.size), args.output
+    if sides is None:
+        raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
+    size = {"width": int(sides[1]), "height": int(sides[2])}
+    options, series = args.make(GenerateOptions, SeriesOptions, views=args.views, **size)
+    if out.exists() and not out.is_dir():
+        raise SceneError(out, "expected a folder to write scenes to, found a file", "name another")
     with stage_progress(quiet=args.silent) as progress:
         scenes = generate_scenes(out, args.scenes, options, seed=series.seed, progress=partial(progress, "generate"))
     document = {**document_head(), "options": options.to_dict(), "seed": series.seed, "notes": []}
@@ -53,15 +53,3 @@ def generate(args: opt.Args) -> None:
     line = f"{out}: {len(scenes) - kept} scenes"
     line += f", {kept} were there already" if kept else ""
     print_document(document, line, as_json=args.json, quiet=args.quiet)
-
-
-def _settings(args: opt.Args) -> tuple[GenerateOptions, SeriesOptions]:
-    """Parse the settings of the scenes, and of their series."""
-    from gsmerge.research.generate import GenerateOptions
-
-    sides = re.fullmatch(r"(\d{1,5})x(\d{1,5})", args.size)
-    if sides is None:
-        raise UsageError(f"--size: expected width and height such as 320x240, got {args.size!r}")
-    width, height = map(int, sides.groups())
-    options, series = args.make(GenerateOptions, SeriesOptions, views=args.views, width=width, height=height)
-    return options, series

@@ -14,6 +14,7 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import AddOutput, atomic_outputs
+from gsmerge.io.cameras.camera_file import FLIP
 from gsmerge.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
 from gsmerge.research.generate.shapes import invert
@@ -97,7 +98,6 @@ def generate(
 
 RECORD = "generated.json"
 RECORD_VERSION = 3  # increases when the same seed and options give other scenes
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 
 
 def scene_key(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:

@@ -132,7 +132,9 @@ def make_scene(seed: int, index: int, options: GenerateOptions) -> SyntheticScen
     gain = find_exposure([radiance(scene, p, _shrink(lens), 1) for p in poses[::2]], rng.uniform(0.22, 0.62))
     seeds = rng.integers(0, 2**63, len(poses))
     world = invert(poses[0]) if rng.random() < 0.5 else np.eye(4)  # that of many exporters is the first camera
-    moved = [_move_pose(pose, world, noise.unit) for pose in poses]
+    moved = [matmul(world, pose) for pose in poses]  # in the world of the exporter, and its units
+    for estimate in moved:
+        estimate[:3, 3] *= noise.unit
     views = range(0, len(poses), 2)
     errors = {i: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for i in views}
 
@@ -199,13 +201,6 @@ def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> 
     out = pose.copy()
     out[:3, :3] = matmul(pose[:3, :3], quat_to_rotmat(quat))
     out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
-    return out
-
-
-def _move_pose(pose: Array, world: Array, unit: float) -> Array:
-    """Move a pose into the world of the exporter, in its units."""
-    out = matmul(world, pose)
-    out[:3, 3] *= unit
     return out
 
 

@@ -1,21 +1,13 @@
 """Training of the networks on renders compared with photos."""
 
-from gsmerge.research.training.examples import Example, make_example
-from gsmerge.research.training.loop import choose_device, train
-from gsmerge.research.training.scenes import make_training_scene
-from gsmerge.research.training.shards import Shard, prepare_shards, read_shard, write_shard
-from gsmerge.research.training.train_options import TrainOptions, preset_options
-
-__all__ = [
-    "Example",
-    "Shard",
-    "TrainOptions",
-    "choose_device",
-    "make_example",
-    "make_training_scene",
-    "prepare_shards",
-    "preset_options",
-    "read_shard",
-    "train",
-    "write_shard",
-]
+from gsmerge.research.training.examples import Example as Example
+from gsmerge.research.training.examples import make_example as make_example
+from gsmerge.research.training.loop import choose_device as choose_device
+from gsmerge.research.training.loop import train as train
+from gsmerge.research.training.scenes import make_training_scene as make_training_scene
+from gsmerge.research.training.shards import Shard as Shard
+from gsmerge.research.training.shards import prepare_shards as prepare_shards
+from gsmerge.research.training.shards import read_shard as read_shard
+from gsmerge.research.training.shards import write_shard as write_shard
+from gsmerge.research.training.train_options import TrainOptions as TrainOptions
+from gsmerge.research.training.train_options import preset_options as preset_options

@@ -17,9 +17,7 @@ from torch.nn.functional import normalize
 
 from gsmerge.networks.apply import (
     NetworkContext,
-    merge_features,
     prepare_children,
-    refine_features,
     run_heads,
 )
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
@@ -292,7 +290,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     encoded = context.encode(features_to_tensors(take(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))
     matches = match(features_to_arrays(encoded), options.match_options())
-    refined = refine_features(_merge(encoded, matches, context), context)
+    refined = context.refine(_merge(encoded, matches, context))
     return RefinedCrop(context, context.describe(refined), matches)
 
 
@@ -321,7 +319,7 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
     alone, order, cuts = cluster_runs(matches)
     if len(order) == 0:
         return encoded
-    pooled = merge_features(pool_tensors(encoded, order, cuts), encoded, order, cuts, context)
+    pooled = context.merge(pool_tensors(encoded, order, cuts), encoded, order, cuts)
     return FeatureGaussians.concat([take(encoded, alone), pooled])
 
 

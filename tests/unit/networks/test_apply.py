@@ -11,10 +11,8 @@ from gsmerge.geometry import covariances
 from gsmerge.networks.apply import (
     NetworkContext,
     decode_gaussians,
-    decode_with_group_features,
     encode_features,
     find_neighbors,
-    refine_features,
     run_heads,
 )
 from gsmerge.networks.corrector import ANALYTIC
@@ -148,9 +146,9 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     few = take(encoded, large)
     children, parents = divide(few, scene.members, np.full(len(few), 6))
     assert np.bincount(parents).tolist() == [6] * len(few)
-    together = decode_gaussians(children, parents, few, context)
+    together = context.decode(children, parents, few)
     for half in (np.arange(len(parents)) % 6 < 3, np.arange(len(parents)) % 6 >= 3):
-        assert_close(together[half], decode_gaussians(children[half], parents[half], few, context))
+        assert_close(together[half], context.decode(children[half], parents[half], few))
     assert not np.array_equal(together.means, children.means)
 
 
@@ -162,8 +160,8 @@ def test_refiner_reads_the_neighbours(scene: Made) -> None:
     for row, same in ((int(near[0, 0]), False), (far, True)):
         latents = encoded.latents.copy()
         latents[row] += 1
-        refined = refine_features(replace(encoded, latents=latents), context)
-        assert np.array_equal(refined.means[0], refine_features(encoded, context).means[0]) is same
+        refined = context.refine(replace(encoded, latents=latents))
+        assert np.array_equal(refined.means[0], context.refine(encoded).means[0]) is same
 
 
 def test_nearest_by_hand(scene: Made) -> None:
@@ -229,7 +227,7 @@ def test_gradients_reach_every_parameter(scene: Made) -> None:
         base = feature_to_gaussians(scene.features)[parents]
         total = total + run_heads(base, parents, group_features, context).square().sum()
     merged = merge(features, pairs(features), context)
-    total = total + refine_features(merged, context).latents.square().sum()
+    total = total + context.refine(merged).latents.square().sum()
     total.backward()
     for name, parameter in networks.named_parameters():
         if name.startswith("encoder.shift"):  # of means, which are arrays here
@@ -285,14 +283,14 @@ def test_heads_of_the_paper_read_latent_mass_and_base_colour_alone(scene: Made) 
     parents, changed = np.arange(len(features)), described.group.copy()
     changed[:, [i for i in range(GROUP) if i not in PAPER_NUMBERS]] += 1
     before, after = (
-        decode_with_group_features(described.base, parents, replace(described, group=group), context)
+        decode_gaussians(described.base, parents, replace(described, group=group), context)
         for group in (described.group, changed)
     )
     assert_close(before, after)
     for column in PAPER_NUMBERS:
         changed = described.group.copy()
         changed[:, column] += 1
-        other = decode_with_group_features(described.base, parents, replace(described, group=changed), context)
+        other = decode_gaussians(described.base, parents, replace(described, group=changed), context)
         assert not np.array_equal(other.scales, before.scales)
 
 

@@ -17,22 +17,19 @@ from gsmerge.settings.compact import CompactOptions
 VIEW = 480 * 320
 
 
-def seconds(
-    views: int = 12, *, photos: bool = True, fit_steps: int = 240, num_drawn: float | None = None, **settings: Any
-) -> float:
+def seconds(views: int = 12, *, fit_steps: int = 240, num_drawn: float = 0.3 * VIEW, **settings: Any) -> float:
     options = CompactOptions().with_settings(settings)
-    size = SceneSize(views * VIEW, views, 320, 480, True, "photos" if photos else "renders")
+    size = SceneSize(views * VIEW, views, 320, 480, True, "photos")
     plain = choose_for_scene(size, options).settings(options)
-    return work_seconds(views * VIEW, VIEW, plain, photos=photos, fit_steps=fit_steps, num_drawn=num_drawn)
+    return work_seconds(views * VIEW, VIEW, plain, fit_steps=fit_steps, num_drawn=num_drawn)
 
 
 def test_more_work_takes_longer() -> None:
     none = seconds(fit="none", checkpoint="none")
     assert none < seconds(fit="none") < seconds(fit="none", checkpoint="none", segmentation="slic")
     assert none < seconds(fit_steps=55) < seconds() < seconds(fit_steps=1000)
-    assert seconds(photos=False, checkpoint="none") < none
     assert seconds(24, fit="none") == pytest.approx(2 * seconds(12, fit="none"))
-    assert seconds(method="voxel") < seconds() < seconds(method="unmerged-fit")
+    assert seconds(method="voxel") < seconds() < seconds(method="unmerged-fit", num_drawn=12 * VIEW)
     assert seconds(num_drawn=0) < seconds() < seconds(num_drawn=VIEW)
     assert seconds(fit="none", num_drawn=0) == seconds(fit="none", num_drawn=VIEW)
 
@@ -40,7 +37,7 @@ def test_more_work_takes_longer() -> None:
 def test_threads_share_the_views() -> None:
     plain = CompactOptions().to_dict()
     one, two, many = (
-        wall_seconds(2 * VIEW, 2, plain, photos=True, fit_steps=240, threads=threads) for threads in (1, 2, 16)
+        wall_seconds(2 * VIEW, 2, plain, fit_steps=240, num_drawn=VIEW, threads=threads) for threads in (1, 2, 16)
     )
     assert one > two == many > estimate.IMPORT_SECONDS
 

@@ -13,7 +13,7 @@ from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch
 
 from gsmerge.networks import apply, tokens
-from gsmerge.networks.apply import NetworkContext, encode_features, merge_features, refine_features
+from gsmerge.networks.apply import NetworkContext, encode_features
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import FEATURE, NetworkOptions
 from gsmerge.networks.tensors import quat_to_rotmat
@@ -68,10 +68,10 @@ def test_every_stage_has_the_values_of_its_kernels(scene: Made, start: str) -> N
     same(actual, expected)
     pooled = pool_runs(expected, order, cuts)
     same(pool_tensors(actual, order, cuts), pooled)
-    expected = merge_features(pooled, expected, order, cuts, plain)
-    actual = merge_features(pool_tensors(actual, order, cuts), actual, order, cuts, training)
+    expected = plain.merge(pooled, expected, order, cuts)
+    actual = training.merge(pool_tensors(actual, order, cuts), actual, order, cuts)
     same(actual, expected)
-    expected, actual = refine_features(expected, plain), refine_features(actual, training)
+    expected, actual = plain.refine(expected), training.refine(actual)
     same(actual, expected)
     base, other = plain.describe(expected), training.describe(actual)
     for name in ("frames", "sizes", "group"):

@@ -14,7 +14,7 @@ from training_runs import OPTIONS, PAPER, TINY, noisy_networks, torch, written
 from gsmerge.errors import GsmergeError
 from gsmerge.kernels.elementary import exp
 from gsmerge.measure.lpips import lpips, lpips_available
-from gsmerge.networks.apply import NetworkContext, refine_features
+from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.raster import render
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
@@ -254,7 +254,7 @@ def test_what_is_rendered_is_what_the_stages_make(example: Example, network: Net
     encoded = learned.encode(example.features)
     merged = merge(encoded, match(encoded, PHOTO.match_options()), learned)
     options = DecodeOptions(k=k, min_opacity=0)
-    expected = decode(refine_features(merged, learned), example.members, options, networks=learned)
+    expected = decode(learned.refine(merged), example.members, options, networks=learned)
     with torch.no_grad():
         real = predict(whole_photo(example, 0, k).crop, networks, PHOTO, 0).gaussians.numpy()
     for name in ("means", "scales", "opacities", "sh0"):

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from gsmerge.batch import BatchOptions, Job, workload
+from gsmerge.batch import BatchOptions, Job, run
 from gsmerge.batch.jobs import CompactCall
-from gsmerge.batch.workload import choose_concurrency
+from gsmerge.batch.run import choose_concurrency
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.scene.exporters import AUTO
 from gsmerge.settings.compact import CompactOptions
@@ -21,8 +21,8 @@ def jobs(*counts: int) -> list[Job]:
 
 
 def machine(monkeypatch: pytest.MonkeyPatch, processors: int, memory: int | None) -> None:
-    monkeypatch.setattr(workload, "available_threads", lambda: processors)
-    monkeypatch.setattr(workload, "free_memory", lambda: memory)
+    monkeypatch.setattr(run, "available_threads", lambda: processors)
+    monkeypatch.setattr(run, "free_memory", lambda: memory)
 
 
 def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,7 +50,7 @@ def test_memory_limits_how_many_come_at_once(monkeypatch: pytest.MonkeyPatch) ->
     scenes, need = jobs(small, large, small, large, small), memory_bytes(large)
 
     def count(share: float | None, **message: Any) -> int:
-        machine(monkeypatch, 4, None if share is None else int(share * need / workload.FREE_MEMORY_SHARE) + 1)
+        machine(monkeypatch, 4, None if share is None else int(share * need / run.FREE_MEMORY_SHARE) + 1)
         return choose_concurrency(scenes, BatchOptions(**message)).jobs
 
     assert [count(3), count(2), count(1.9), count(0.5), count(None)] == [4, 2, 1, 1, 4]
