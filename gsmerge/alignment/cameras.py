@@ -14,13 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.frames import solve_pose
-from gsmerge.alignment.score import (
-    Correspondences,
-    check_pairs,
-    photo_colors,
-    pixel_errors,
-    pixel_limit,
-)
+from gsmerge.alignment.score import Correspondences, check_pairs, photo_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
 from gsmerge.geometry import camera_depths, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
@@ -113,11 +107,7 @@ def max_pixels(width: int, height: int) -> float:
 
 
 def move_cameras(
-    pairs: Correspondences,
-    cameras: Cameras,
-    names: tuple[str, ...],
-    source: str = "Ks",
-    images: np.ndarray = NO_IMAGES,
+    pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks", images: np.ndarray = NO_IMAGES
 ) -> MovedCameras | None:
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
 

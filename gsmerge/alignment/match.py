@@ -184,8 +184,7 @@ def read_views(
     if not bound.ok and set(own) >= set(layout.views):
         return bound  # nothing is nearer than poses of their own
     frames = chain(
-        ((0, frame) for frame in usual_frames(cameras, inputs.scale)),
-        solved_frames(pairs, cameras, own, inputs.scale),
+        ((0, frame) for frame in usual_frames(cameras, inputs.scale)), solved_frames(pairs, cameras, own, inputs.scale)
     )
     as_good = max(_AS_GOOD * bound.median_px, bound.median_px + _AS_GOOD_PX)
     readings: list[Reading] = []

@@ -45,11 +45,7 @@ from gsmerge.alignment.layouts import (
     view_orders,
 )
 from gsmerge.alignment.match import Place, Source, match_views, refine
-from gsmerge.alignment.score import (
-    SHUFFLED_MARGIN,
-    SMALLEST_PX,
-    score_layout,
-)
+from gsmerge.alignment.score import SHUFFLED_MARGIN, SMALLEST_PX, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile

@@ -14,14 +14,7 @@ from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.formats import depth_maps
 from gsmerge.io.formats.table import may_hold_gaussians
-from gsmerge.scene.files import (
-    IMAGE_PLACES,
-    PLY_PLACES,
-    TRAINED_PLACES,
-    list_plys,
-    named_ply,
-    other_plys,
-)
+from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
 

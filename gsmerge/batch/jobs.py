@@ -138,12 +138,7 @@ class Job:
         return find_scene_files(Path(self.scene), cameras=self.cameras, images=self.images)
 
 
-def find_jobs(
-    arguments: Sequence[str],
-    out: Path,
-    options: BatchOptions,
-    results: Collection[str] = (),
-) -> list[Job]:
+def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, results: Collection[str] = ()) -> list[Job]:
     """Find all scenes, each once, and name their results in the output folder.
 
     ``arguments`` are folders (``out`` is not searched), patterns, ``.ply`` files, and text files with one of these per

@@ -12,12 +12,7 @@ from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes
 from gsmerge.compaction.report import CompactReport, Covered
-from gsmerge.compaction.result import (
-    CompactResult,
-    measure_covered,
-    measure_input,
-    measure_result,
-)
+from gsmerge.compaction.result import CompactResult, measure_covered, measure_input, measure_result
 from gsmerge.facts.partition import (
     WHOLE_GAUSSIANS,
     Block,

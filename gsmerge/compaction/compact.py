@@ -31,11 +31,7 @@ MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than
 
 
 def compact(
-    scene: Scene | StrPath,
-    options: CompactOptions | None = None,
-    *,
-    progress: Progress | None = None,
-    **settings: Any,
+    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 

@@ -112,12 +112,7 @@ def other_cameras(path: Path) -> UsageError:
 
 
 def add_colmap(
-    add: AddOutput,
-    path: Path,
-    points: Path,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    photos: Photos,
+    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, photos: Photos
 ) -> list[Path]:
     """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
 

@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.new_views import NewViews
-from gsmerge.report import (
-    document_head,
-    file_sha256,
-    html_table,
-    seconds_document,
-    seconds_line,
-    text_table,
-    wrap_line,
-)
+from gsmerge.report import document_head, file_sha256, html_table, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes
 
 

@@ -209,12 +209,7 @@ def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
 
 
 def _score_photos(
-    name: str,
-    gaussians: Gaussians,
-    views: Scene,
-    prepared: Prepared,
-    plan: Plan,
-    covered: Sequence[np.ndarray] | None,
+    name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None
 ) -> PhotoScore:
     """Score Gaussians on the scored photos of ``views``: a quarter of each, or all if a quality is the target.
 

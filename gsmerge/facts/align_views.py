@@ -15,14 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.geometry import (
-    camera_depths,
-    motion_matrices,
-    motion_vectors,
-    move_views,
-    project,
-    without_common_motion,
-)
+from gsmerge.geometry import camera_depths, motion_matrices, motion_vectors, move_views, project, without_common_motion
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur

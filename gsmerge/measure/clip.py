@@ -25,10 +25,7 @@ from gsmerge.types import StrPath
 
 # Encoders by the ending of a name, the first that OpenCV has is used, with their names. Browsers play all but the last
 # of .mp4. VP8 takes a third of the time of VP9 and 1.6 times the space.
-ENCODERS = {
-    ".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")),
-    ".webm": (("VP80", "VP8"), ("VP90", "VP9")),
-}
+ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
 GIF = ".gif"
 SUFFIXES = (*ENCODERS, GIF)
 H264 = "H.264"  # of .mp4 where the program ffmpeg is at hand: nearly every program plays it

@@ -29,14 +29,7 @@ from gsmerge.measure.clip import (
     swipe_places,
     write_clip,
 )
-from gsmerge.measure.preview import (
-    Picture,
-    contact_sheet,
-    outside_pictures,
-    save_picture,
-    to_picture,
-    view_pictures,
-)
+from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR

@@ -121,10 +121,7 @@ def render_in_turn(
 
 
 def _tiler(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    options: Mapping[str, Any],
-    columns: Sequence[tuple[int, int]] | None = None,
+    gaussians: Gaussians, cameras: Cameras, options: Mapping[str, Any], columns: Sequence[tuple[int, int]] | None = None
 ) -> Callable[..., TiledView]:
     """Prepare the Gaussians for cameras, and return what tiles each view by its number, or a band of it."""
     splats, viewmats, Ks = prepare_views(gaussians, cameras)

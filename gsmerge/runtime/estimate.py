@@ -36,12 +36,7 @@ BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is i
 
 
 def work_seconds(
-    pixels: int,
-    view_pixels: float,
-    options: Mapping[str, Any],
-    *,
-    fit_steps: int,
-    num_drawn: float,
+    pixels: int, view_pixels: float, options: Mapping[str, Any], *, fit_steps: int, num_drawn: float
 ) -> float:
     """Estimate the processor seconds of compacting a scene, without imports.
 

@@ -18,15 +18,7 @@ from gsmerge.geometry import correlation
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import list_images
-from gsmerge.io.photo_files import (
-    Photos,
-    PhotoTransform,
-    Size,
-    decode_image,
-    image_size,
-    resize_and_crop,
-    resize_to,
-)
+from gsmerge.io.photo_files import Photos, PhotoTransform, Size, decode_image, image_size, resize_and_crop, resize_to
 from gsmerge.runtime.threads import parallel_map
 
 _SIDE = 128  # pixels of the pictures' longer side that are compared

@@ -121,11 +121,7 @@ class SceneFiles:
 
 
 def find_scene_files(
-    path: StrPath,
-    *,
-    cameras: StrPath | None = None,
-    images: StrPath | None = None,
-    masks: StrPath | None = None,
+    path: StrPath, *, cameras: StrPath | None = None, images: StrPath | None = None, masks: StrPath | None = None
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names, or "none", are not searched.
 

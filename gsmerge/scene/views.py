@@ -17,13 +17,7 @@ from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import CHUNK, read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.formats.table import is_frame
-from gsmerge.io.image_names import (
-    IMAGE_SUFFIXES,
-    find_image,
-    match_images,
-    match_masks,
-    natural_key,
-)
+from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, match_images, match_masks, natural_key
 from gsmerge.io.photo_files import (
     Photos,
     PhotoTransform,

@@ -202,11 +202,7 @@ def halve(
 
 
 def pool_children(
-    features: FeatureGaussians,
-    members: Members,
-    starts: np.ndarray,
-    ids: np.ndarray,
-    parents: np.ndarray,
+    features: FeatureGaussians, members: Members, starts: np.ndarray, ids: np.ndarray, parents: np.ndarray
 ) -> Gaussians:
     """Pool each run of members into one Gaussian, with the gain of its parent Feature Gaussian."""
     moments = pool_members(members, starts, ids)

@@ -17,14 +17,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.geometry import camera_depths
 from gsmerge.kernels.elementary import log, log10
-from gsmerge.kernels.superpixels.merge_tree import (
-    OVERSIZE,
-    PLANE_ERROR,
-    ROW,
-    cut_labels,
-    merge_order,
-    region_sums,
-)
+from gsmerge.kernels.superpixels.merge_tree import OVERSIZE, PLANE_ERROR, ROW, cut_labels, merge_order, region_sums
 from gsmerge.kernels.superpixels.regions import pad_labels
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.raster.images import seen_depths

@@ -12,10 +12,7 @@ from pathlib import Path
 import pytest
 from scripts import load_script
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(os.name == "nt" or not shutil.which("bash"), reason="needs bash"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name == "nt" or not shutil.which("bash"), reason="needs bash")]
 
 
 @pytest.fixture(scope="module")

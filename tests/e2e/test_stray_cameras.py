@@ -84,10 +84,7 @@ def test_commands_that_take_cameras_run_beside_them(words: tuple[str, ...], stra
 
 @pytest.mark.parametrize(
     ("words", "place", "value"),
-    [
-        ("--hint opacity=raw", "scene.ply", "--hint opacity=raw"),
-        ("--set checkpoint=nosuch", "nosuch", "checkpoint"),
-    ],
+    [("--hint opacity=raw", "scene.ply", "--hint opacity=raw"), ("--set checkpoint=nosuch", "nosuch", "checkpoint")],
 )
 def test_what_cannot_be_is_refused(words: str, place: str, value: str, smallest_copy: Path, run: Run) -> None:
     assert_refused(run("compact", smallest_copy, *words.split()), 3, place, value)

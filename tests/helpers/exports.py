@@ -89,13 +89,7 @@ def export_rows(tiny: Tiny, index: np.ndarray | None = None, rest: int = 0, norm
     return rows
 
 
-def turned(
-    rows: np.ndarray,
-    turn: np.ndarray,
-    *,
-    scale: float = 1.0,
-    shift: np.ndarray | None = None,
-) -> np.ndarray:
+def turned(rows: np.ndarray, turn: np.ndarray, *, scale: float = 1.0, shift: np.ndarray | None = None) -> np.ndarray:
     """The rows in another world: ``scale * turn @ x + shift``."""
     out = rows.copy()
     means = matmul(scale * np.stack([rows[c] for c in "xyz"], 1), turn.T) + (0 if shift is None else shift)

@@ -76,12 +76,7 @@ def stand_in(words: Sequence[str]) -> None:
 
 
 def write_set(
-    path: Path,
-    levels: Sequence[Gaussians],
-    *,
-    mip: bool = False,
-    leaves: int = 1,
-    environment: Gaussians | None = None,
+    path: Path, levels: Sequence[Gaussians], *, mip: bool = False, leaves: int = 1, environment: Gaussians | None = None
 ) -> None:
     """Write a Streamed SOG of one chunk for each level, each cut into as many runs as there are leaves."""
     path.parent.mkdir(parents=True, exist_ok=True)

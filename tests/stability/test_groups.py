@@ -251,10 +251,7 @@ def test_thin_pole_stays_visible_from_a_new_view(settings: dict) -> None:
 def test_near_and_far_details_are_both_kept() -> None:
     """A card five centimetres away before a landscape two kilometres away, textured alike in the image."""
     near, far = scenes.waves(1), scenes.waves(2)
-    surfaces = [
-        scenes.plane(0.05, lambda p: near(p * 60), right=0.0),
-        scenes.plane(2000.0, lambda p: far(p / 700)),
-    ]
+    surfaces = [scenes.plane(0.05, lambda p: near(p * 60), right=0.0), scenes.plane(2000.0, lambda p: far(p / 700))]
     cameras = scenes.arc(3, span=0.004)
     scene = scenes.make_scene(surfaces, cameras)
     actual = compacted(scene, fit_steps=60).gaussians

@@ -251,9 +251,7 @@ def test_covered_pixels_without_a_gaussian_get_the_nearest_colour(room: Scene) -
     ids = np.where(missing.reshape(-1), -1, room.pixel_ids).astype(np.int32)
     shown = ~missing.reshape(-1)
     rows = replace(
-        room.gaussians,
-        sh0=room.gaussians.sh0 * shown[:, None, None],
-        opacities=room.gaussians.opacities * shown,
+        room.gaussians, sh0=room.gaussians.sh0 * shown[:, None, None], opacities=room.gaussians.opacities * shown
     )
     scene = replace(room, gaussians=rows, pixel_ids=ids, missing=missing)
     mended = prepare(replace(scene, images=band(room.images))).scene.images

@@ -7,17 +7,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.types import (
-    Cameras,
-    FeatureGaussians,
-    Gaussians,
-    Groups,
-    Scene,
-    as_array,
-    as_tensor,
-    grid_ids,
-    like,
-)
+from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Scene, as_array, as_tensor, grid_ids, like
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:

@@ -16,12 +16,7 @@ from itertools import combinations
 import numpy as np
 
 from gsmerge.alignment.registration.keypoints import End, KeypointMatches, Photo, find_keypoints, match_photos
-from gsmerge.alignment.registration.similarities import (
-    apply_after,
-    fit_similarities,
-    invert_place,
-    round_place,
-)
+from gsmerge.alignment.registration.similarities import apply_after, fit_similarities, invert_place, round_place
 from gsmerge.geometry import IDENTITY, Damping, Similarity, camera_depths, descend, lower_median, motion_matrices
 from gsmerge.kernels.elementary import exp, log, log1p
 from gsmerge.kernels.matrices import matmul, solve, transform

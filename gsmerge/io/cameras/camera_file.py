@@ -12,15 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.photo_files import (
-    PhotoReader,
-    Photos,
-    PhotoTransform,
-    Size,
-    change_photos,
-    photo_size,
-    same_shape,
-)
+from gsmerge.io.photo_files import PhotoReader, Photos, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath

@@ -9,12 +9,7 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.camera_file import (
-    C2W_OPENCV,
-    C2W_OPENGL,
-    W2C_OPENCV,
-    CameraFile,
-)
+from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
 from gsmerge.io.cameras.json_files import (

@@ -95,12 +95,7 @@ DEPTHS = Format(
     holds=_lazy("depth_maps.holds_depth_maps"), each=(6.0,),
 )  # fmt: skip
 STATE = Format(
-    SUFFIX,
-    "batches of views: Gaussians, cameras and pictures",
-    _lazy("gsm.read_rows"),
-    None,
-    -1,
-    each=(56.0,),
+    SUFFIX, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
 HTML = Format(

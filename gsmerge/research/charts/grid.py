@@ -164,12 +164,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
 
 
 def make_jobs(
-    sources: Sequence[Source],
-    grid: Grid,
-    measured: EvaluateOptions,
-    *,
-    seed: int = 0,
-    command: str = "",
+    sources: Sequence[Source], grid: Grid, measured: EvaluateOptions, *, seed: int = 0, command: str = ""
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 

@@ -227,10 +227,7 @@ class ChartRun:
 
 @lru_cache(maxsize=1)
 def _load(
-    files: SceneFiles,
-    targets: Path | None,
-    target_images: Path | None,
-    sha256: str,
+    files: SceneFiles, targets: Path | None, target_images: Path | None, sha256: str
 ) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
     """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
     load = load_files(files)

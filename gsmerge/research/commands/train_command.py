@@ -45,12 +45,7 @@ class RunOptions(Settings):
 def train(args: opt.Args) -> None:
     """Train networks on scenes and their photos; after an interruption the same call goes on."""
     from gsmerge.report import document_head
-    from gsmerge.research.training import (
-        TrainOptions,
-        choose_device,
-        prepare_shards,
-        preset_options,
-    )
+    from gsmerge.research.training import TrainOptions, choose_device, prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
     from gsmerge.runtime.threads import use_threads
 

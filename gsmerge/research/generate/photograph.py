@@ -13,15 +13,7 @@ from numpy.typing import NDArray
 from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
 from gsmerge.kernels.elementary import arctan2, cos, power, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.research.generate.shapes import (
-    Array,
-    Shape,
-    ShapeArrays,
-    bounds,
-    norm,
-    pack,
-    rotate,
-)
+from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, bounds, norm, pack, rotate
 from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface

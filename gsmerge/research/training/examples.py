@@ -18,13 +18,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import lower_median
 from gsmerge.pooling import Members, feature_to_gaussians
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
-from gsmerge.research.training.scenes import (
-    TrainingScene,
-    coverage,
-    covered_pixels,
-    make_training_scene,
-    view_subsets,
-)
+from gsmerge.research.training.scenes import TrainingScene, coverage, covered_pixels, make_training_scene, view_subsets
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.scene.held_out import read_held_out
 from gsmerge.scene.read import load_scene

@@ -24,13 +24,7 @@ from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR
 from gsmerge.research.training.modules import Networks
-from gsmerge.research.training.predict import (
-    Prediction,
-    analytic_gaussians,
-    decode_crop,
-    predict,
-    refine_crop,
-)
+from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window
 from gsmerge.types import SH_C0, Gaussians
@@ -78,11 +72,7 @@ def _unit_features(image: Tensor, layers: tuple[Layer, ...], kernels: list[Tenso
 
 
 def window_loss(
-    networks: Networks,
-    window: Window,
-    options: TrainOptions,
-    step: int,
-    rng: np.random.Generator,
+    networks: Networks, window: Window, options: TrainOptions, step: int, rng: np.random.Generator
 ) -> Tensor:
     """Compute the loss of a window: its renders on a random background against the photo, plus regularizers.
 

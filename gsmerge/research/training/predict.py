@@ -15,11 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsmerge.networks.apply import (
-    NetworkContext,
-    prepare_children,
-    run_heads,
-)
+from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import COLOR, LOGIT, MASS, MEAN, ROTATION, SIZE
 from gsmerge.networks.options import CORRECTED, PART
 from gsmerge.networks.tensors import (

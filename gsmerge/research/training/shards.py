@@ -61,10 +61,7 @@ class Shard:
 
 
 def prepare_shards(
-    scenes: Sequence[Path],
-    options: TrainOptions,
-    folder: Path,
-    report: Report | None = None,
+    scenes: Sequence[Path], options: TrainOptions, folder: Path, report: Report | None = None
 ) -> list[Shard]:
     """Return the shards of all scenes in order; missing ones are made.
 

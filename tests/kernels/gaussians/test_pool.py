@@ -84,10 +84,7 @@ def test_pool_matches(own: bool, seed: int) -> None:
 
 
 @pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("opacities", 0.0), ("opacities", 1.0), ("scales", 0.02), ("quats", 0.0)],
-)
+@pytest.mark.parametrize(("field", "value"), [("opacities", 0.0), ("opacities", 1.0), ("scales", 0.02), ("quats", 0.0)])
 def test_pool_matches_at_the_ends(field: str, value: float, own: bool) -> None:
     """Transparent groups take the plain mean, opaque ones have a finite depth."""
     members = random_members(50, 2)

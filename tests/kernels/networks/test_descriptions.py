@@ -63,11 +63,7 @@ def slow_group(features: GroupFeatures, row: int, viewmat: np.ndarray) -> list[f
     local = arcsinh(frame.T @ f.covars[row].astype(np.float64) @ frame / size**2)
     place = viewmat[:3, :3] @ mean + viewmat[:3, 3]
     numbers = [*np.clip(log(base.scales[row] / pixel), -12, 12) / 4, logit(base.opacities[row]) / 3]
-    numbers += [
-        log(f.masses[row] / pixel**3) / 10,
-        log(f.extinctions[row] / pixel**2) / 10,
-        log(count) / 4,
-    ]
+    numbers += [log(f.masses[row] / pixel**3) / 10, log(f.extinctions[row] / pixel**2) / 10, log(count) / 4]
     numbers += [f.weights[row] / count, *(SH_C0 * base.sh0[row, 0]), *local[np.triu_indices(3)]]
     return [*numbers, *np.clip(place[:2] / max(place[2], 1e-6), -3, 3)]
 

@@ -13,17 +13,7 @@ from network_fixtures import noisy
 from sweeps import sweep
 
 from gsmerge.kernels import elementary
-from gsmerge.kernels.networks.layers import (
-    GELU,
-    PLAIN,
-    TANH,
-    attend,
-    dense,
-    normalise,
-    pack,
-    padded,
-    scratch_size,
-)
+from gsmerge.kernels.networks.layers import GELU, PLAIN, TANH, attend, dense, normalise, pack, padded, scratch_size
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import GROUP, MEMBER, PART, SLOTS, NetworkOptions, weight_shapes
 from gsmerge.runtime.threads import parallel_map, use_threads

@@ -91,9 +91,7 @@ CHANGES: dict[str, Callable[[Gaussians], dict[str, np.ndarray]]] = {
     "no rotation": lambda g: {"quats": np.zeros_like(g.quats)},
     "long quats": lambda g: {"quats": g.quats * 1e9},
     "too opaque": lambda g: {"opacities": np.full_like(g.opacities, 3.0)},
-    "at the camera": lambda g: {
-        "means": turned_cameras(1).numpy().centres[0].astype(np.float32) + 1e-2 * g.means,
-    },
+    "at the camera": lambda g: {"means": turned_cameras(1).numpy().centres[0].astype(np.float32) + 1e-2 * g.means},
     "in one place": lambda g: {"means": np.array([[0.1, 0.2, 3.0]], np.float32).repeat(len(g), 0)},
 }
 

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from slow_renderer import (
-    random_gaussians,
-    turned_cameras,
-    view_colors,
-)
+from slow_renderer import random_gaussians, turned_cameras, view_colors
 from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge.kernels.raster import sh

@@ -43,14 +43,7 @@ def test_bass_parameters(pixels: np.ndarray, labels: np.ndarray) -> None:
     rows = bass.fit_regions(pad_labels(labels), pixels, np.full(30, labels.size / 30))
     for row, (colour, place, covariance) in zip(rows, slow_parameters(pixels, labels, 30), strict=True):
         inverse = np.linalg.inv(covariance)
-        expected = [
-            *colour,
-            *place,
-            inverse[0, 0],
-            2 * inverse[0, 1],
-            inverse[1, 1],
-            log(np.linalg.det(covariance)),
-        ]
+        expected = [*colour, *place, inverse[0, 0], 2 * inverse[0, 1], inverse[1, 1], log(np.linalg.det(covariance))]
         assert row == pytest.approx(np.array(expected), rel=1e-4, abs=1e-5)
 
 

@@ -94,8 +94,7 @@ def test_two_readings_that_fit_are_refused(tmp_path: Path, monkeypatch: pytest.M
     true = other_conventions(SMOOTH.w2c, C2W_OPENGL)[0]
     same = replace(true, viewmats=SMOOTH.w2c)
     monkeypatch.setattr(
-        "gsmerge.alignment.match.other_conventions",
-        lambda *_: [same, replace(same, convention=("another", "way"))],
+        "gsmerge.alignment.match.other_conventions", lambda *_: [same, replace(same, convention=("another", "way"))]
     )
     with refuses(SceneError, "transforms.json", "world-to-camera", "OpenCV", "another"):
         load_scene(folder, order="view-major", cameras=folder / "transforms.json")

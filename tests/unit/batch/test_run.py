@@ -76,10 +76,7 @@ def test_processes_take_turns_though_each_removes_the_file(tmp_path: Path) -> No
 
 def test_a_lock_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with (
-        pytest.raises(SceneError, match="exists"),
-        lock_result(tmp_path / "file", "a.ply", wait=False),
-    ):
+    with pytest.raises(SceneError, match="exists"), lock_result(tmp_path / "file", "a.ply", wait=False):
         pass
 
 

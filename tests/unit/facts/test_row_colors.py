@@ -56,9 +56,7 @@ def two_layers(front: Scene, back: Scene) -> Scene:
     """Two scenes of the same cameras, view by view, as models with several Gaussians per pixel write them."""
     gaussians = Gaussians.concat([front.gaussians, back.gaussians])
     cameras = replace(
-        front.cameras,
-        viewmats=np.concatenate([front.cameras.viewmats] * 2),
-        Ks=np.concatenate([front.cameras.Ks] * 2),
+        front.cameras, viewmats=np.concatenate([front.cameras.viewmats] * 2), Ks=np.concatenate([front.cameras.Ks] * 2)
     )
     ids = grid_ids(np.concatenate([front.valid, back.valid]))
     return Scene(gaussians, cameras, None, ids, (*front.names, *front.names))

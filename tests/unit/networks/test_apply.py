@@ -8,13 +8,7 @@ import pytest
 from network_fixtures import SMALL, Made, made, noisy, untrained
 
 from gsmerge.geometry import covariances
-from gsmerge.networks.apply import (
-    NetworkContext,
-    decode_gaussians,
-    encode_features,
-    find_neighbors,
-    run_heads,
-)
+from gsmerge.networks.apply import NetworkContext, decode_gaussians, encode_features, find_neighbors, run_heads
 from gsmerge.networks.corrector import ANALYTIC
 from gsmerge.networks.options import GROUP, PAPER_NUMBERS, NetworkOptions
 from gsmerge.networks.weights import NetworkWeights

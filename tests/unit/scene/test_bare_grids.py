@@ -116,10 +116,7 @@ def test_rows_that_are_no_numbers(tmp_path: Path) -> None:
 def test_rows_that_are_no_grid(tmp_path: Path) -> None:
     tiny, rng = made(), np.random.default_rng(0)
     count = len(tiny.gaussians)
-    others = {
-        "shuffled": rng.permutation(count),
-        "sorted": np.lexsort(tiny.gaussians.means.T),
-    }
+    others = {"shuffled": rng.permutation(count), "sorted": np.lexsort(tiny.gaussians.means.T)}
     for name, index in others.items():
         loaded = read_bare(tmp_path / name, tiny, index)
         assert len(loaded.scene) == 0

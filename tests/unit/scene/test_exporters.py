@@ -97,8 +97,7 @@ def test_depth_anything_every_other_view(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "axes"),
-    [("view-fastest", (1, 2, 0)), ("column-major", (0, 2, 1)), ("view-major", (0, 1, 2))],
+    ("order", "axes"), [("view-fastest", (1, 2, 0)), ("column-major", (0, 2, 1)), ("view-major", (0, 1, 2))]
 )
 def test_orders(tmp_path: Path, smooth: Tiny, order: str, axes: tuple[int, int, int]) -> None:
     index = np.arange(3 * smooth.height * smooth.width).reshape(3, smooth.height, smooth.width)

@@ -44,11 +44,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
 @pytest.mark.parametrize(
     ("left", "found", "said"),
     [
-        (
-            ("exports/npz/results.npz", "scene.glb"),
-            "exports/npz/results.npz",
-            ("depth maps", "infer_gs=True"),
-        ),
+        (("exports/npz/results.npz", "scene.glb"), "exports/npz/results.npz", ("depth maps", "infer_gs=True")),
         (("exports/mini_npz/results.npz",), "exports/mini_npz/results.npz", ("npz-gs_ply", "giant")),
         (("scene.glb", "scene.jpg"), "scene.glb", ("Depth Anything 3", "npz-gs_ply")),
         (("results.npz",), "results.npz", ("Depth Anything 3", "npz-gs_ply")),

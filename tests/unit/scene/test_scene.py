@@ -9,15 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import names, noted, refuses
-from tiny_scene import (
-    Tiny,
-    edited_json,
-    frames_of,
-    write_colmap_binary,
-    write_images,
-    write_npz,
-    write_transforms,
-)
+from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_images, write_npz, write_transforms
 
 from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError

@@ -17,14 +17,7 @@ from gsmerge.pooling import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.assign import (
-    assign,
-    find_owners,
-    find_pixels,
-    merge_unseen,
-    middle_pixels,
-    owner_pixels,
-)
+from gsmerge.stages.assign import assign, find_owners, find_pixels, merge_unseen, middle_pixels, owner_pixels
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.segment import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.superpixels import segment
@@ -87,10 +80,7 @@ def test_rows_by_pixel_are_those_of_the_grid(room: Scene, groups: Groups) -> Non
     for actual, expected in zip(member_rows(scene, members, groups), in_order, strict=True):
         assert (actual == expected).all()
     np.testing.assert_allclose(members.footprints, scene_members(room).footprints, rtol=1e-5)
-    one, other = (
-        encode(scene, members, groups),
-        encode(room, scene_members(room), groups),
-    )
+    one, other = (encode(scene, members, groups), encode(room, scene_members(room), groups))
     assert np.allclose(one.means, other.means, atol=1e-6)
     assert np.array_equal(one.views, other.views)
 

@@ -76,10 +76,7 @@ def bent(x: np.ndarray, y: np.ndarray, model: str, c: list[float]) -> tuple[np.n
         return x * scale, y * scale
     k1, k2, p1, p2, k3, k4, k5, k6 = [*c, *[0.0] * (8 - len(c))]
     scale = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
-    return (
-        x * scale + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-        y * scale + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
-    )
+    return (x * scale + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2), y * scale + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y)
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from messages import refuses
-from tiny_scene import (
-    Tiny,
-    assert_same,
-    write_colmap_binary,
-    write_colmap_text,
-)
+from tiny_scene import Tiny, assert_same, write_colmap_binary, write_colmap_text
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras

@@ -8,13 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from messages import refuses
-from tiny_scene import (
-    Tiny,
-    assert_same,
-    write_colmap_binary,
-    write_colmap_text,
-    write_npz,
-)
+from tiny_scene import Tiny, assert_same, write_colmap_binary, write_colmap_text, write_npz
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras

@@ -12,14 +12,7 @@ import scenes
 from hostile.camera_models import long_lrm, world_mirror
 from hostile.case import HEIGHT, VIEWS, WIDTH
 from messages import refuses
-from tiny_scene import (
-    Tiny,
-    edited_json,
-    save_json,
-    write_colmap_text,
-    write_inria,
-    write_transforms,
-)
+from tiny_scene import Tiny, edited_json, save_json, write_colmap_text, write_inria, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras

@@ -10,14 +10,7 @@ from messages import noted, refuses
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.research.charts.grid import (
-    Grid,
-    find_sources,
-    list_settings,
-    make_jobs,
-    parse_grid,
-    scene_names,
-)
+from gsmerge.research.charts.grid import Grid, find_sources, list_settings, make_jobs, parse_grid, scene_names
 from gsmerge.settings.compact import CompactOptions
 
 
@@ -62,12 +55,7 @@ def test_baselines_run_once_per_size() -> None:
 def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
     grid = Grid(method=("unmerged", "unmerged-fit"), budget=("1%", "2%"), effort=("fast", "default"), fit=("none",))
     combinations, notes = list_settings(grid)
-    assert combinations == [
-        ("input", {}),
-        ("unmerged", {}),
-        ("unmerged-fit", {"effort": "fast"}),
-        ("unmerged-fit", {}),
-    ]
+    assert combinations == [("input", {}), ("unmerged", {}), ("unmerged-fit", {"effort": "fast"}), ("unmerged-fit", {})]
     assert noted(notes, "5 combination(s)")
 
 

@@ -10,14 +10,7 @@ import pytest
 from experiments import SCENES, make_grid, make_record
 from messages import refuses
 
-from gsmerge.research.charts.lines import (
-    Results,
-    line_key,
-    line_names,
-    mean_interval,
-    paired_intervals,
-    size_label,
-)
+from gsmerge.research.charts.lines import Results, line_key, line_names, mean_interval, paired_intervals, size_label
 
 PSNR = "psnr_target_visible"
 

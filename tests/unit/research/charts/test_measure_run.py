@@ -15,11 +15,7 @@ from experiments import make_record
 
 from gsmerge.batch.records import DONE, FAILED, RECORDS, record
 from gsmerge.io.jsonl import append_line
-from gsmerge.research.charts.measure_run import (
-    RunRecord,
-    keep_pictures,
-    read_runs,
-)
+from gsmerge.research.charts.measure_run import RunRecord, keep_pictures, read_runs
 
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:

@@ -14,15 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.networks.corrections import LOGIT
 from gsmerge.networks.options import Bounds
-from gsmerge.research.training import (
-    Example,
-    Shard,
-    TrainOptions,
-    choose_device,
-    make_example,
-    preset_options,
-    train,
-)
+from gsmerge.research.training import Example, Shard, TrainOptions, choose_device, make_example, preset_options, train
 from gsmerge.research.training.scenes import TrainingScene, make_training_scene
 from gsmerge.settings.setting import change_settings
 from gsmerge.types import Scene
