@@ -221,18 +221,31 @@ def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -
     """
     if not 1 < len(cameras) <= MOST_VIEWS:
         return fitted
-    cameras = _small_cameras(cameras)
+    cameras, splats = _small_cameras(cameras), prepare(fitted)
     between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
-    seen = _see(fitted, cameras), _see(fitted, between).where_covered()
-    filled, full = fitted, len(fitted) + most
-    for view in range(len(between)):
-        if len(filled) >= full:
-            break
-        more = _continue_surfaces(filled, between[[view]], seen, outside)
-        filled = Gaussians.concat([filled, more[: full - len(filled)]])
-    faintest = order[: len(filled) - len(fitted)]
-    return filled[np.delete(np.arange(len(filled)), faintest)]
+    seen, missed = _see(splats, cameras), _see(splats, between, between=True)
+
+    def continue_surfaces(view: int) -> Gaussians:
+        return _continue_surfaces(missed, view, seen, outside, fitted.shN.shape[1])
+
+    added = fitted[:0]
+    for view, more in enumerate(parallel_map(continue_surfaces, range(len(between) if most else 0))):
+        more = more[~_on_same_pixels(more, added, between[[view]])]
+        added = Gaussians.concat([added, more[: most - len(added)]])
+    return Gaussians.concat([fitted[np.sort(order[len(added) :])], added])
+
+
+def _on_same_pixels(some: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
+    """Mark ``some`` Gaussians ``[n]`` whose pixel in a camera is one of the four around one of the ``others``."""
+    covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
+    (around,), (depths,) = project(others.means, camera)
+    corners = around[depths > 0, None] + np.array([(0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)])
+    x, y = np.clip(np.floor(corners), 0, last).astype(np.int64).reshape(-1, 2).T
+    covered[y, x] = True
+    covered[[0, -1]] = covered[:, [0, -1]] = False  # the rim has what stands outside
+    x, y = np.clip(np.floor(project(some.means, camera)[0][0] + 1), 0, last).astype(np.int64).T
+    return covered[y, x]
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,11 +254,10 @@ class Seen:
 
     cameras: Cameras
     depths: np.ndarray  # [c,h,w] mean camera z
-    clear: np.ndarray  # [c,h,w] bool, where little is
-
-    def where_covered(self) -> Seen:
-        """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
-        return Seen(self.cameras, np.where(self.clear, np.float32(0), self.depths), np.zeros_like(self.clear))
+    farthest: np.ndarray  # [c,h,w] the farthest around, as far as new Gaussians reach; 0 where nothing is said
+    left: np.ndarray  # [c,h,w] transmittance
+    clear: np.ndarray  # [c,h,w] bool, where little is to be
+    images: np.ndarray | None  # [c,h,w,3] of cameras between photos
 
     def contradict(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the points ``[n,3]`` that stand before a surface, or where a camera sees nothing."""
@@ -253,7 +265,7 @@ class Seen:
         inside = (z > 0) & ((pixels >= -REACH) & (pixels < size + REACH)).all(2)
         camera, point = np.nonzero(inside)
         column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
-        wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.depths[camera, row, column])
+        wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.farthest[camera, row, column])
         return np.bincount(point[wrong], minlength=len(points)) > 0
 
 
@@ -276,37 +288,33 @@ def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
     return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR)
 
 
-def _see(gaussians: Gaussians, cameras: Cameras) -> Seen:
-    """Draw what cameras see; depths are the farthest around, as far as new Gaussians reach."""
-    splats = prepare(gaussians)
+def _see(splats: Splats, cameras: Cameras, *, between: bool = False) -> Seen:
+    """Draw what cameras see; those ``between`` photos say nothing where it is clear, and see colours, too."""
 
-    def see(view: int) -> tuple[np.ndarray, np.ndarray]:
-        depths, left = blend_depths(_tile(splats, cameras, view))
-        return cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8)), left > CLEAR
+    def see(view: int) -> tuple[np.ndarray, ...]:
+        tiled = _tile(splats, cameras, view)
+        depths, left = blend_depths(tiled)
+        farthest = cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8))
+        image = [blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]] if between else []
+        return depths, np.where(between & (left > CLEAR), np.float32(0), farthest), left, *image
 
-    shape = len(cameras), cameras.height, cameras.width
-    depths, clear = np.zeros(shape, np.float32), np.zeros(shape, bool)
-    for view, pictures in enumerate(parallel_map(see, range(len(cameras)))):
-        depths[view], clear[view] = pictures
-    return Seen(cameras, depths, clear)
+    columns = list(map(np.stack, zip(*parallel_map(see, range(len(cameras))), strict=True)))
+    depths, farthest, left = columns[:3]
+    return Seen(cameras, depths, farthest, left, (left > CLEAR) & (not between), columns[3] if between else None)
 
 
-def _continue_surfaces(
-    gaussians: Gaussians, camera: Cameras, seen: tuple[Seen, ...], outside: Outside | None
-) -> Gaussians:
-    """Make Gaussians for the clear pixels of a camera that continue the farther side of the surfaces beside.
+def _continue_surfaces(missed: Seen, view: int, seen: Seen, outside: Outside | None, num_higher: int) -> Gaussians:
+    """Make Gaussians for the clear pixels of a camera between photos that continue the farther side of the surfaces.
 
-    Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
+    Each stands at the first of ``DEEPER`` times that depth which no camera contradicts; none where all are.
     """
-    tiled = _tile(prepare(gaussians), camera, 0)
-    depths, left = blend_depths(tiled)
+    camera, depths, left = missed.cameras[[view]], missed.depths[view], missed.left[view]
+    assert missed.images is not None
     solid, clear = left < SOLID, left > CLEAR
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
     clear &= cv2.dilate(known.astype(np.uint8), around) > 0
-    if not clear.any():
-        return gaussians[:0]
-    image = blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0] / np.maximum(1 - left, 1e-6)[..., None]
+    image = missed.images[view] / np.maximum(1 - left, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
     y, x = np.nonzero(clear)
@@ -314,11 +322,11 @@ def _continue_surfaces(
     eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
     tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
     points = (eye + tried[..., None] * rays).reshape(-1, 3)
-    wrong = np.logical_or(*(some.contradict(points) for some in seen))
+    wrong = seen.contradict(points) | missed.contradict(points)
     if outside is not None:
         wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
     hidden = ~wrong.reshape(tried.shape)
     rows = np.flatnonzero(hidden.any(0))
     chosen = tried[hidden.argmax(0)[rows], rows]
     colors = sums[rows, 1:4] / sums[rows, 4:]
-    return _make_gaussians(eye, rays[rows], chosen, SIZE / K[0, 0], colors, gaussians.shN.shape[1])
+    return _make_gaussians(eye, rays[rows], chosen, SIZE / K[0, 0], colors, num_higher)

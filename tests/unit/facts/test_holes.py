@@ -228,6 +228,15 @@ def test_what_a_camera_between_views_uncovers_is_filled_behind_what_they_see() -
     assert (new[:, 2] > 3).all()
 
 
+def test_cameras_between_do_not_fill_the_same_twice() -> None:
+    gaussians, cameras = slit(-0.6, -0.2, 0.2, 0.6)
+    new = fill_between(with_faint(gaussians), cameras, None)[len(gaussians) :]
+    new = new[new.opacities > 0.5]
+    apart = np.linalg.norm(new.means[:, None] - new.means, axis=2) + np.diag(np.full(len(new), np.inf))
+    assert len(new) > 50
+    assert np.median(apart.min(1) / new.scales[:, 0]) > 1
+
+
 def test_only_faint_gaussians_make_room() -> None:
     gaussians, cameras = slit(-0.6, 0.6)
     np.testing.assert_array_equal(fill_between(gaussians, cameras, None).means, gaussians.means)
