@@ -200,8 +200,7 @@ def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     pictures = row_pictures(scene)
     known = scene.stored & (scene.gaussians.opacities.reshape(inside.shape) > FAINT) & inside
     covers = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
-    if covers.any() or not inside.all():
-        picture_rows(scene, differ_drawn)
+    picture_rows(scene, differ_drawn, np.asarray((covers | ~inside).any((1, 2))))
     return covers, pictures
 
 

@@ -66,10 +66,11 @@ class RowPicture:
     drawing: np.ndarray  # [h,w,3] before black
 
 
-def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T]) -> list[T]:
-    """Return ``use(views, picture)`` for every camera; its views are layers."""
+def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], wanted: np.ndarray | None = None) -> list[T]:
+    """Return ``use(views, picture)`` for every camera, or those with views in ``wanted [v]``; its views are layers."""
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]
+    groups = [views for views in groups if wanted is None or wanted[views].any()]
     return list(in_turn(lambda views: use(views, _picture(scene, views)), groups))
 
 
