@@ -105,8 +105,9 @@ def draw_chart(records: list[dict[str, Any]], path: Path) -> None:
         panels = figure.subplots(1, 2)
         for axes, key, label in zip(panels, ("psnr", "lpips"), ("PSNR, dB", "LPIPS, less is better"), strict=True):
             axes.axhline(mean(records, INPUT, key), color="#888888", linewidth=0.8, linestyle=":", label=INPUT)
-            for number, name in enumerate((*OURS, *THEIRS)):
-                style = {"color": COLORS[number % len(COLORS)], "marker": "s" if name in THEIRS else "o"}
+            colors = (*COLORS[: len(OURS)], "#333333", "#999999")
+            for name, color in zip((*OURS, *THEIRS), colors, strict=True):
+                style = {"color": color, "marker": "s" if name in THEIRS else "o"}
                 place = mean(records, name, "processor"), mean(records, name, key)
                 axes.plot(*place, linestyle="", markersize=4.5, label=name.replace("`", ""), **style)
             axes.set(xscale="log", xlabel="processor seconds", ylabel=label)

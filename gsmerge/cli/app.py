@@ -125,11 +125,11 @@ def _command_of(words: list[str]) -> str | None:
 
 
 def _is_scene(word: str) -> bool:
-    """Return whether a first word is a scene in place of a command: a path that exists, or a name of such files."""
+    """Return whether a first word is a scene in place of a command: a path that is one, or a name of such files."""
     if word.startswith("-") or _command_of([word]) is not None:
         return False
-    if os.path.lexists(word) or "." not in word:
-        return os.path.lexists(word)
+    if os.path.lexists(word) or os.path.dirname(word):
+        return True
     from gsmerge.io.formats.table import SCENE_SUFFIXES
     from gsmerge.settings.extend import SUFFIX
 

@@ -17,7 +17,8 @@ COST_FIT = 0.5  # besides the steps
 COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # more than usual
 # Of a step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
-COST_DRAWN = 0.15  # per million Gaussians that it draws
+COST_DRAWN = 0.25  # per million Gaussians that it draws
+MORE = 0.6  # of a processor that each thread but the first is worth
 
 # Where views are placed, per million Gaussians of the input:
 COST_READ = 3.0  # of reading and judging
@@ -55,7 +56,7 @@ def work_seconds(
 def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, threads: int, **facts: Any) -> float:
     """Estimate the wall time of a run on ``threads`` threads with imports; other arguments: :func:`work_seconds`."""
     work = work_seconds(pixels, pixels / max(num_views, 1), options, **facts)
-    return IMPORT_SECONDS + work / max(1, min(threads, num_views))
+    return IMPORT_SECONDS + work / (1 + MORE * max(0, min(threads, num_views) - 1))
 
 
 def placed_seconds(num_input: int, num_drawn: float, *, threads: int, fit_steps: int, views: int, tries: int) -> float:

@@ -61,8 +61,8 @@ class CompactOptions(Settings):
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
     method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel or contribution.",
         "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME")  # fmt: skip
-    effort: str = setting("default", "Quality for time: best is sharper and takes two to three times as "
-        "long; fast and draft take a third or less.",
+    effort: str = setting("default", "Quality for time: best is sharper and takes three times as "
+        "long; fast and draft take less than half.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",

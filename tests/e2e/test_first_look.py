@@ -67,7 +67,8 @@ def test_a_plan_and_what_no_page_shows_open_none(smallest_copy: Path, run: Run, 
 
 def test_a_name_of_no_file_is_a_scene_by_its_ending(tmp_path: Path, run: Run, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    assert_refused(run("nowhere.ply"), 3, "nowhere.ply", "no such file")
+    for scene in ("nowhere.ply", "./nowhere", "some/nowhere"):
+        assert_refused(run(scene), 3, scene.removeprefix("./"), "no such file")
     assert "No such command" in run("nowhere").err
     assert "No such command" in run("nowhere.txt").err
 
