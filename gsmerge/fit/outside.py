@@ -34,8 +34,7 @@ PLACES = 42  # views outside, at most, or as many as there are photos
 SAMPLE = 2000  # Gaussians that say how far away the middle of a view lies
 ROWS = 4000  # Gaussians of the input for each photo that stand for all, made as much larger as they are fewer
 NEAREST = 0.25  # of the depth of what a view sees: nearer to a camera nothing is looked at
-# Quantile of the depths of what a view sees, and times that, from which on all depths count as one: a flyaway that
-# shimmers through would move the mean depth of its pixel
+# Quantile of depths in a view, and times that, from which on all count as one: a flyaway moves its pixel's mean depth
 LAST, FARTHEST = 0.98, 4.0
 EMPTY, SOLID = 0.15, 0.9  # opacities of the input: below it a pixel is empty, above it shows a surface
 # Distance from what the input shows, as a share of the width, within which nothing is asked: what stands beside the
