@@ -79,6 +79,7 @@ USAGE = {
     "render room --path spline --views 1 -o a.mp4": "spline*2*1",
     "render room --frames 9 -o a": "--frames*--path",
     "evaluate room --lpips none --no-context": "*--no-context*--set context=false",
+    "evaluate room --lpips none -q": "--quiet*-o*--json",
     "evaluate room --lpips none --set context=false": "context=false*held-out*--targets",
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",
     "evaluate room --lpips none -o room/scene.ply": "room/scene.ply*.json, .csv, .md or .html",
