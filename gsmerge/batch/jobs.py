@@ -46,7 +46,8 @@ class BatchOptions(Settings):
         "format.")  # fmt: skip
     jobs: int | None = setting(None, "Scenes at once.", "By default as many as processors and free memory allow.",
         least=1)  # fmt: skip
-    overwrite: bool = setting(False, "Compact scenes again that are done, and replace files that no batch wrote.")
+    overwrite: bool = setting(False, "Compact scenes again, and replace files that no batch wrote with these "
+        "settings.")  # fmt: skip
     engine: str = setting("local", "Where scenes are compacted, see `Engine`.")
     address: str | None = setting(None, "Address of the Ray cluster, see `Engine`.")
 
@@ -76,7 +77,7 @@ class SceneCall(Protocol):
     """Call that makes the result of a scene."""
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of everything that the result depends on."""
+        """Return a digest of everything that the result depends on; what follows a dot in it is of settings alone."""
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Make the result; return its report and the files written."""
@@ -91,7 +92,7 @@ class CompactCall:
     hints: ReadHints
 
     def key(self, files: SceneFiles) -> str:
-        """Return a digest of the input's files, all settings and the version."""
+        """Return a digest of the input's files and the version and, after a dot, one of all settings."""
         settings = self.settings.to_dict()
         del settings["threads"]
         checkpoint = Path(self.settings.checkpoint)
@@ -100,7 +101,8 @@ class CompactCall:
         without = [name for name in sorted(files.named) if getattr(files, name) is None]
         reading = {"opacity": self.opacity, **vars(self.hints), "without": without}
         version = {"tool_version": __version__, "schema_version": SCHEMA_VERSION}
-        return digest({"scene": content_hash(read_files(files)), "settings": settings, "reading": reading, **version})
+        scene = digest({"scene": content_hash(read_files(files)), **version})
+        return f"{scene}.{digest({'settings': settings, 'reading': reading})}"
 
     def run(self, files: SceneFiles, out: Path, threads: int) -> tuple[dict[str, Any], list[Path]]:
         """Compact the scene; return the report, and the result with its coarser levels."""

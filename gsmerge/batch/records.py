@@ -60,7 +60,7 @@ class RecordIndex:
                 output, status = _text(line["output"]), line["status"]
                 if status == DONE:
                     self.results[output] = _read_result(line, end)
-                elif status == FAILED and output in self.results:
+                elif status == FAILED and line["key"] is None and output in self.results:  # a refusal has its key
                     self.results[output] = replace(self.results[output], key="")
         return self
 

@@ -153,6 +153,11 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     if foreign and not begun.exists() and not run.overwrite:
         problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
         raise UsageError(f"{run.folder / foreign[0]}: {problem}")
+    former = "" if known is None else known.key.partition(".")[2]  # which stands for the settings
+    there = any(os.path.lexists(run.folder / name) for name in names)
+    if there and former not in ("", key.partition(".")[2]) and not run.overwrite:
+        problem = "was made with other settings; pass --overwrite to make it again, or name another --output"
+        return record(FAILED, job.scene, job.output, key=key, error=f"{run.folder / job.output}: {problem}")
     mark(begun)
     out = run.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ import typer
 from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import plain_warnings, say
-from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
+from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, expand_home, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -217,7 +217,7 @@ def _check_working_directory() -> None:
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
-    words = [word for word in arguments if word != DEBUG]
+    words = [expand_home(word) for word in arguments if word != DEBUG]
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)

@@ -56,8 +56,8 @@ def parse_jobs(text: str) -> int:
         opt.option("name", str, "Name of a result: {stem}, {parent}, {index} and {k} are filled in.",
                    default="{stem}.ply", metavar="NAME"),
     ),
-    opt.changed("overwrite", False, help="Compact scenes again that are done, and replace files in the folder that no "
-                "batch wrote."),
+    opt.changed("overwrite", False, help="Compact scenes again, and replace files in the folder that no batch wrote "
+                "with these settings."),
     "strict dry_run seed",
     opt.changed("threads", help="Threads of each scene.", show_default="processors by jobs"),
     opt.changed("json", False, help="Print one line of JSON per scene on stdout."),

@@ -56,7 +56,7 @@ PARAMETERS = (
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream. A new folder: a web "
-               "site; colmap: a COLMAP model; a folder with files in it gets the result.", "SCENE.compact.ply"),
+               "site; colmap: a COLMAP model; an existing folder gets the result.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 

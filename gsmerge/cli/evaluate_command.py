@@ -60,6 +60,8 @@ def evaluate(args: opt.Args) -> None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
     args.views, args.masks = own.views, None if own.masks is None else opt.named_or_none(own.masks)
     files, outputs = args.files(args.before), args.output or []
+    if args.quiet and not (outputs or args.json):
+        raise UsageError("--quiet: expected -o or --json with it, since nothing would be shown")
     _check_files(args, outputs, own, input_files(files))
     seconds = [_seconds_of(making) for making in own.merge_seconds]
     from gsmerge.measure.evaluate import evaluate as evaluate_scene

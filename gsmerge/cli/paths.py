@@ -40,7 +40,7 @@ def default_output(ply: Path) -> Path:
 def output_file(output: Path, name: str) -> Path:
     """Return the file that an output names: of a folder its main file, or in an existing folder the file ``name``.
 
-    A folder named ``colmap`` is a COLMAP model, a new or empty one and one with a site of gsmerge a web site.
+    A folder named ``colmap`` is a COLMAP model, a new one and one with a site of gsmerge a web site.
     """
     from gsmerge.io.formats.table import FOLDER, PLACE, POINTS, SITE
 
@@ -58,7 +58,7 @@ def _is_site(output: Path) -> bool:
     if not os.path.lexists(output):
         return not output.suffix
     try:
-        return output.is_dir() and (not any(output.iterdir()) or is_page(output / SITE.ending))
+        return output.is_dir() and is_page(output / SITE.ending)
     except OSError:  # no permission to look into it: the check of outputs says so
         return False
 

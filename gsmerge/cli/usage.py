@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -48,6 +49,12 @@ BUDGET_WORDS = (
 UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 
+def expand_home(word: str) -> str:
+    """Write out the ~ with which a word, or what follows an option or a = in it, begins, where no shell has done so."""
+    match = re.fullmatch(r"(-\w|.*?=|)(~.*)", word, re.DOTALL)
+    return word if match is None else match[1] + os.path.expanduser(match[2])
+
+
 class _Words:
     """Part of commands and groups: what was typed is checked as words, before it is read as values."""
 
@@ -78,6 +85,8 @@ def _check_words(param: Any, words: Any, times: int, names: set[str]) -> None:
     for place, word in enumerate(words):
         if not word:
             raise UsageError(f"{label}: expected a value, got an empty one")
+        if is_option and word == "-" and param.name == "output":
+            raise UsageError(f"{label}: expected a file to write, got -; results are not written to stdout")
         if is_option and (word in names or word == "-" or word.startswith("--")):
             raise UsageError(f"{label}: expected a value, got {word}")
         if is_option and word in words[:place]:

@@ -11,17 +11,19 @@ import numpy as np
 
 from gsmerge.compaction.files import Outputs, check_colmap, sized
 from gsmerge.compaction.methods import check_method
+from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.place_cameras import count_placed, placed_views
 from gsmerge.facts.prepare import canonicalise, missing_notes
-from gsmerge.facts.scene_size import measure_size
+from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.plan import (
     KEPT_LOSS,
     KEPT_PSNR,
+    SceneChoices,
     choose_for_scene,
     load_networks,
     merges_pairs,
@@ -29,7 +31,15 @@ from gsmerge.plan import (
     stands_alone,
 )
 from gsmerge.report import document_head
-from gsmerge.runtime.estimate import TRIED, fit_of, memory_bytes, memory_problem, placed_seconds, wall_seconds
+from gsmerge.runtime.estimate import (
+    TRIED,
+    TRIED_BY_PHOTOS,
+    fit_of,
+    memory_bytes,
+    memory_problem,
+    placed_seconds,
+    wall_seconds,
+)
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_run
 from gsmerge.runtime.threads import available_threads
@@ -72,8 +82,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     else:
         inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))
         seconds = wall_seconds(
-            at_once * choices.blocks, len(scene), settings, threads=threads, fit_steps=steps, num_drawn=drawn * inside
-        )
+            at_once * choices.blocks, len(scene), settings, threads=threads, fit_steps=steps, num_drawn=drawn * inside,
+            **_search(size, options, choices, inside),
+        )  # fmt: skip
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=pixels - at_once)
     distributed = limits.count is not None or options.budget.auto
     return {
@@ -92,6 +103,18 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),
     }
+
+
+def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, inside: float) -> dict[str, Any]:
+    """Return what the search for the number of Gaussians adds, as arguments of :func:`wall_seconds`."""
+    budget, limits = options.budget, choices.limits
+    if choices.keeps_input or budget.target_psnr is not None:
+        return {"tries": TRIED_BY_PHOTOS}
+    if size.rendered or not (budget.auto or budget.max_drop is not None):
+        return {}
+    shares, steps = (RUNGS, LONG) if budget.max_drop is not None else (AUTO_RUNGS, SHORT)
+    counts = rungs(shares, limits.default, limits.min_count, limits.max_count)
+    return {"short_steps": steps, "short_drawn": [count * inside for count in counts]}
 
 
 def estimate_lines(run: Mapping[str, Any]) -> list[str]:

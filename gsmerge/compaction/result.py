@@ -24,7 +24,7 @@ from gsmerge.raster.metrics import MAX_LOSS, describe_distance, describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath, to_float32
 
 if TYPE_CHECKING:
     import torch
@@ -89,6 +89,11 @@ class CompactResult:
         from gsmerge.measure.preview import picture_html, to_picture
 
         return picture_html(to_picture(image), "the middle view") + report
+
+    def to_single(self) -> CompactResult:
+        """Return the same result, of arrays, with means as float32 numbers."""
+        coarser = tuple(level.to_single() for level in self.coarser)
+        return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 
     def to(self, device: torch.device | str | None) -> CompactResult:
         """Return the same result with tensors on a device; None leaves NumPy arrays."""

@@ -103,7 +103,7 @@ def compact_tensors(
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
     Returns:
-        The result of :func:`gsmerge.compact`; tensors on the device of ``means`` if that is a tensor.
+        The result of :func:`gsmerge.compact`; tensors on the device of ``means`` if that is one, with its precision.
 
     Raises:
         SceneError: If an array has another shape or convention; it says what to pass instead.
@@ -136,6 +136,8 @@ def compact_tensors(
     more += _rotation_notes(scene, check_rotations=check_rotations)
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + more
+    if gaussians.means.dtype == np.float32:
+        result = result.to_single()
     return result.to(means.device if hasattr(means, "detach") else None)
 
 

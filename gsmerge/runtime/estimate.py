@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsmerge.runtime.memory import machine_memory
@@ -13,7 +13,9 @@ IMPORT_SECONDS = 0.4
 COST_MERGE = 1.0  # reading, superpixels and merging
 COST_SCORE = 0.3  # of input and result against the photos
 COST_NETWORKS = 1.4
+COST_PAPER = 4.5  # those of the paper, which see more and refine
 COST_FIT = 0.5  # besides the steps
+COST_COUNT = 0.4  # of each further count that a search builds
 COST_SLOW = {"bass-adaptive": 6.0, "slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # more than usual
 # Of a step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
@@ -27,6 +29,7 @@ COST_PAIRS = 3.0  # of merging pairs, for each count that is tried
 PLACED_PIXELS = 512 * 512  # of a view, at most
 FITS = 2  # to placed views, for each count
 TRIED = 5  # counts, where the input's quality decides
+TRIED_BY_PHOTOS = 3  # counts, where views are given and a quality decides
 
 # Memory, in bytes
 BYTES_FIXED = 250_000_000  # interpreter and libraries
@@ -37,20 +40,25 @@ BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is i
 
 
 def work_seconds(
-    pixels: int, view_pixels: float, options: Mapping[str, Any], *, fit_steps: int, num_drawn: float
-) -> float:
+    pixels: int, view_pixels: float, options: Mapping[str, Any], *, fit_steps: int, num_drawn: float, tries: int = 1,
+    short_steps: int = 0, short_drawn: Sequence[float] = (),
+) -> float:  # fmt: skip
     """Estimate the processor seconds of compacting a scene, without imports.
 
     ``pixels``: pixels of all views together, or the number of Gaussians if that is larger; ``view_pixels``: pixels of
     one view; ``options``: all settings by flat name, with the checkpoint in use; ``num_drawn``: average number of
-    Gaussians in a view of the fit.
+    Gaussians in a view of the fit; ``tries``: counts that are fitted; ``short_drawn``: the same average for each
+    count that a search fits to photos of half the size, in ``short_steps``.
     """
     method, fits = options["method"], fit_of(options) == "full"
     work = COST_MERGE + COST_SCORE + COST_FIT * fits
     work += COST_SLOW.get(options["segmentation"] if method == "gsmerge" else method, 0.0)
-    work += COST_NETWORKS * (method == "gsmerge" and options["checkpoint"] != "none")
+    networks = COST_PAPER if "paper" in (options["recipe"], options["checkpoint"]) else COST_NETWORKS
+    work += networks * (method == "gsmerge" and options["checkpoint"] != "none")
+    work += COST_COUNT * (tries - 1 + len(short_drawn))
     step = COST_STEP * view_pixels + COST_DRAWN * num_drawn
-    return (pixels * work + fit_steps * fits * step) / 1e6
+    short = sum(COST_STEP * view_pixels / 4 + COST_DRAWN * drawn for drawn in short_drawn)
+    return (pixels * work + tries * fit_steps * fits * step + short_steps * short) / 1e6
 
 
 def wall_seconds(pixels: int, num_views: int, options: Mapping[str, Any], *, threads: int, **facts: Any) -> float:

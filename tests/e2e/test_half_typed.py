@@ -91,7 +91,7 @@ def test_an_empty_name_is_not_this_folder(
         ("compact x.ply --no-open", "gsmerge view has it"),
         ("compact x.ply -overwrite", "two dashes, --overwrite"),
         ("render x.ply -output=a.png", "two dashes, --output=a.png"),
-        ("compact x.ply -o -", "--output: expected a value"),
+        ("compact x.ply -o -", "--output: expected a file"),
         ("convert x.ply -o y.spz", "gsmerge convert a.ply x.spz"),
         ("evaluate x.ply --format json", "the name of -o decides;"),
         ("--quiet x.ply", "after the name of a command or scene"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from bare_files import write_without_grid
 
 from gsmerge.cli import main
+from gsmerge.cli.usage import expand_home
 
 from .conftest import Run, assert_refused, listing
 
@@ -33,6 +35,7 @@ USAGE = {
     "compact room --threads 0": "--threads*1",
     "compact room --budget 5B": "budget*502*5",
     "compact room --effort slow": "--effort*'slow'*'draft'",
+    "compact room -o -": "--output*file*stdout",
     "compact room -o a.ksplat": "a.ksplat*.ply*lod-meta.json",
     "convert room a.usda": "a.usda*ends in*.spz*.usdz",
     "compact room --set checkpoint=none --set require_checkpoint=true": 'require_checkpoint*"none"',
@@ -76,6 +79,7 @@ USAGE = {
     "render room --path spline --views 1 -o a.mp4": "spline*2*1",
     "render room --frames 9 -o a": "--frames*--path",
     "evaluate room --lpips none --no-context": "*--no-context*--set context=false",
+    "evaluate room --lpips none -q": "--quiet*-o*--json",
     "evaluate room --lpips none --set context=false": "context=false*held-out*--targets",
     "evaluate room --lpips none --target-images room/images": "--target-images*--targets",
     "evaluate room --lpips none -o room/scene.ply": "room/scene.ply*.json, .csv, .md or .html",
@@ -168,3 +172,16 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     for more in ([], ["--dry-run"]) if planned else ([],):
         assert_refused(run(*shlex.split(words.format()), *more), 2 if words in USAGE else 3, *parts)
     assert listing(prepared) == before
+
+
+def test_a_tilde_is_the_home_folder_wherever_a_path_begins(
+    smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(smallest_copy.parent))
+    monkeypatch.setenv("USERPROFILE", str(smallest_copy.parent))  # which Windows calls it
+    scene, quick = f"~/{smallest_copy.name}", ("--dry-run", "--json", "--effort", "draft")
+    for words in (("-o", "~/x.ply"), ("--output=~/x.ply",), ("-o~/x.ply",)):
+        document = json.loads(run("compact", scene, *words, *quick, code=0).out)
+        assert document["output"]["path"] == str(smallest_copy.parent / "x.ply")
+    assert expand_home("masks=~/m") == f"masks={smallest_copy.parent}/m"
+    assert expand_home("./~/a=b~c") == "./~/a=b~c"

@@ -121,8 +121,17 @@ def test_what_is_done_is_skipped_and_what_changed_is_not(scene: Path, out: Path)
     assert run(scene, out, replace(QUICK, jobs=3))["status"] == SKIPPED
     assert run(scene, out, replace(QUICK, overwrite=True))["status"] == DONE
     seed = replace(QUICK, settings=QUICK.settings.with_settings({"seed": 1}))
-    assert run(scene, out, seed)["status"] == DONE
-    assert run(scene, out)["status"] == DONE  # back to the first settings: the file is of the others
+    before = results(out)
+    for _ in range(2):  # the first refusal is no claim
+        assert says(run(scene, out, seed)["error"], out / "room.ply", "other settings", "--overwrite")
+        assert results(out) == before
+    assert run(scene, out)["status"] == SKIPPED  # what was refused leaves the others done
+    assert run(scene, out, replace(seed, overwrite=True))["status"] == DONE
+    assert says(
+        run(scene, out)["error"], out / "room.ply", "settings"
+    )  # back to the first settings: the file is of the others
+    (out / "room.ply").unlink()
+    assert run(scene, out)["status"] == DONE
     (out / "room.ply").write_bytes(b"spoiled")
     assert run(scene, out)["status"] == DONE
     photo = next((scene / "images").iterdir())
@@ -153,7 +162,8 @@ def test_a_checkpoint_counts_by_what_is_in_it(scene: Path, out: Path, tmp_path: 
     same = replace(QUICK, settings=QUICK.settings.with_settings({"checkpoint": str(other)}))
     assert run(scene, out, same)["status"] == SKIPPED
     written(other, noisy())
-    assert run(scene, out, same)["status"] == DONE
+    assert says(run(scene, out, same)["error"], out / "room.ply", "other settings")
+    assert run(scene, out, replace(same, overwrite=True))["status"] == DONE
     other.unlink()
     with refuses(SceneError, "same.safetensors", "no such file"):
         run(scene, out, same)

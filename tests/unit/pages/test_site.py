@@ -89,12 +89,8 @@ def test_which_folders_are_sites(tmp_path: Path, contents: dict[str, bytes]) -> 
     (tmp_path / "site" / "index.html").write_bytes(contents["index.html"])
     (tmp_path / "foreign" / "index.html").write_text("<!DOCTYPE html><title>mine</title>")
     (tmp_path / "full" / "b.ply").write_bytes(b"")
-    assert [named(name) for name in ("new", "empty", "site")] == [
-        "new/index.html",
-        "empty/index.html",
-        "site/index.html",
-    ]
-    assert [named(name) for name in ("foreign", "full")] == ["foreign/a.ply", "full/a.ply"]
+    assert [named(name) for name in ("new", "site")] == ["new/index.html", "site/index.html"]
+    assert [named(name) for name in ("empty", "foreign", "full")] == ["empty/a.ply", "foreign/a.ply", "full/a.ply"]
     assert [named(name) for name in ("b.ply", "colmap")] == ["b.ply", "colmap/sparse/0/points3D.bin"]
     assert is_page(tmp_path / "site" / "index.html")
     assert not is_page(tmp_path / "foreign" / "index.html")

@@ -34,6 +34,17 @@ def test_more_work_takes_longer() -> None:
     assert seconds(fit="none", num_drawn=0) == seconds(fit="none", num_drawn=VIEW)
 
 
+def test_a_search_counts_what_it_tries() -> None:
+    plain = CompactOptions().with_settings({"checkpoint": "none"}).to_dict()
+
+    def searched(**facts: Any) -> float:
+        return work_seconds(12 * VIEW, VIEW, plain, fit_steps=240, num_drawn=VIEW / 25, **facts)
+
+    assert searched() < searched(short_steps=60, short_drawn=[VIEW / 25] * 4)
+    assert 3 * searched() > searched(tries=3) > 2 * searched() > searched(short_steps=60, short_drawn=[VIEW / 25] * 4)
+    assert seconds(recipe="paper") > 2 * seconds(fit="none", checkpoint="shipped")
+
+
 def test_threads_share_the_views() -> None:
     plain = CompactOptions().to_dict()
     one, two, many = (
