@@ -34,7 +34,7 @@ holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.re
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
-    "views.npz", "transforms.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
+    "views.npz", "transforms.json", "transforms_train.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
     "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
     "results.npz", "cameras.npz", "camera_poses.txt", "0", ".",
 )  # fmt: skip
@@ -150,8 +150,9 @@ CAMERA_FORMATS = (
     CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"),
                  C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
-    CameraFormat("transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms,
-                 C2W_OPENGL, "pixels or field of view; may be missing; lenses", lambda file: "frames" in file.object),
+    CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
+                 ".json", read_transforms, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
+                 lambda file: "frames" in file.object),
     CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", read_transforms,
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),
