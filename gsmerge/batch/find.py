@@ -22,7 +22,7 @@ MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system
 _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)} | DEPTH_NAMES
-SCENE_PARTS = SCENE_NAMES | set(IMAGE_PLACES)
+SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
 
 
 def scene_plys(scene: Path) -> list[Path]:

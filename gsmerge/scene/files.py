@@ -40,7 +40,10 @@ PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply"
 # Of trained scenes, the one of the most steps: INRIA's, and gsplat's
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # where DepthSplat and its relatives write NAME.ply, with the photos in images/NAME
-IMAGE_PLACES = ("images", "input", "context", "rgb", "input_images")
+IMAGE_PLACES = (
+    "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
+    "keyframes/images",
+)  # fmt: skip
 MASK_PLACES = ("masks",)
 _PICTURES = ("images", "masks")  # of the files of a scene
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs

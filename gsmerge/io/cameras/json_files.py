@@ -57,11 +57,11 @@ def is_long_lrm(source: CameraSource) -> bool:
 
 
 @contextmanager
-def _number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Turn errors of missing keys and invalid numbers in the block into a SceneError."""
+def number_errors(path: Path, expected: str) -> Iterator[None]:
+    """Turn errors of missing entries, and of values that are no numbers or objects, in the block into a SceneError."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+    except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
         raise SceneError(path, f"{expected} ({error})") from error
 
 
@@ -80,19 +80,19 @@ def transforms_views(path: Path, data: Any) -> list[StoredView]:
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):
         raise SceneError(path, "expected 'frames' to be a list of objects, found something else")
     check_count(path, len(frames))
-    with _number_errors(path, "expected numbers"):
+    with number_errors(path, "expected numbers"):
         common = _camera_values(data) if isinstance(data, dict) else {}
     entries: list[tuple[str, np.ndarray, dict[str, Any]]] = []
     for i, frame in enumerate(frames):
         name = str(frame.get("file_path") or frame.get("image_path") or frame.get("name") or f"view {i}")
         if "transform_matrix" not in frame:
             raise SceneError(path, f"view {name}: expected 'transform_matrix', found none")
-        with _number_errors(path, f"view {name}: expected numbers"):
+        with number_errors(path, f"view {name}: expected numbers"):
             entries.append((name, _array(frame["transform_matrix"]), {**common, **_camera_values(frame)}))
     bare = not any(key in values for _, _, values in entries for key in _FOCAL_KEYS)
     views, size_of = [], cache(image_size)  # of photos that many frames may name
     for name, pose, values in entries:
-        with _number_errors(path, f"view {name}: expected numbers"):
+        with number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values)
             size = round(values.get("w", 0)), round(values.get("h", 0))
             K, size = (None, size) if bare else _intrinsics(path, name, values, size_of)
@@ -187,7 +187,7 @@ def read_inria(source: CameraSource) -> StoredCameras:
         missing = [key for key in _INRIA_KEYS if entry.get(key) is None]
         if missing:
             raise SceneError(path, f"view {name}: missing {', '.join(missing)}")
-        with _number_errors(path, f"view {name}: expected numbers"):
+        with number_errors(path, f"view {name}: expected numbers"):
             rotation = _array(entry["rotation"]).reshape(3, 3)
             centre = _array(entry["position"]).reshape(3, 1)
             fx, fy, width, height = (_number(entry[key]) for key in ("fx", "fy", "width", "height"))
@@ -217,27 +217,28 @@ def _with_optimised_poses(views: list[StoredView], folder: Path) -> list[StoredV
 
 
 def read_ffgs(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a ``cameras.json`` as ffgs's example writes it.
+    """Read the cameras of a ``cameras.json`` as ffgs's example writes it, and GlobalSplat.
 
     ``views`` have ``c2w`` with OpenCV axes and ``k_normalized``, divided by the size ``image_shape`` of the model's
-    input. SceneError if a value is missing or not a number.
+    input; of GlobalSplat ``intrinsic``, in pixels or likewise. SceneError if a value is missing or not a number.
     """
     views, path = [], source.path
     check_count(path, len(source.json["views"]))
-    with _number_errors(path, "expected 'image_shape' of two numbers"):
+    with number_errors(path, "expected 'image_shape' of two numbers"):
         height, width = (round(_number(side)) for side in source.json["image_shape"])
     for i, view in enumerate(source.json["views"]):
-        name = str(view.get("file") or f"view {i}")
-        with _number_errors(path, f"view {name}: expected numbers in 'c2w' and 'k_normalized'"):
-            pose, K = _array(view["c2w"]).reshape(4, 4), _array(view["k_normalized"]).reshape(3, 3)
-        views.append(StoredView(name, pose, K * np.array([[width], [height], [1]]), (width, height)))
+        name = str(view.get("file") or view.get("image") or f"view {i}")
+        key, sides = ("intrinsic", (1, 1, 1)) if "intrinsic" in view else ("k_normalized", (width, height, 1))
+        with number_errors(path, f"view {name}: expected numbers in 'c2w' and {key!r}"):
+            pose, K = _array(view["c2w"]).reshape(4, 4), _array(view[key]).reshape(3, 3)
+        views.append(StoredView(name, pose, K * np.array(sides)[:, None], (width, height)))
     return StoredCameras(views)
 
 
-def is_ffgs(source: CameraSource) -> bool:
-    """Return whether a JSON file has ``views`` with ``c2w``, as ffgs writes them."""
+def is_ffgs(source: CameraSource, key: str = "c2w") -> bool:
+    """Return whether a JSON file has ``views`` with a key, as ffgs and GlobalSplat write them."""
     views = source.object.get("views")
-    return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any("c2w" in v for v in views)
+    return isinstance(views, list) and all(isinstance(v, dict) for v in views) and any(key in v for v in views)
 
 
 def read_world_mirror(source: CameraSource) -> StoredCameras:
@@ -275,7 +276,7 @@ def _matrices(path: Path, data: Mapping[str, Any], key: str, side: int) -> dict[
     check_count(path, len(entries))
     matrices = {}
     for entry in entries:
-        with _number_errors(path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
+        with number_errors(path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
             name, matrix = str(entry["camera_id"]), _array(entry["matrix"])
         if matrix.shape not in ((side, side), (3, side)):
             raise SceneError(path, f"{key} of {name}: expected {side}x{side} numbers, found shape {matrix.shape}")
@@ -295,7 +296,7 @@ def read_long_lrm(source: CameraSource) -> StoredCameras:
     frames, path, folder = [], source.path, source.folder
     for i, frame in enumerate(source.json["frames"]):
         name = str(frame.get("file_path") or frame.get("image_path") or f"view {i}")
-        with _number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
+        with number_errors(path, f"view {name}: expected w2c, fx, fy, cx, cy, w, h as numbers"):
             pose = _array(frame["w2c"]).reshape(4, 4)
             K = make_pinhole(*(_number(frame[key]) for key in ("fx", "fy", "cx", "cy")))
             frames.append(StoredView(name, pose, K, (round(_number(frame["w"])), round(_number(frame["h"])))))
@@ -333,7 +334,7 @@ def _numbers(path: Path) -> np.ndarray | None:
     words = read_text(path).replace(",", " ").split(maxsplit=MAX_VIEWS)
     if len(words) > MAX_VIEWS:
         raise SceneError(path, f"expected at most {MAX_VIEWS} numbers, found more")
-    with _number_errors(path, "expected numbers"):
+    with number_errors(path, "expected numbers"):
         values = np.array(words, np.float64)
     if not np.isfinite(values).all():
         raise SceneError(path, "expected finite numbers, found NaN or inf")
@@ -384,13 +385,13 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     if path is None:
         return []
     data = read_json(path)
-    with _number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
+    with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
         scale = _number(data["scale"])
     frames = [_similarity(path, moved, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
-        with _number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
+        with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
             applied, factor = _square(camera_data["applied_transform"]), _number(camera_data.get("applied_scale") or 1)
             frames.append(_similarity(path, matmul(moved, invert(applied)), scale / factor))
     return frames

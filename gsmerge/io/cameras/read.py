@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -34,16 +35,27 @@ holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.re
 # Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
 # because Depth Anything 3 puts one there at the photos' own size.
 CAMERA_PLACES = (
-    "views.npz", "transforms.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
+    "views.npz", "transforms.json", "transforms_train.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
     "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
-    "results.npz", "cameras.npz", "camera_poses.txt", "0", ".",
+    "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras",
+    "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
 )  # fmt: skip
+_START = 1 << 12  # bytes of a file of Polycam that name all its values
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 
 
 def is_colmap(folder: Path) -> bool:
     """Return whether a folder holds a COLMAP model."""
     return holds_model(folder, ".bin") or holds_model(folder, ".txt")
+
+
+def is_keyframes(folder: Path) -> bool:
+    """Return whether a folder holds the cameras of Polycam's keyframes, a ``.json`` each."""
+    first = min(folder.glob("[!.]*.json"), default=folder)
+    if first.is_file():
+        with suppress(OSError), first.open("rb") as file:
+            return b'"t_00"' in file.read(_START)
+    return False
 
 
 def holds_model(folder: Path, suffix: str) -> bool:
@@ -55,15 +67,15 @@ def find_cameras(folder: Path) -> Path | None:
     """Find the first known camera file below a folder, or its only ``.torch`` chunk."""
     for place in CAMERA_PLACES:
         candidate = folder / place
-        if candidate.is_file() or (candidate.is_dir() and is_colmap(candidate)):
+        if candidate.is_file() or (candidate.is_dir() and (is_colmap(candidate) or is_keyframes(candidate))):
             return candidate
     chunks = [chunk for chunk in folder.glob(f"*{CHUNK}") if chunk.is_file()]
     return chunks[0] if len(chunks) == 1 else None
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only ``.json`` or ``.npz`` in a folder that holds cameras, whatever its name; None without one."""
-    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in (".json", ".npz"))
+    """Find the only ``.json``, ``.npz`` or ``.xml`` in a folder that holds cameras, by any name; None without one."""
+    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in (".json", ".npz", ".xml"))
     files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
     camera_files = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
     return camera_files[0] if len(camera_files) == 1 else None
@@ -99,7 +111,7 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = Path(path)
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
-    if path.is_dir() and not is_colmap(path):
+    if path.is_dir() and not is_colmap(path) and not is_keyframes(path):
         inside = find_cameras(path) or find_other_cameras(path)
         if inside is None:
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
@@ -145,21 +157,30 @@ _RE10K = CameraFormat(
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".bin")),
+    CameraFormat("Polycam", "`keyframes/corrected_cameras` of Polycam", "", _lazy("programs.read_polycam"),
+                 C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses"),
     CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"),
                  C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
-    CameraFormat("transforms.json", "`transforms.json` of nerfstudio and instant-ngp", ".json", read_transforms,
-                 C2W_OPENGL, "pixels or field of view; may be missing; lenses", lambda file: "frames" in file.object),
+    CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
+                 ".json", read_transforms, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
+                 lambda file: "frames" in file.object),
     CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", read_transforms,
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),
     CameraFormat("INRIA cameras.json", "`cameras.json` of INRIA; InstantSplat's `pose/ours_N/pose_optimized.npy`",
                  ".json", read_inria, C2W_OPENCV, "pixels; principal point in the middle, or `cx`, `cy`",
                  lambda file: "position" in file.first or "rotation" in file.first),
+    CameraFormat("GlobalSplat cameras.json", "`cameras.json` of GlobalSplat", ".json", read_ffgs, C2W_OPENCV,
+                 "pixels, or divided by the size", lambda file: is_ffgs(file, "intrinsic")),
     CameraFormat(FFGS, "`cameras.json` of ffgs", ".json", read_ffgs, C2W_OPENCV,
                  "divided by the size of the model's input", is_ffgs),
+    CameraFormat("OpenSfM", "`reconstruction.json` of OpenSfM and WebODM", ".json", _lazy("programs.read_opensfm"),
+                 W2C_OPENCV, "divided by the larger side; lenses", lambda file: "shots" in file.first),
+    CameraFormat("Metashape", "`.xml` of Metashape", ".xml", _lazy("programs.read_metashape"), C2W_OPENCV,
+                 "pixels from the middle; lenses"),
     CameraFormat("camera_params.json", "`camera_params.json` of WorldMirror", ".json", read_world_mirror,
                  C2W_OPENCV, "pixels", lambda file: {"extrinsics", "intrinsics"} <= file.object.keys()),
     CameraFormat("dump of a model", "`views.npz` ([below](#models-that-save-no-cameras))", ".npz",
@@ -178,7 +199,7 @@ CAMERA_FORMATS = (
 )  # fmt: skip
 CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy
-    "": ("expected cameras as .json, .npz, .torch or a COLMAP folder, found another kind of file",),
+    "": ("expected cameras as .json, .npz, .xml, .torch or a COLMAP folder, found another kind of file",),
     ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),
     ".ply": ("expected cameras inside it, found none", "name another file"),
 }

@@ -81,6 +81,19 @@ def test_image_folders_in_order(tmp_path: Path, tiny: Tiny) -> None:
     assert find_scene_files(tmp_path).images == tmp_path / "images"
 
 
+@pytest.mark.parametrize("folder", ["color", "corrected_images", "keyframes/corrected_images", "keyframes/images"])
+def test_image_folders_of_other_programs(tmp_path: Path, folder: str) -> None:
+    make(tmp_path, "scene.ply", f"{folder}/1.png")
+    assert find_scene_files(tmp_path).images == tmp_path / folder
+
+
+def test_blender_s_training_views(tmp_path: Path, tiny: Tiny) -> None:
+    make(tmp_path, "scene.ply")
+    for part in ("train", "test", "val"):
+        write_transforms(tmp_path / f"transforms_{part}.json", tiny)
+    assert find_scene_files(tmp_path).cameras == tmp_path / "transforms_train.json"
+
+
 def test_what_is_not_there(tmp_path: Path, tiny: Tiny) -> None:
     with refuses(SceneError, "none.ply", "no such"):
         find_scene_files(tmp_path / "none.ply")

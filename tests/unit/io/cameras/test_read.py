@@ -175,7 +175,7 @@ def test_what_is_no_camera_file(tmp_path: Path) -> None:
         ("text.json", "hello", "JSON"),
         ("other.json", '{"a": 1}', "'frames'"),
         ("list.json", "[1, 2]", "'frames'"),
-        ("cameras.xml", "<a/>", ".npz"),
+        ("cameras.yml", "<a/>", ".npz"),
     ):
         if text is not None:
             (tmp_path / name).write_text(text)

@@ -1,0 +1,118 @@
+"""Cameras as capture and survey programs write them: OpenSfM and WebODM, Polycam, Metashape.
+
+Each reader makes the frames of a ``transforms.json`` from its file, which are then read as those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry import motion_matrices
+from gsmerge.io.bounds import read_budget, read_json, read_text
+from gsmerge.io.cameras.camera_file import check_count
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.json_files import number_errors, transforms_views
+from gsmerge.io.image_names import natural_key
+
+_MODELS = {  # of OpenSfM, by names of lenses that mean the same
+    "perspective": "OPENCV", "brown": "OPENCV", "simple_radial": "OPENCV", "radial": "OPENCV",
+    "fisheye": "OPENCV_FISHEYE", "fisheye_opencv": "OPENCV_FISHEYE",
+}  # fmt: skip
+_SENSORS = {"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE"}  # of Metashape
+_MATRIX = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]  # keys of Polycam
+_ELEMENT_BYTES = 200  # of memory for each "<" of an XML file
+
+
+def read_opensfm(source: CameraSource) -> StoredCameras:
+    """Read the cameras of the reconstruction with the most images; SceneError if a value is missing or no number."""
+    path = source.path
+    with number_errors(path, "expected reconstructions of 'cameras' and 'shots'"):
+        largest = max(source.json, key=lambda entry: len(entry["shots"]))
+        shots = dict(largest["shots"])
+        check_count(path, len(shots))
+        cameras = {name: _opensfm_camera(camera) for name, camera in largest["cameras"].items()}
+        motions = np.array([[*shot["rotation"], *shot["translation"]] for shot in shots.values()], np.float64)
+        poses = motion_matrices(motions.reshape(-1, 6))
+        frames = [
+            {"file_path": name, "transform_matrix": pose, **cameras[shot["camera"]]}
+            for (name, shot), pose in zip(shots.items(), poses, strict=True)
+        ]
+    return StoredCameras(transforms_views(path, frames))
+
+
+def _opensfm_camera(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the intrinsics of a camera, which are divided by the larger side and count from the middle."""
+    width, height = float(camera["width"]), float(camera["height"])
+    side = max(width, height)
+    fx = side * float(camera["focal_x"] if "focal_x" in camera else camera["focal"])
+    fy = side * float(camera["focal_y"]) if "focal_y" in camera else fx
+    cx, cy = width / 2 + side * float(camera.get("c_x", 0)), height / 2 + side * float(camera.get("c_y", 0))
+    lens = {key: camera.get(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2")}
+    model = _MODELS.get(camera["projection_type"], camera["projection_type"])
+    return {"w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "camera_model": model, **lens}
+
+
+def read_polycam(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a folder, a file each; SceneError if a value is missing or no number."""
+    frames, paths = [], sorted(source.path.glob("*.json"), key=lambda path: natural_key(path.name))
+    check_count(source.path, len(paths))
+    for path in paths:
+        values = read_json(path)
+        with number_errors(path, "expected t_00 to t_23, fx, fy, cx, cy, width, height as numbers"):
+            frame = {"fl_x": values["fx"], "fl_y": values["fy"], "w": values["width"], "h": values["height"]}
+            pose = [[values[key] for key in row] for row in _MATRIX]
+            frames.append(
+                {"file_path": path.stem, "transform_matrix": pose, "cx": values["cx"], "cy": values["cy"]} | frame
+            )
+    return StoredCameras(transforms_views(source.path, frames))
+
+
+def read_metashape(source: CameraSource) -> StoredCameras:
+    """Read the cameras that Metashape placed; SceneError if the file is damaged, or a value is missing or no number."""
+    path, text = source.path, read_text(source.path)
+    read_budget(path).check_memory(_ELEMENT_BYTES * text.count("<"), "XML")
+    if "<!DOCTYPE" in text:  # entities could make a short text endless
+        raise SceneError(path, "expected XML as Metashape writes it, found <!DOCTYPE")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise SceneError(path, f"expected XML, found something else ({error})") from error
+    with number_errors(path, "expected sensors with 'calibration', and cameras with 'transform'"):
+        sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
+        cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+        check_count(path, len(cameras))
+        intrinsics = {
+            name: _metashape_sensor(sensors[name]) for name in {camera.get("sensor_id") for camera in cameras}
+        }
+        frames = [
+            {
+                "file_path": camera.get("label"),
+                "transform_matrix": np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4),
+                **intrinsics[camera.get("sensor_id")],
+            }
+            for camera in cameras
+        ]
+    return StoredCameras(transforms_views(path, frames))
+
+
+def _metashape_sensor(sensor: ElementTree.Element) -> dict[str, Any]:
+    """Return the intrinsics of a sensor, whose principal point counts from the middle."""
+    calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
+    size = [*calibration.iter("resolution"), *sensor.iter("resolution")][0].attrib
+    width, height = float(size["width"]), float(size["height"])
+    numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
+    focal = {"fl_x": numbers["f"] + numbers.get("b1", 0), "fl_y": numbers["f"]}
+    centre = {"cx": numbers.get("cx", 0) + width / 2, "cy": numbers.get("cy", 0) + height / 2}
+    # p1 and p2 are the other way round than OpenCV's
+    lens = {
+        "p1": numbers.get("p2"),
+        "p2": numbers.get("p1"),
+        **{key: numbers.get(key) for key in ("k1", "k2", "k3", "k4")},
+    }
+    model = _SENSORS.get(sensor.get("type", "frame"), sensor.get("type"))
+    return {"w": width, "h": height, "camera_model": model, **focal, **centre, **lens}

@@ -1,0 +1,175 @@
+"""Cameras of capture and survey programs are read: GlobalSplat's, OpenSfM's, Polycam's and Metashape's."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+from hostile.case import HEIGHT, VIEWS, WIDTH
+from messages import refuses
+from tiny_scene import FLIP, save_json
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+from gsmerge.io.cameras.read import find_cameras, find_other_cameras
+
+C2W = np.linalg.inv(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
+K = np.array([[40.0, 0, WIDTH / 2 + 1], [0, 42, HEIGHT / 2 - 2], [0, 0, 1]])
+SIDE = max(WIDTH, HEIGHT)
+SIZE = {"width": WIDTH, "height": HEIGHT}
+
+
+def write_globalsplat(folder: Path, scale: tuple[float, float] = (1, 1)) -> Path:
+    intrinsic = (K / [[scale[0]], [scale[1]], [1]]).tolist()
+    views = [{"image": f"{i}.png", "intrinsic": intrinsic, "c2w": pose.tolist()} for i, pose in enumerate(C2W)]
+    return save_json(folder / "cameras.json", {"image_shape": [HEIGHT, WIDTH], "views": views})
+
+
+def write_globalsplat_divided(folder: Path) -> Path:
+    return write_globalsplat(folder, (WIDTH, HEIGHT))
+
+
+def write_opensfm(folder: Path, **lens: object) -> Path:
+    camera = {
+        "projection_type": "brown", **SIZE, "focal_x": K[0, 0] / SIDE, "focal_y": K[1, 1] / SIDE,
+        "c_x": (K[0, 2] - WIDTH / 2) / SIDE, "c_y": (K[1, 2] - HEIGHT / 2) / SIDE, **lens,
+    }  # fmt: skip
+    shots = {
+        f"{i}.png": {
+            "rotation": cv2.Rodrigues(pose[:3, :3])[0].ravel().tolist(),
+            "translation": pose[:3, 3].tolist(),
+            "camera": "v2",
+        }
+        for i, pose in enumerate(np.linalg.inv(C2W))
+    }
+    parts = [{"cameras": {}, "shots": {}}, {"cameras": {"v2": camera}, "shots": shots}]
+    return save_json(folder / "reconstruction.json", parts)
+
+
+def write_polycam(folder: Path) -> Path:
+    place = folder / "keyframes" / "corrected_cameras"
+    place.mkdir(parents=True)
+    for i, pose in enumerate(C2W @ FLIP):
+        values = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], **SIZE}
+        save_json(place / f"{8 + i}.json", values)
+    return place
+
+
+def write_metashape(folder: Path, lens: str = "", kind: str = "frame") -> Path:
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    poses = [" ".join(map(repr, pose.ravel().tolist())) for pose in C2W]
+    cameras = [
+        f'<camera id="{i}" sensor_id="0" label="{i}"><transform>{pose}</transform></camera>'
+        for i, pose in enumerate(poses)
+    ]
+    path = folder / "cameras.xml"
+    path.write_text(
+        f'<?xml version="1.0" encoding="UTF-8"?><document><chunk><sensors><sensor id="0" type="{kind}">{size}'
+        f'<calibration class="adjusted">{size}<f>42</f><b1>-2</b1><cx>1</cx><cy>-2</cy>{lens}</calibration>'
+        f'<calibration class="initial">{size}<f>1</f></calibration></sensor></sensors>'
+        f'<cameras>{"".join(cameras)}<camera id="99" sensor_id="1" label="not placed"/></cameras></chunk></document>'
+    )
+    return path
+
+
+WRITERS = (write_globalsplat, write_globalsplat_divided, write_opensfm, write_polycam, write_metashape)
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_poses_and_intrinsics_are_read(tmp_path: Path, write: Callable[[Path], Path]) -> None:
+    path = write(tmp_path)
+    actual = read_cameras(path)
+    np.testing.assert_allclose(actual.viewmats, np.linalg.inv(C2W), atol=1e-9)
+    np.testing.assert_allclose(actual.Ks, np.stack([K] * VIEWS), atol=1e-9)
+    assert set(actual.widths) == {WIDTH}
+    assert [name.removesuffix(".png") for name in actual.names] == (
+        ["8", "9", "10"] if write is write_polycam else ["0", "1", "2"]
+    )
+    assert find_cameras(tmp_path) == path
+    assert not actual.lenses
+
+
+def test_metashape_s_file_of_any_name(tmp_path: Path) -> None:
+    path = write_metashape(tmp_path).rename(tmp_path / "Chunk 1.xml")
+    (tmp_path / "other.xml").write_text("<a/>")
+    assert find_cameras(tmp_path) is None
+    assert find_other_cameras(tmp_path) == path
+
+
+def test_lenses_are_read(tmp_path: Path) -> None:
+    """Metashape's p1 and p2 are OpenCV's p2 and p1."""
+    tags = "<k1>0.1</k1><k2>0.2</k2><k3>0.3</k3><p1>0.01</p1><p2>0.02</p2>"
+    lens = read_cameras(write_metashape(tmp_path, tags)).lenses[0]
+    assert lens is not None
+    assert lens.coefficients == (0.1, 0.2, 0.02, 0.01, 0.3)
+    lens = read_cameras(write_opensfm(tmp_path, k1=0.1, k2=0.2, k3=0.3, p1=0.01, p2=0.02)).lenses[0]
+    assert lens is not None
+    assert lens.coefficients == (0.1, 0.2, 0.01, 0.02, 0.3)
+    for path in (
+        write_opensfm(tmp_path, projection_type="fisheye", k1=0.1),
+        write_metashape(tmp_path, "<k1>0.1</k1>", "fisheye"),
+    ):
+        lens = read_cameras(path).lenses[0]
+        assert lens is not None
+        assert (lens.model, lens.coefficients) == ("fisheye", (0.1, 0, 0, 0))
+
+
+def test_a_focal_length_for_both_axes(tmp_path: Path) -> None:
+    path = write_opensfm(tmp_path)
+    parts = json.loads(path.read_text())
+    camera = parts[1]["cameras"]["v2"]
+    camera |= {"projection_type": "perspective", "focal": camera.pop("focal_x")}
+    del camera["focal_y"], camera["c_x"], camera["c_y"]
+    save_json(path, parts)
+    middle = [[K[0, 0], 0, WIDTH / 2], [0, K[0, 0], HEIGHT / 2], [0, 0, 1]]
+    np.testing.assert_allclose(read_cameras(path).Ks[0], middle, atol=1e-9)
+
+
+def replace_text(old: str, new: str) -> Callable[[Path], object]:
+    def replace(path: Path) -> None:
+        place = path / "8.json" if path.is_dir() else path
+        place.write_text(place.read_text().replace(old, new))
+
+    return replace
+
+
+@pytest.mark.parametrize(
+    ("write", "old", "new", "named"),
+    [
+        (write_globalsplat, "c2w", "w2c", ("cameras.json: view 0.png", "'c2w'")),
+        (write_opensfm, "translation", "t", ("reconstruction.json", "translation")),
+        (write_opensfm, "brown", "spherical", ("reconstruction.json: view 0.png", "SPHERICAL")),
+        (write_opensfm, '"v2"', '"v3', ("reconstruction.json",)),
+        (write_opensfm, '"cameras": {', '"cameras": [], "c": {', ("reconstruction.json", "'cameras'")),
+        (write_polycam, "t_23", "t", ("8.json", "t_23")),
+        (write_polycam, "{", "[", ("8.json",)),
+        (write_metashape, "<document", "<!DOCTYPE a><document", ("cameras.xml", "DOCTYPE")),
+        (write_metashape, "</document>", "", ("cameras.xml", "XML")),
+        (write_metashape, "transform", "turn", ("cameras.xml", "at least one")),
+        (write_metashape, "<calibration", "<c", ("cameras.xml", "mismatched")),
+        (write_metashape, "resolution", "r", ("cameras.xml", "sensors")),
+        (write_metashape, 'sensor_id="0"', 'sensor_id="7"', ("cameras.xml", "'7'")),
+        (write_metashape, "</transform>", " 1</transform>", ("cameras.xml", "17")),
+        (write_metashape, 'type="frame"', 'type="spherical"', ("cameras.xml: view 0", "SPHERICAL")),
+    ],
+)
+def test_what_is_wrong_is_named(
+    tmp_path: Path, write: Callable[[Path], Path], old: str, new: str, named: tuple[str, ...]
+) -> None:
+    path = write(tmp_path)
+    replace_text(old, new)(path)
+    with refuses(SceneError, *named):
+        read_cameras(path)
+
+
+def test_many_elements_take_no_more_memory_than_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.xml"
+    path.write_text("<a>" + "<b/>" * 2_000_000 + "</a>")
+    with refuses(SceneError, "cameras.xml", "XML", "MB"):
+        read_cameras(path)
