@@ -169,12 +169,17 @@ def camera_centres(viewmats: np.ndarray) -> np.ndarray:
     return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)
 
 
-def middle_depth(means: np.ndarray, camera: Cameras, share: float = 0.5) -> float:
-    """Measure the median, or another quantile, of depths of points ``[n,3]`` in a camera's picture; 1 without any."""
+def middle_depth(means: np.ndarray, camera: Cameras) -> float:
+    """Measure the median depth of the points ``[n,3]`` inside one camera's picture; 1 without any."""
+    return float(np.quantile(depths_inside(means, camera), 0.5))
+
+
+def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
+    """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; 1 without any."""
     points = means[:: max(1, len(means) // DEPTH_SAMPLE)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
-    return float(np.quantile(depths[inside], share)) if inside.any() else 1.0
+    return np.asarray(depths[inside]) if inside.any() else np.ones(1)
 
 
 def step_outside(

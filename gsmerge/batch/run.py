@@ -35,7 +35,7 @@ FREE_MEMORY_SHARE = 0.8  # of the free memory that scenes at once may take, wher
 
 @dataclass(frozen=True)
 class Concurrency:
-    """How many scenes are compacted at once, each on how many threads."""
+    """Number of scenes that are compacted at once, and of threads for each."""
 
     jobs: int  # 0: as many as the cluster has processors for
     threads: int

@@ -10,7 +10,7 @@ them, and what is empty there continues the farther side of the surfaces around,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -224,10 +224,12 @@ def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -
     cameras, splats = _small_cameras(cameras), prepare(fitted)
     between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
-    seen, missed = _see(splats, cameras), _see(splats, between, between=True)
+    looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
+    depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
+    seen = _see(cameras, depths), _see(between, [look[:2] for look in looks]).where_covered()
 
     def continue_surfaces(view: int) -> Gaussians:
-        return _continue_surfaces(missed, view, seen, outside, fitted.shN.shape[1])
+        return _continue_surfaces(looks[view], between[[view]], seen, outside, fitted.shN.shape[1])
 
     added = fitted[:0]
     for view, more in enumerate(parallel_map(continue_surfaces, range(len(between) if most else 0))):
@@ -250,14 +252,15 @@ def _on_same_pixels(some: Gaussians, others: Gaussians, camera: Cameras) -> np.n
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What c cameras of one size see of a scene."""
+    """Surfaces and gaps that c cameras of one size see of a scene."""
 
     cameras: Cameras
-    depths: np.ndarray  # [c,h,w] mean camera z
-    farthest: np.ndarray  # [c,h,w] the farthest around, as far as new Gaussians reach; 0 where nothing is said
-    left: np.ndarray  # [c,h,w] transmittance
-    clear: np.ndarray  # [c,h,w] bool, where little is to be
-    images: np.ndarray | None  # [c,h,w,3] of cameras between photos
+    farthest: np.ndarray  # [c,h,w] mean camera z, the farthest around, as far as new Gaussians reach
+    clear: np.ndarray  # [c,h,w] bool, where little is
+
+    def where_covered(self) -> Seen:
+        """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
+        return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
 
     def contradict(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the points ``[n,3]`` that stand before a surface, or where a camera sees nothing."""
@@ -288,33 +291,36 @@ def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
     return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR)
 
 
-def _see(splats: Splats, cameras: Cameras, *, between: bool = False) -> Seen:
-    """Draw what cameras see; those ``between`` photos say nothing where it is clear, and see colours, too."""
-
-    def see(view: int) -> tuple[np.ndarray, ...]:
-        tiled = _tile(splats, cameras, view)
-        depths, left = blend_depths(tiled)
-        farthest = cv2.dilate(depths, np.ones((2 * REACH + 1,) * 2, np.uint8))
-        image = [blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]] if between else []
-        return depths, np.where(between & (left > CLEAR), np.float32(0), farthest), left, *image
-
-    columns = list(map(np.stack, zip(*parallel_map(see, range(len(cameras))), strict=True)))
-    depths, farthest, left = columns[:3]
-    return Seen(cameras, depths, farthest, left, (left > CLEAR) & (not between), columns[3] if between else None)
+def _look(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw the mean depths ``[h,w]``, transmittance ``[h,w]`` and colours ``[h,w,3]`` that a camera sees."""
+    tiled = _tile(splats, cameras, view)
+    return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
 
 
-def _continue_surfaces(missed: Seen, view: int, seen: Seen, outside: Outside | None, num_higher: int) -> Gaussians:
-    """Make Gaussians for the clear pixels of a camera between photos that continue the farther side of the surfaces.
+def _see(cameras: Cameras, looks: Sequence[tuple[np.ndarray, np.ndarray]]) -> Seen:
+    """Find surfaces and gaps from the mean depths ``[h,w]`` and transmittance ``[h,w]`` of each camera."""
+    around = np.ones((2 * REACH + 1,) * 2, np.uint8)
+    farthest = np.stack([cv2.dilate(depths, around) for depths, _ in looks])
+    return Seen(cameras, farthest, np.stack([left > CLEAR for _, left in looks]))
 
-    Each stands at the first of ``DEEPER`` times that depth which no camera contradicts; none where all are.
+
+def _continue_surfaces(
+    look: tuple[np.ndarray, np.ndarray, np.ndarray],
+    camera: Cameras,
+    seen: tuple[Seen, Seen],
+    outside: Outside | None,
+    num_higher: int,
+) -> Gaussians:
+    """Make Gaussians for the clear pixels of a ``camera`` that continue the farther side of the surfaces beside.
+
+    Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
     """
-    camera, depths, left = missed.cameras[[view]], missed.depths[view], missed.left[view]
-    assert missed.images is not None
+    depths, left, image = look
     solid, clear = left < SOLID, left > CLEAR
     around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
     known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
     clear &= cv2.dilate(known.astype(np.uint8), around) > 0
-    image = missed.images[view] / np.maximum(1 - left, 1e-6)[..., None]
+    image = image / np.maximum(1 - left, 1e-6)[..., None]
     values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
     sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
     y, x = np.nonzero(clear)
@@ -322,7 +328,7 @@ def _continue_surfaces(missed: Seen, view: int, seen: Seen, outside: Outside | N
     eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
     tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
     points = (eye + tried[..., None] * rays).reshape(-1, 3)
-    wrong = seen.contradict(points) | missed.contradict(points)
+    wrong = np.logical_or(*(some.contradict(points) for some in seen))
     if outside is not None:
         wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
     hidden = ~wrong.reshape(tried.shape)

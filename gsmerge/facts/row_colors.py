@@ -58,7 +58,7 @@ def add_row_colors(scene: Scene, *, given: bool = False) -> PicturedScene:
 
 @dataclass(frozen=True, eq=False)
 class RowPicture:
-    """What the Gaussians of a camera's own pixels look like from there."""
+    """Picture that the Gaussians of a camera's own pixels make from there."""
 
     picture: np.ndarray  # [h,w,3] their colours, or the drawing where it takes the place of these
     known: np.ndarray  # [h,w] pixels that one of the two shows

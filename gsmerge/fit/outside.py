@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry import middle_depth, project, step_outside
+from gsmerge.geometry import depths_inside, middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, prepare, tile_view
 from gsmerge.raster.composite import blend, blend_depths, depth_colors
@@ -84,11 +84,9 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     points = rows.means[:: max(1, len(rows) // SAMPLE)]
     placed = outside_cameras(points, cameras, min(looks, max(PLACES, len(photos))), LOW, HIGH)
-    used = [cameras[[view]] for view in range(min(len(placed), len(cameras)))]
-    near, far = (
-        scale * np.resize([middle_depth(points, camera, share) for camera in used], len(placed))
-        for scale, share in ((NEAREST, 0.5), (FARTHEST, LAST))
-    )
+    depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
+    near, far = np.resize([np.quantile(some, (0.5, LAST)) for some in depths], (len(placed), 2)).T
+    near, far = NEAREST * near, FARTHEST * far
     views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
 
     def look(view: int) -> np.ndarray:

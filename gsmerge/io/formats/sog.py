@@ -51,7 +51,7 @@ _MAX_STEPS = 200
 
 @dataclass(frozen=True)
 class _Bundle:
-    """The files of a ``.sog`` by name, in a zip; one of more bytes than all have as they are stored is not read."""
+    """Files of a ``.sog`` by name, in a zip; one of more bytes than all have as they are stored is not read."""
 
     archive: zipfile.ZipFile
     size: int  # of all
@@ -68,7 +68,7 @@ class _Bundle:
 
 @dataclass(frozen=True)
 class _Folder:
-    """The same in a folder, and in no other."""
+    """Files of a ``.sog`` by name, in a folder and in no other."""
 
     folder: Path
     size: int
