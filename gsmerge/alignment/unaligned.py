@@ -197,6 +197,7 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, why: Scen
 def _exporter_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
     """Yield the frames that exporters use for rows, at the scale of the cameras."""
     yield from usual_frames(inputs.cameras)[1:]
+    yield Similarity(np.diag([1.0, -1, -1]), 1.0, np.zeros(3), "turned to y up, as .spz files are", "other")
     first = inputs.cameras.viewmats[0]
     yield Similarity(first[:3, :3], 1.0, first[:3, 3], "moved into the first camera", "first")
 

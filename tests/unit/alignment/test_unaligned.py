@@ -73,6 +73,14 @@ def test_voxels_in_the_first_camera_at_any_scale(tmp_path: Path, scale: float) -
     assert np.allclose(loaded.scene.cameras.centres, scale * centres, atol=0.03 * scale)
 
 
+def test_voxels_turned_to_y_up(tmp_path: Path) -> None:
+    """As files are that were written in the axes of .spz, beside OpenCV cameras."""
+    half = np.diag([1.0, -1, -1])
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxels(), half)))
+    assert any("turned to y up" in note for note in loaded.notes)
+    assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ half, atol=1e-6)
+
+
 def test_without_photos_no_other_frame_is_tried(tmp_path: Path) -> None:
     rows = turned(voxels(), np.diag([-1.0, 1, -1]))
     folder = save_export(tmp_path, SMOOTH, rows)
