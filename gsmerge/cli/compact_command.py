@@ -55,8 +55,8 @@ PARAMETERS = (
     f"{opt.READING} masks budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
-    opt.output(f"{opt.COMPACT_SCENE} lod-meta.json: levels that stream. A new folder: a web "
-               "site; colmap: a COLMAP model; an existing folder gets the result.", "SCENE.compact.ply"),
+    opt.output(f"{opt.COMPACT_SCENE} .html: a page to send, with a viewer. lod-meta.json: levels that stream; "
+               "colmap: a COLMAP model; any other folder gets SCENE.compact.ply.", "SCENE.compact.ply"),
     "overwrite strict dry_run seed threads",
 )  # fmt: skip
 
@@ -72,7 +72,8 @@ def look(args: opt.Args) -> None:
     """Compact a scene, and open a page with the result beside it: ``gsmerge SCENE``."""
     scene, features = args.scenes[0], _features_in(args.scenes)
     usual = default_output(scene if features else args.files(*args.scenes).base)
-    args.output = output_file(args.output or usual, usual.name)
+    writing: FileOptions = args.make(CompactOptions, FileOptions, Engine)[1]
+    args.output = output_file(args.output or usual, usual.name, site=writing.site)
     # Files that were joined, and Feature Gaussians, have no page of their own
     shown = [args.output] if features or len(args.scenes) > 1 else [scene, args.output]
     if os.path.lexists(args.output) and not (args.overwrite or args.dry_run):
@@ -100,7 +101,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     hints = args.hints()
     from gsmerge.compaction.files import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import INDEX, output_format
+    from gsmerge.io.formats.table import COLMAP, HTML, INDEX, output_format
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -111,20 +112,20 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     _check_scenes(args)
     files = args.files(*args.scenes)
     default = default_output(files.base)
-    out = output_file(args.output or default, default.name)
-    streamed, model = out.name == INDEX, model_files(out)
+    out = output_file(args.output or default, default.name, site=writing.site)
+    streamed, alone = out.name == INDEX, HTML.names(out) or COLMAP.names(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if model and settings.budget.levels > 1:
-        raise UsageError(f"{out}: expected no --levels for a web site or a COLMAP model")
+    if alone and settings.budget.levels > 1:
+        raise UsageError(f"{out}: expected no --levels for a page or a COLMAP model")
     if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
         raise UsageError(f"{out}: expected a --budget in Gaussians for such files, got {settings.budget.budget}")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not model else None
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not alone else None
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     inputs = (*input_files(files), *networks)
     beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
-    named = (out, *model, *levels, beside)
+    named = (out, *model_files(out, site=writing.site), *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True, cameras=True)
     if writing.columns == "full" and settings.budget.in_bytes:
@@ -139,7 +140,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 
     outputs = Outputs(
         out, viewer_cameras=cameras, overwrite=args.overwrite, normals=writing.normals,
-        full_columns=writing.columns == "full",
+        full_columns=writing.columns == "full", site=writing.site,
     )  # fmt: skip
     seconds_before = {"import": perf_counter() - start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:
@@ -160,7 +161,7 @@ def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
         look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) and not shown else []
-        look = ["python", "-m", "http.server", "-d", str(out.parent)] if SITE.names(out) else look
+        look = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == SITE else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]
@@ -179,12 +180,12 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians alone, got {len(args.scenes)} inputs")
     args.require_scene(OF_FEATURES, path)
-    out = output_file(args.output or default_output(path), default_output(path).name)
-    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     from gsmerge.settings.stages import DecodeOptions
     from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
+    out = output_file(args.output or default_output(path), default_output(path).name, site=writing.site)
+    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(

@@ -27,7 +27,7 @@ class PhotoOptions(Settings):
     opt.argument("paths", list[Path], "IN... OUT",
                  "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, .ksplat, "
                  "meta.json, .lcc or .lcc2; several of one world are joined. The last is written, as its name says: "
-                 ".ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html, lod-meta.json, a new folder for a web site, or "
+                 ".ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), lod-meta.json, a folder, or "
                  "one named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
@@ -46,8 +46,8 @@ def convert(args: opt.Args) -> None:
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
-    output = output_file(output, inputs[0].name)
-    check_outputs((output, *model_files(output)), (*inputs, *named), overwrite=args.overwrite)
+    output = output_file(output, inputs[0].name, site=writing.site)
+    check_outputs((output, *model_files(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
@@ -55,7 +55,7 @@ def convert(args: opt.Args) -> None:
     options = ConvertOptions(
         inputs, output, args.cameras, images, args.opacity, cleaning, placement,
         normals=writing.normals, full_columns=writing.columns == "full",
-        overwrite=args.overwrite,
+        site=writing.site, overwrite=args.overwrite,
     )  # fmt: skip
     with stage_progress(quiet=args.silent) as progress, record_run(progress):
         document = convert_files(options)

@@ -28,6 +28,8 @@ class FileOptions(Settings):
         "bytes per Gaussian; a `budget` in bytes counts them.")  # fmt: skip
     columns: str = setting("needed", "Columns of a `.ply`: those that are needed, or full: all 62 of INRIA's, which "
         "Unity's importer wants, with zeros for harmonics up to degree 3.", choices=("needed", "full"))  # fmt: skip
+    site: bool = setting(False, "Write a web site into the folder `-o`: a page as of `.html`, with its scene and "
+        "viewer beside it.")  # fmt: skip
     viewer_cameras: bool = setting(True, "Write the input views beside the result of `compact`, as `NAME.cameras.json` "
         "for viewers.")  # fmt: skip
 
@@ -37,30 +39,19 @@ def default_output(ply: Path) -> Path:
     return ply.with_name(f"{ply.stem}.compact.ply")
 
 
-def output_file(output: Path, name: str) -> Path:
-    """Return the file that an output names: of a folder its main file, or in an existing folder the file ``name``.
+def output_file(output: Path, name: str, *, site: bool = False) -> Path:
+    """Return the file that an output names: itself, or of a folder, which a new name without an ending is, its file.
 
-    A folder named ``colmap`` is a COLMAP model, a new one and one with a site of gsmerge a web site.
+    That is the page of a ``site``, the points of a folder named ``colmap``, and otherwise ``name``.
     """
-    from gsmerge.io.formats.table import FOLDER, PLACE, POINTS, SITE
+    from gsmerge.io.formats.table import FOLDER, HTML, PLACE, POINTS, SITE
 
+    if site:
+        return output if HTML.names(output) else output / SITE
     if output.name == FOLDER:
         return output / PLACE / POINTS
-    if _is_site(output):
-        return output / SITE.ending
-    return output / name if output.is_dir() else output
-
-
-def _is_site(output: Path) -> bool:
-    """Return whether a folder is, or is to become, a web site; a file's name has an ending."""
-    from gsmerge.io.formats.table import SITE
-
-    if not os.path.lexists(output):
-        return not output.suffix
-    try:
-        return output.is_dir() and is_page(output / SITE.ending)
-    except OSError:  # no permission to look into it: the check of outputs says so
-        return False
+    is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
+    return output / name if is_folder else output
 
 
 def is_page(path: Path) -> bool:
@@ -76,11 +67,11 @@ def _start_of(path: Path) -> bytes:
         return b""
 
 
-def model_files(output: Path) -> tuple[Path, ...]:
-    """List the other files of a web site, or of a COLMAP model, of which another program's is a SceneError."""
-    from gsmerge.io.formats.table import POINTS, SITE
+def model_files(output: Path, *, site: bool = False) -> tuple[Path, ...]:
+    """List the other files of a ``site``, or of a COLMAP model, of which another program's is a SceneError."""
+    from gsmerge.io.formats.table import POINTS
 
-    if SITE.names(output):
+    if site:
         from gsmerge.pages.site import NAMES
 
         return tuple(output.with_name(name) for name in NAMES.values())

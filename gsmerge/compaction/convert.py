@@ -36,7 +36,7 @@ from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, DEPTHS, INDEX, SITE, input_format
+from gsmerge.io.formats.table import COLMAP, DEPTHS, HTML, INDEX, input_format
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
@@ -66,6 +66,7 @@ class ConvertOptions:
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     full_columns: bool = False  # pad its harmonics with zeros up to degree 3
+    site: bool = False  # write the files of a page beside it
     overwrite: bool = False
 
 
@@ -183,10 +184,11 @@ def _write(
         first = add(out)
         if ending == COLMAP.ending:
             written = add_colmap(add, out, first, gaussians, cameras, photos)
-        elif ending == SITE.ending:
-            from gsmerge.pages.site import add_site
+        elif ending == HTML.ending:
+            from gsmerge.pages.site import add_site, site_contents
 
-            written = add_site(add, out, first, gaussians, cameras, scene_title(options.inputs[0]), comments)
+            title = scene_title(options.inputs[0])
+            written = add_site(add, first, site_contents(gaussians, cameras, title, comments, apart=options.site))
         elif ending == INDEX:
             ((_, files),) = add_levels(add, out, first, [gaussians], comments)
             written = [first, *files]
@@ -195,7 +197,7 @@ def _write(
                 first, gaussians, overwrite=True, comments=comments, ending=ending, normals=options.normals,
             )  # fmt: skip
             written = [first]
-        if len(cameras) and ending not in (COLMAP.ending, SITE.ending):
+        if len(cameras) and ending not in (COLMAP.ending, HTML.ending):
             beside = viewer_cameras_path(out)
             add_views(add, beside, cameras, names, overwrite=options.overwrite)
         num_bytes = sum(path.stat().st_size for path in written)

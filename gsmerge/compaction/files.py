@@ -22,7 +22,7 @@ from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, INDEX, SITE, SITE_SCENE
+from gsmerge.io.formats.table import COLMAP, HTML, INDEX
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, record_part
@@ -48,6 +48,7 @@ class Outputs:
     overwrite: bool = False
     normals: bool = True  # write the three columns of zeros that some viewers want of a ``.ply``
     full_columns: bool = False  # pad harmonics of a ``.ply`` with zeros up to degree 3
+    site: bool = False  # write the files of a page beside it
 
 
 def compact_files(
@@ -144,7 +145,7 @@ def _write_results(
 ) -> dict[Path, list[Path]]:
     """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
 
-    A COLMAP model and a web site have the ``views``, too: cameras, names with photos, and the scene's title. Returns
+    A COLMAP model and a page have the ``views``, too: cameras, names with photos, and the scene's title. Returns
     the path of each result, in their order, with its files as they are before they are renamed.
     """
     out = outputs.result
@@ -152,10 +153,11 @@ def _write_results(
     cameras, photos, title = views
     if ending == COLMAP.ending:
         return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
-    if ending == SITE.ending:
-        from gsmerge.pages.site import add_site
+    if ending == HTML.ending:
+        from gsmerge.pages.site import add_site, site_contents
 
-        return {out: add_site(add, out, first, results[0].gaussians, cameras, title, comments)}
+        contents = site_contents(results[0].gaussians, cameras, title, comments, apart=outputs.site)
+        return {out: add_site(add, first, contents)}
     if ending == INDEX:
         (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments)
         return {out: [first, *finest], **dict(coarser)}
@@ -172,9 +174,7 @@ def _write_results(
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
     """Say in the settings whose bytes a budget counts."""
-    name = SITE_SCENE if SITE.names(outputs.result) else outputs.result.name
-    budget = replace(settings.budget, output=name)
-    return replace(settings, budget=budget)
+    return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
 
 
 def _padded(result: CompactResult) -> CompactResult:

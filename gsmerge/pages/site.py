@@ -1,8 +1,8 @@
-"""Write a web site: a page with a viewer, whose camera stays where photos stood, and the ``.sog`` that it shows."""
+"""Write a page with a viewer, whose camera stays where photos stood, and the ``.sog`` in it, or beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,11 +12,11 @@ from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import sog_bytes
-from gsmerge.io.formats.table import SITE, SITE_SCENE
+from gsmerge.io.formats.table import SITE_SCENE
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import ENGINE, camera_numbers, render_template
+from gsmerge.pages.page import ENGINE, base64_text, camera_numbers, data_uri, render_template
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
@@ -30,30 +30,37 @@ MAX_VIEWS = 64  # of which the page knows where they stood
 LICENSED = ("spark", "three", "fflate")
 
 
-def add_site(
-    add: AddOutput, path: Path, page: Path, gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]
-) -> list[Path]:
-    """Write a web site as part of :func:`gsmerge.io.atomic.atomic_outputs`; ``page`` is the temporary file of ``path``.
+def add_site(add: AddOutput, page: Path, contents: tuple[str, Mapping[str, bytes]]) -> list[Path]:
+    """Write what :func:`site_contents` makes of a ``page``; return the present paths of all files."""
+    text, beside = contents
+    files = {add(page): text.encode(), **{add(page.with_name(name)): content for name, content in beside.items()}}
+    for path, content in files.items():
+        path.write_bytes(content)
+    return list(files)
 
-    Without cameras some are placed, and one may look from any side. Returns the present paths of all its files.
+
+def site_contents(
+    gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str], *, apart: bool
+) -> tuple[str, dict[str, bytes]]:
+    """Make a page, and by name the files beside it: none unless it is ``apart`` from what it shows.
+
+    Without cameras some are placed, and one may look from any side.
     """
-    contents = site_contents(gaussians, cameras, title, comments)
-    written = [page, *(add(path.with_name(name)) for name in NAMES.values())]
-    for file, name in zip(written, (SITE.ending, *NAMES.values()), strict=True):
-        file.write_bytes(contents[name])
-    return written
-
-
-def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> dict[str, bytes]:
-    """Make the files of a web site, by name."""
     scene, expected = sog_bytes(gaussians, comments), read_new_views(comments)
     is_free = len(cameras) == 0
     shown = place_cameras(gaussians.numpy()) if is_free else cameras.numpy()
     middle = 0 if is_free else median_camera(shown)  # of placed ones the first shows the most
-    picture = render(gaussians.numpy(), shown[[middle]]).images[0]
+    poster = encode_still(to_picture(render(gaussians.numpy(), shown[[middle]]).images[0]))
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
+    vendor = files("gsmerge.pages").joinpath("vendor")
+    licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
+    notice, engine = "\n\n".join(licences).encode(), files("gsmerge.pages").joinpath(ENGINE).read_bytes()
+    contents = dict(zip(NAMES.values(), (scene, engine, poster, notice), strict=True))
     page = render_template(
-        "site.html", policy=POLICY, title=title, count=len(gaussians), size=len(scene), names=NAMES,
+        "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES, apart=apart,
+        poster=NAMES["poster"] if apart else data_uri(poster, "image/webp"),
+        licences=NAMES["licences"] if apart else data_uri(notice, "text/plain"),
+        inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
         gain=None if expected is None else expected[1] - expected[0],
         download=f"{title}.sog",
         json_data={
@@ -63,12 +70,4 @@ def site_contents(gaussians: Gaussians, cameras: Cameras, title: str, comments: 
             ],
         },
     )  # fmt: skip
-    vendor = files("gsmerge.pages").joinpath("vendor")
-    licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
-    return {
-        SITE.ending: page.encode(),
-        NAMES["scene"]: scene,
-        NAMES["engine"]: files("gsmerge.pages").joinpath(ENGINE).read_bytes(),
-        NAMES["poster"]: encode_still(to_picture(picture)),
-        NAMES["licences"]: "\n\n".join(licences).encode(),
-    }
+    return page, contents if apart else {}

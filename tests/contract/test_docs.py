@@ -149,7 +149,7 @@ def test_benchmarks_in_pages_are_there(page: str) -> None:
 # What users of such tools ask: words of the question, and of its answer
 QUESTIONS = {
     "smaller files": "--budget", "look at a result": "gsmerge view", "look bad": "exposure",
-    "several photos of SHARP": "--images", "on a phone": "--light", "floaters": "--drop floaters",
+    "several photos of SHARP": "--images", "on a phone": "small.html", "floaters": "--drop floaters",
     "the sky": "--drop sky", "upside down": "--up", "my cameras": "cameras.json", "levels that stream": "lod-meta.json",
     "lose": "dB", "hundreds of views": "blocks", "Blender or Unity": "--up z", "commercially": "licences.md",
     "Spark": "blurAmount: 0", "trained": "--budget", "join two scenes": "--translate", "Vision Pro": "usdz",

@@ -1,4 +1,4 @@
-"""``-o site/``: a folder that any web server publishes, and that opens from disk once it is chosen in the browser."""
+"""``-o small.html``: one file that opens from disk; ``--set site=true``: a folder that any web server publishes."""
 
 from __future__ import annotations
 
@@ -28,37 +28,42 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_compact_writes_a_site_whole_or_not_at_all(run: Run, smallest_copy: Path) -> None:
+QUICK = ("--effort", "draft", "--fit", "none")
+SITE = ("--set", "site=true")
+
+
+def test_compact_writes_a_site_where_one_is_asked_for(run: Run, smallest_copy: Path) -> None:
     site = smallest_copy / "site"
-    quick = ("--effort", "draft", "--fit", "none")
-    document = json.loads(run("compact", smallest_copy, "-o", f"{site}/", *quick, "--json", code=0).out)
-    assert names(site) == FILES
+    site.mkdir()
+    (site / ".gsmerge-00000000-999999999-00000000.html").touch()  # the rest of a killed run
+    document = json.loads(run("compact", smallest_copy, "-o", f"{site}/", *QUICK, *SITE, "--json", code=0).out)
+    assert [name for name in names(site) if name[0] != "."] == FILES
     assert document["output"]["path"] == str(site / "index.html")
-    assert document["output"]["bytes"] == sum(path.stat().st_size for path in site.iterdir())
-    assert_refused(run("compact", smallest_copy, "-o", site, "--budget", "50"), 2, site / "index.html")
-    (site / "scene.sog").write_bytes(b"")
-    (site / "index.html").unlink()  # what is left is no site: the result goes into the folder
-    run("compact", smallest_copy, "-o", site, *quick, code=0)
+    assert document["output"]["bytes"] == sum((site / name).stat().st_size for name in FILES)
+    assert_refused(run("compact", smallest_copy, "-o", site, "--budget", "50", *SITE), 2, site / "index.html")
+    run("compact", smallest_copy, "-o", site, *QUICK, code=0)
     assert "scene.compact.ply" in names(site)
 
 
-@pytest.mark.slow
-def test_a_budget_in_bytes_is_that_of_the_scene(run: Run, small_copy: Path) -> None:
-    site = small_copy / "site"
-    assert_refused(run("compact", small_copy, "-o", site, "--levels", "2"), 2, site / "index.html")
-    assert not site.exists()  # levels have none
-    run("compact", small_copy, "-o", site, "--effort", "draft", "--budget", "12kB", code=0)
-    assert 10_000 < (site / "scene.sog").stat().st_size <= 12_000
+def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
+    page = smallest_copy / "made" / "small.html"
+    assert_refused(run("compact", smallest_copy, "-o", page, "--levels", "2"), 2, page)
+    assert not page.parent.exists()  # levels have none
+    document = json.loads(run("compact", smallest_copy, "-o", page, *QUICK, "--json", code=0).out)
+    assert names(page.parent) == ["small.html"]
+    assert document["output"]["bytes"] == page.stat().st_size < 1_100_000
 
 
 def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, smallest_copy: Path) -> None:
     small, site = smallest_copy / "scene.ply", smallest_copy / "site"
-    run("convert", small, site, code=0)
+    run("convert", small, site, *SITE, code=0)
     assert names(site) == FILES
     before = (site / "index.html").read_bytes()
-    run("convert", small, site, "--scale", "2", "--overwrite", code=0)
+    run("convert", small, site, *SITE, "--scale", "2", "--overwrite", code=0)
     assert names(site) == FILES
     assert (site / "index.html").read_bytes() != before
+    run("convert", small, smallest_copy / "new", code=0)
+    assert "scene.ply" in names(smallest_copy / "new")
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -71,7 +76,8 @@ def site(small_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from gsmerge.cli import main
 
     folder = tmp_path_factory.mktemp("made") / "site"
-    assert main(["compact", str(small_scene), "-o", str(folder), "--effort", "draft", "-q"]) == 0
+    assert main(["compact", str(small_scene), "-o", str(folder), "--effort", "draft", "-q", *SITE]) == 0
+    assert main(["convert", str(folder / "scene.sog"), str(folder.parent / "one.html"), "-q"]) == 0
     return folder
 
 
@@ -99,7 +105,8 @@ def test_from_a_server_it_opens_by_itself_and_draws_as_we_do(
     host = served.removesuffix("index.html")
     assert [url for url in tab.requests() if not url.startswith((host, f"blob:{host}"))] == []
     width, height = tab.run("[data.views[0].width, data.views[0].height]")
-    tab.run(f"stage.style.flex = 'none'; stage.style.minHeight = 0; stage.style.width = '{width}px'")
+    tab.run(f"stage.style.right = stage.style.bottom = 'auto'; stage.style.width = '{width}px'")
+    tab.run("document.querySelectorAll('header, footer').forEach((one) => one.remove())")
     tab.run(f"stage.style.height = '{height}px'; const usual = frame; frame = () => ({{...usual(), exact: true}}); 0")
     tab.run("site.frame = frame; site.look(data.start); 0")
     scene = gsmerge.read_scene(small_scene)
@@ -157,13 +164,40 @@ def test_on_a_phone_one_finger_turns_and_two_come_nearer(tab: Browser, served: s
     assert tab.run("[site.lens / column(site.camera.matrix, 3).distanceTo(site.target)]")[0] > 1.5 * before
 
 
+@needs_browser()
+def test_one_file_opens_from_disk(tab: Browser, site: Path) -> None:
+    before = len(tab.requests())
+    tab.open(site.parent / "one.html")
+    assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]
+    tab.wait(SETTLED)
+    assert tab.run("[id('canvas').hidden, id('poster').hidden, id('save').hidden]") == [False, True, False]
+    assert [url for url in tab.requests()[before:] if not url.startswith(("file:", "data:", "blob:"))] == []
+    saved = tab.run("fetch(id('save').href).then((answer) => answer.arrayBuffer()).then((bytes) => bytes.byteLength)")
+    assert 5_000 < saved < 100_000
+
+
+@needs_browser()
+def test_a_site_from_disk_shows_a_picture_and_says_what_to_do(tab: Browser, site: Path) -> None:
+    tab.open(site / "index.html")
+    tab.wait("id('status').textContent.includes('NAME.html')")
+    assert tab.run("[id('canvas').hidden, id('poster').naturalWidth > 0]") == [True, True]
+
+
 @pytest.mark.slow
 @needs_browser()
-def test_from_disk_it_shows_a_picture_and_asks_for_its_folder(tab: Browser, site: Path) -> None:
-    tab.open(site / "index.html")
-    assert tab.run("[id('disk').hidden, id('poster').naturalWidth > 0, id('status').textContent]") == [False, True, ""]
-    root = tab.call("DOM.getDocument")["root"]["nodeId"]
-    node = tab.call("DOM.querySelector", nodeId=root, selector="#folder")["nodeId"]
-    tab.call("DOM.setFileInputFiles", nodeId=node, files=[str(site)])
+@pytest.mark.parametrize("supported", [True, False])
+def test_vr_is_offered_where_the_browser_has_it(supported: bool, tab: Browser, site: Path) -> None:
+    target = tab.call("Target.createTarget", url="about:blank")["targetId"]
+    tab.session = tab.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+    session = "requestSession: async () => { throw Error('off'); }"
+    xr = f"isSessionSupported: async () => {json.dumps(supported)}, {session}"
+    script = f"Object.defineProperty(navigator, 'xr', {{ value: {{ {xr} }} }});"
+    tab.call("Page.enable")
+    tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+    tab.call("Page.navigate", url=(site.parent / "one.html").as_uri())
+    tab.wait("location.protocol === 'file:' && document.readyState === 'complete'")
     tab.wait(SETTLED)
-    assert tab.run("[id('disk').hidden, id('canvas').hidden, id('poster').hidden]") == [True, False, True]
+    assert tab.run("new Promise((end) => setTimeout(() => end(id('headset').hidden)))") is not supported
+    if supported:
+        tab.run("id('headset').click()")
+        tab.wait("id('status').textContent === 'No VR: off'")

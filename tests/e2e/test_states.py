@@ -149,7 +149,7 @@ def test_a_state_is_a_scene(states: list[Path], walks: list[Path], tmp_path: Pat
     for words in (
         ("compact", alone, *few, "-o", tmp_path / "small.spz"),
         ("compact", alone, *few, "-o", tmp_path / "colmap"),
-        ("compact", alone, *few, "-o", tmp_path / "site"),
+        ("compact", alone, *few, "-o", tmp_path / "small.html"),
         ("inspect", alone),
         ("render", alone, "-o", tmp_path / "a.png"),
         ("evaluate", alone, out, "--lpips", "none"),

@@ -69,8 +69,6 @@ def stand_in(words: Sequence[str]) -> None:
     elif "-d" in words:
         count = int(words[words.index("-d") + 1])
         write_ply(out, read_ply(words[4], opacity="logit").gaussians[:count])
-    elif out.suffix == ".html":
-        out.write_text("<html>")
     else:
         out.write_bytes(Path(words[4]).read_bytes())
 

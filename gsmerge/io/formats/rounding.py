@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gsmerge.io.formats.read import read_gaussians
-from gsmerge.io.formats.table import COLMAP, HTML, LEVELS, PLY, SITE, SITE_SCENE, input_format, output_format
+from gsmerge.io.formats.table import COLMAP, HTML, LEVELS, PLY, SITE_SCENE, input_format, output_format
 from gsmerge.io.formats.write import write_gaussians
 from gsmerge.types import Gaussians, StrPath
 
@@ -46,7 +46,7 @@ def as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     if not rounding_notes(path, gaussians):
         return gaussians
     chosen = output_format(path, levels=True, cameras=True)
-    name = SITE_SCENE if chosen in (LEVELS, SITE, HTML) else f"a{chosen.ending}"
+    name = SITE_SCENE if chosen in (LEVELS, HTML) else f"a{chosen.ending}"
     if input_format(name).read is None:
         name = "a.ply"  # in float32, as a USD file
     with TemporaryDirectory() as folder:

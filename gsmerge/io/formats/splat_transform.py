@@ -6,7 +6,6 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,14 +14,11 @@ from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io.bounds import check_file, read_json
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.write import write_ply
-from gsmerge.types import Gaussians
 
 PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
 PACKAGE = "@playcanvas/splat-transform@3.7"
 TIME_LIMIT = 1800  # seconds
 MAX_OUTPUT = 300  # characters of the program's own output in an error
-MAX_DEGREE = 3
 
 
 def find_program() -> str:
@@ -34,15 +30,6 @@ def find_program() -> str:
         problem = f"expected the program {place}, found none; install it with: npm install -g {PACKAGE}"
         raise UsageError(f"{PROGRAM}: {problem}")
     return program
-
-
-def require_html() -> None:
-    """Raise UsageError, with the command that makes a page of a ``.ply``, where the program is not installed."""
-    try:
-        find_program()
-    except UsageError as error:
-        problem = f"{PROGRAM} writes it, which is not installed"
-        raise UsageError(f".html: {problem}; convert a .ply with: npx {PACKAGE} scene.ply scene.html") from error
 
 
 def holds_sog(path: Path) -> bool:
@@ -98,12 +85,3 @@ def read_rows(path: Path) -> StoredRows:
         stored, rows=rows, layout=f"{stored.layout}, by {PROGRAM}", encoding="logit",
         bytes_beside=sum(file.stat().st_size for file in others),
     )  # fmt: skip
-
-
-def html_bytes(gaussians: Gaussians, comments: Sequence[str]) -> bytes:
-    """Make a page with PlayCanvas' viewer and the Gaussians in it."""
-    with TemporaryDirectory(prefix="gsmerge-") as folder:
-        scene, page = Path(folder) / "scene.ply", Path(folder) / "scene.html"
-        write_ply(scene, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=comments)
-        run_program(scene, "-i", 1, page)
-        return page.read_bytes()

@@ -59,11 +59,10 @@ LEVELS = Format(
     round_means=_lazy("sog.round_means"),
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
-SITE = Format(
-    "index.html", "a web site: a page with a viewer, and the .sog that it shows", None, None, 3, each=_SOG,
-    round_means=_lazy("sog.round_means"),
-)  # fmt: skip
-SITE_SCENE = "scene.sog"
+HTML = Format(
+    ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means")
+)
+SITE, SITE_SCENE = "index.html", "scene.sog"  # of a page that has its files beside it
 FILES = (  # of endings that end alike the longest first
     Format(
         ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
@@ -98,11 +97,7 @@ STATE = Format(
     SUFFIX, "batches of views: Gaussians, cameras and pictures", _lazy("gsm.read_rows"), None, -1, each=(56.0,)
 )
 META = "meta.json"  # of a .sog that is a folder
-HTML = Format(
-    ".html", "PlayCanvas' viewer, by splat-transform", None, _lazy("splat_transform.html_bytes"), 3,
-    require=_lazy("splat_transform.require_html"), round_means=_lazy("sog.round_means"),
-)  # fmt: skip
-BY_PROGRAM = (  # which splat-transform reads or writes in our place
+BY_PROGRAM = (  # which splat-transform reads in our place
     Format(".ksplat", "by splat-transform", _READ_BY_PROGRAM, None, -1),
     Format(
         META, "a .sog without its zip, by splat-transform", _READ_BY_PROGRAM, None, -1,
@@ -110,10 +105,9 @@ BY_PROGRAM = (  # which splat-transform reads or writes in our place
     ),
     Format(".lcc", "the finest level, by splat-transform", _READ_BY_PROGRAM, None, -1),
     Format(".lcc2", "as `.lcc`", _READ_BY_PROGRAM, None, -1),
-    HTML,
 )  # fmt: skip
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
-FORMATS = (*FILES, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
+FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
@@ -175,18 +169,19 @@ def may_hold_gaussians(path: Path) -> bool:
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
     """Return the format in which to write a path; UsageError for an unknown ending or a missing package.
 
-    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a web site, which have cameras.
+    ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a page, which have cameras.
     """
-    allowed = {LEVELS: levels, COLMAP: cameras, SITE: cameras}
-    chosen = next((row for row in (SITE, *FORMATS) if row.names(path)), None)
+    allowed = {LEVELS: levels, COLMAP: cameras, HTML: cameras}
+    chosen = next((row for row in FORMATS if row.names(path)), None)
     if chosen is not None and (chosen.max_degree < 0 or not allowed.get(chosen, True)):
         chosen = None
     if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if chosen is None:
+        endings = join_words((*OUTPUT_FORMATS, *([HTML.ending] if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", a new folder for a web site, or one named {FOLDER}" if cameras else ""
-        raise UsageError(f"{path}: expected a name that ends in {join_words(OUTPUT_FORMATS)}{index}{folder}")
+        folder = f", or a folder, or one named {FOLDER}" if cameras else ""
+        raise UsageError(f"{path}: expected a name that ends in {endings}{index}{folder}")
     chosen.require()
     return chosen

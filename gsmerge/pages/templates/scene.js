@@ -92,7 +92,7 @@ class SplatView {
     const pane = spark.uniforms.renderSize.value;
     spark.onBeforeRender = (...values) => { // which would take the whole canvas for the size of the picture
       Vendor.SparkRenderer.prototype.onBeforeRender.apply(spark, values);
-      pane.set(this.pane[2], this.pane[3]);
+      if (!this.renderer.xr.isPresenting) pane.set(this.pane[2], this.pane[3]);
     };
     const scene = new Vendor.Scene();
     scene.add(spark, mesh);

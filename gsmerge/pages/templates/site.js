@@ -1,10 +1,11 @@
 "use strict";
-// A published scene: its files are beside the page, and the camera stays where photos stood.
+// A published scene: its files are in the page or beside it, and the camera stays where photos stood.
 
 const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
-const SCENE = "scene";
+const [SCENE, VR] = ["scene", "immersive-vr"];
+const METRES = 2; // in VR, to what is looked at
 // Shares of the distance of what photos show: how far the camera may leave their hull, what it looks at that of what
 // they show, and how near it may come to that
 const [AROUND, BESIDE, NEAREST] = [0.1, 0.15, 0.25];
@@ -92,6 +93,35 @@ class SiteView extends SplatView {
     if (factor > 1) this.lens = Math.min(MOST_LENS, Math.max(this.lens, (this.lens * factor * distance()) / before));
     this.fit();
   }
+
+  request() {
+    if (!this.renderer.xr.isPresenting) super.request(); // which the headset does itself
+  }
+
+  // Into a headset: its wearer stands where the camera is, upright, with what it looks at a few metres ahead.
+  async enter() {
+    const session = await navigator.xr.requestSession(VR);
+    const { scene, mesh, spark } = this.results.get(SCENE);
+    const place = column(this.camera.matrix, 3);
+    const back = column(this.camera.matrix, 0).cross(this.up).normalize();
+    const right = this.up.clone().cross(back);
+    const scale = METRES / place.distanceTo(this.target);
+    const rows = [right, this.up, back].flatMap((axis) => [...axis.clone().multiplyScalar(scale).toArray(), -scale * axis.dot(place)]);
+    mesh.matrixAutoUpdate = false;
+    mesh.matrix.set(...rows, 0, 0, 0, 1);
+    this.renderer.xr.enabled = spark.autoUpdate = true;
+    session.addEventListener("end", () => {
+      mesh.matrix.identity();
+      this.renderer.xr.enabled = spark.autoUpdate = false;
+      this.renderer.setAnimationLoop(null);
+      setTimeout(() => this.changed());
+    });
+    this.renderer.xr.setReferenceSpaceType("local");
+    this.renderer.setScissorTest(false);
+    await this.renderer.xr.setSession(session);
+    const head = new Vendor.PerspectiveCamera();
+    this.renderer.setAnimationLoop(() => this.renderer.render(scene, head));
+  }
 }
 
 function frame() {
@@ -106,46 +136,36 @@ function frame() {
 
 const say = (words) => { id("status").textContent = words; };
 
-async function fetchBytes(name) {
+// Bytes of a file of the page, which is in it or beside it.
+async function read(name) {
+  if (id(name)) return takeBytes(name);
+  if (location.protocol === "file:") throw new Error("a browser lets a page from disk read none of the files beside it; publish its folder, or write one file: -o NAME.html");
   const answer = await fetch(name);
   if (!answer.ok) throw new Error(`${name} is missing beside this page`);
   return new Uint8Array(await answer.arrayBuffer());
 }
 
-// From the chosen folder of a page that was opened from disk.
-async function bytesOf(files, name) {
-  const file = files.find((one) => one.name === name);
-  if (!file) throw new Error(`${name} is not in this folder`);
-  return new Uint8Array(await file.arrayBuffer());
-}
-
-async function open(read) {
-  say("3D loads …");
+async function start() {
+  listen();
+  id("full").hidden = !document.fullscreenEnabled;
   try {
-    const [engine, scene] = await Promise.all([read(data.names.engine), read(data.names.scene)]);
-    if (!window.Vendor) await loadVendor(engine);
+    const scene = await read(data.names.scene);
+    [id("save").href, id("save").hidden] = [URL.createObjectURL(new Blob([scene])), false];
+    if (!window.DecompressionStream || !document.createElement("canvas").getContext("webgl2")) throw new Error("this browser has no WebGL 2");
+    await loadVendor(await read(data.names.engine));
     const settle = (settled) => stage.setAttribute("aria-busy", String(!settled));
     const made = new SiteView(id("canvas"), data.views, frame, settle);
     await made.add(SCENE, scene, data.names.scene);
     await made.prepare();
     site = made;
-    [id("disk").hidden, id("canvas").hidden, id("poster").hidden, id("reset").disabled] = [true, false, true, false];
+    [id("canvas").hidden, id("poster").hidden, id("reset").hidden] = [false, true, false];
     id("canvas").addEventListener("webglcontextlost", () => say("3D was lost: reload the page"));
     say("");
     site.fit();
+    if (navigator.xr) id("headset").hidden = !(await navigator.xr.isSessionSupported(VR));
   } catch (error) {
     say(`No 3D: ${error.message}`);
   }
-}
-
-function start() {
-  listen();
-  id("full").hidden = !document.fullscreenEnabled;
-  if (!window.DecompressionStream || !document.createElement("canvas").getContext("webgl2")) return say("No 3D: this browser has no WebGL 2");
-  if (location.protocol !== "file:") return open(fetchBytes);
-  say("");
-  id("disk").hidden = false;
-  id("folder").addEventListener("change", (event) => open((name) => bytesOf([...event.target.files], name)));
 }
 
 function listen() {
@@ -176,7 +196,8 @@ function listen() {
   document.addEventListener("keydown", onKey);
   window.addEventListener("resize", () => site && site.fit());
   id("reset").addEventListener("click", () => site.reset());
-  id("full").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : stage.requestFullscreen()));
+  id("full").addEventListener("click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
+  id("headset").addEventListener("click", () => site.enter().catch((error) => say(`No VR: ${error.message}`)));
 }
 
 function onKey(event) {

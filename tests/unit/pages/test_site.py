@@ -1,7 +1,9 @@
-"""A web site: files that need no other host, and a camera that a page may not leave."""
+"""A page with a scene, in one file or a few, that needs no other host, and a camera that it may not leave."""
 
 from __future__ import annotations
 
+import base64
+import html
 import json
 import re
 from pathlib import Path
@@ -23,47 +25,66 @@ EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 NONE = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
-@pytest.fixture(scope="module")
-def contents() -> dict[str, bytes]:
+Contents = tuple[str, dict[str, bytes]]
+
+
+def contents_of(*, apart: bool) -> Contents:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
-    return site_contents(scene.gaussians, scene.cameras, EVIL, ())
+    return site_contents(scene.gaussians, scene.cameras, EVIL, (), apart=apart)
 
 
-def data_of(page: bytes) -> dict[str, Any]:
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.decode(), re.DOTALL)
+@pytest.fixture(scope="module")
+def site() -> Contents:
+    return contents_of(apart=True)
+
+
+def data_of(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
     assert found is not None
     return dict(json.loads(found[1]))
 
 
-def test_a_site_needs_no_other_host(contents: dict[str, bytes]) -> None:
-    page = contents["index.html"].decode()
+@pytest.mark.parametrize("apart", [True, False])
+def test_a_page_needs_no_other_host(apart: bool) -> None:
+    page, files = contents_of(apart=apart)
     check_policy(page)
-    assert re.findall(r"https?:|[\"']//", page) == []
-    addresses = re.findall(r"""(?:src|href)=["']([^"']+)["']""", page)
-    assert {one for one in addresses if not one.startswith("data:")} == set(NAMES.values()) - {NAMES["engine"]}
+    bare = re.sub(r"[A-Za-z0-9+/=]{1000,}", "", page)
+    assert re.findall(r"https?:|[\"']//", bare) == []
+    addresses = set(re.findall(r"""(?:src|href)=["']([^"']+)["']""", bare))
+    beside = {NAMES["poster"], NAMES["licences"]} if apart else set()
+    assert {one for one in addresses if not one.startswith("data:")} == beside
     assert "<b onload" not in page
-    assert set(contents) == {"index.html", *NAMES.values()}
+    assert f'<meta property="og:title" content="{html.escape(EVIL)}">' in page.replace("&#34;", "&quot;")
+    assert set(files) == (set(NAMES.values()) if apart else set())
 
 
-def test_of_a_site_of_1_5_mb_800_kb_are_the_scene(contents: dict[str, bytes]) -> None:
-    assert sum(len(content) for name, content in contents.items() if name != SITE_SCENE) < 700_000
+def test_one_file_holds_what_is_beside_a_site(site: Contents) -> None:
+    page, _ = contents_of(apart=False)
+    for content in site[1].values():
+        assert base64.b64encode(content).decode() in page
 
 
-def test_its_scene_is_a_sog_of_all_gaussians(contents: dict[str, bytes], tmp_path: Path) -> None:
-    (tmp_path / "a.sog").write_bytes(contents[SITE_SCENE])
+def test_all_but_the_scene_takes_little(site: Contents) -> None:
+    page, files = site
+    assert len(page) + sum(len(content) for name, content in files.items() if name != SITE_SCENE) < 700_000
+    assert len(contents_of(apart=False)[0]) < 1_000_000
+
+
+def test_its_scene_is_a_sog_of_all_gaussians(site: Contents, tmp_path: Path) -> None:
+    (tmp_path / "a.sog").write_bytes(site[1][SITE_SCENE])
     assert len(read_gaussians(tmp_path / "a.sog").gaussians) == len(
         scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
     )
 
 
-def test_the_licences_of_the_viewer_are_beside_it(contents: dict[str, bytes]) -> None:
-    assert contents["LICENSES.txt"].count(b"Permission is hereby granted") == 3
+def test_the_licences_of_the_viewer_are_beside_it(site: Contents) -> None:
+    assert site[1]["LICENSES.txt"].count(b"Permission is hereby granted") == 3
 
 
 def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3))
     many = scene.cameras[np.repeat(np.arange(3), 50)]
-    data = data_of(site_contents(scene.gaussians, many, "a", ())["index.html"])
+    data = data_of(site_contents(scene.gaussians, many, "a", (), apart=False)[0])
     assert len(data["views"]) in (MAX_VIEWS, MAX_VIEWS + 1)
     assert data["free"] is False
     np.testing.assert_allclose(data["views"][data["start"]]["viewmat"], scene.cameras.viewmats[1].reshape(-1))
@@ -71,26 +92,42 @@ def test_of_many_views_the_page_knows_some_and_the_middle_one() -> None:
 
 def test_without_cameras_one_may_look_from_any_side() -> None:
     gaussians = scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
-    contents = site_contents(gaussians, NONE, "a", ())
-    data = data_of(contents["index.html"])
+    page, files = site_contents(gaussians, NONE, "a", (), apart=True)
+    data = data_of(page)
     assert data["free"] is True
     assert data["start"] == 0
-    poster = cv2.imdecode(np.frombuffer(contents["poster.webp"], np.uint8), cv2.IMREAD_COLOR)
+    poster = cv2.imdecode(np.frombuffer(files["poster.webp"], np.uint8), cv2.IMREAD_COLOR)
     assert poster is not None
     assert (poster > 20).any(2).mean() > 0.3  # it shows the scene
 
 
-def test_which_folders_are_sites(tmp_path: Path, contents: dict[str, bytes]) -> None:
-    def named(name: str) -> str:
-        return output_file(tmp_path / name, "a.ply").relative_to(tmp_path).as_posix()
-
-    for name in ("empty", "site", "foreign", "full"):
+@pytest.mark.parametrize(
+    ("output", "site", "expected"),
+    [
+        ("new", False, "new/a.ply"),
+        ("empty", False, "empty/a.ply"),
+        ("full.dir", False, "full.dir/a.ply"),  # whatever it holds: a page, or the rest of a killed run
+        ("file", False, "file"),  # which no format names
+        ("new.html", False, "new.html"),
+        ("b.ply", False, "b.ply"),
+        ("colmap", False, "colmap/sparse/0/points3D.bin"),
+        ("new", True, "new/index.html"),
+        ("full.dir", True, "full.dir/index.html"),
+        ("full.dir/page.html", True, "full.dir/page.html"),
+    ],
+)
+def test_a_folder_gets_the_result_and_a_site_where_one_is_asked_for(
+    output: str, site: bool, expected: str, tmp_path: Path
+) -> None:
+    for name in ("empty", "full.dir"):
         (tmp_path / name).mkdir()
-    (tmp_path / "site" / "index.html").write_bytes(contents["index.html"])
-    (tmp_path / "foreign" / "index.html").write_text("<!DOCTYPE html><title>mine</title>")
-    (tmp_path / "full" / "b.ply").write_bytes(b"")
-    assert [named(name) for name in ("new", "site")] == ["new/index.html", "site/index.html"]
-    assert [named(name) for name in ("empty", "foreign", "full")] == ["empty/a.ply", "foreign/a.ply", "full/a.ply"]
-    assert [named(name) for name in ("b.ply", "colmap")] == ["b.ply", "colmap/sparse/0/points3D.bin"]
-    assert is_page(tmp_path / "site" / "index.html")
-    assert not is_page(tmp_path / "foreign" / "index.html")
+    (tmp_path / "full.dir" / "index.html").write_text(contents_of(apart=True)[0])
+    (tmp_path / "full.dir" / ".gsmerge-00000000-1-00000000.html").touch()
+    (tmp_path / "file").touch()
+    assert output_file(tmp_path / output, "a.ply", site=site) == tmp_path / expected
+
+
+def test_a_page_is_known_as_ours(tmp_path: Path) -> None:
+    (tmp_path / "ours.html").write_text(contents_of(apart=False)[0])
+    (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
+    assert [is_page(tmp_path / name) for name in ("ours.html", "mine.html")] == [True, False]

@@ -14,7 +14,7 @@ from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.table import COLMAP, INDEX, OUTPUT_FORMATS
 from gsmerge.types import Gaussians
 
-NAMES = ("lod-meta.json", "a.html", "site/index.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
+NAMES = ("lod-meta.json", "a.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))
 
 
 @pytest.fixture(autouse=True)

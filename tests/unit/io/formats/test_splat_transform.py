@@ -21,7 +21,7 @@ from splat_transform_programs import (
     write_unbundled,
 )
 
-from gsmerge import Gaussians, Scene, read_gaussians, write_gaussians
+from gsmerge import Gaussians, Scene, read_gaussians
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.file_checks import check_content
 from gsmerge.io import write_ply
@@ -96,13 +96,6 @@ def test_damage_is_one_line(name: str, tmp_path: Path) -> None:
             read_gaussians(tmp_path / name)
 
 
-@needs_program()
-def test_a_page_holds_the_scene(scene: Scene, tmp_path: Path) -> None:
-    write_gaussians(tmp_path / "a.html", drawn(scene, 1))
-    assert "<html" in (tmp_path / "a.html").read_text()
-    assert (tmp_path / "a.html").stat().st_size > 1_000_000  # with PlayCanvas' engine
-
-
 @pytest.fixture
 def no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -121,8 +114,6 @@ def test_without_the_program_one_line_has_the_command_that_converts(
 
 
 def test_without_the_program_nothing_is_written(tmp_path: Path, no_program: None) -> None:
-    with refuses(UsageError, ".html", f"npx {PACKAGE} scene.ply scene.html"):
-        write_gaussians(tmp_path / "a.html", corners())
     with refuses(UsageError, "splat-transform", f"npm install -g {PACKAGE}"):
         splat_transform.run_program("a.ply", "b.ply")
     assert list(tmp_path.iterdir()) == []
@@ -133,8 +124,6 @@ def test_a_stand_in_is_given_the_file(tmp_path: Path, monkeypatch: pytest.Monkey
     write_ply(tmp_path / "a.ply", corners())
     (tmp_path / "a.ply").rename(tmp_path / "a.lcc")
     np.testing.assert_array_equal(read_gaussians(tmp_path / "a.lcc").gaussians.means, corners().means)
-    write_gaussians(tmp_path / "a.html", corners())
-    assert (tmp_path / "a.html").read_text() == "<html>"
 
 
 @pytest.mark.parametrize(
