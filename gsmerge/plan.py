@@ -411,7 +411,7 @@ def describe_share(agreement: Agreement | None) -> tuple[str, str]:
     """Return the share of a scene's pixels that it bears Gaussians for, as text such as "10%", and the reason."""
     if agreement is None:
         return SHARE, "depths of several views cannot be compared"
-    return f"{100 * agreement.share:.2g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
+    return f"{100 * agreement.share:.3g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
 
 
 def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:

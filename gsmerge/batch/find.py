@@ -191,7 +191,7 @@ def _listed(file: Path, search: _Search) -> Iterator[Path]:
     for entry in lines:
         if not entry or entry.startswith("#"):
             continue
-        path = file.parent / entry
+        path = file.parent / os.path.expanduser(entry)
         if not os.path.isdir(path):
             yield path
         elif os.path.realpath(path) not in search.seen:

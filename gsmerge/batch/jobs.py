@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,8 +56,9 @@ class BatchOptions(Settings):
         super().__post_init__()
         Engine(self.engine, self.address)
         try:
-            names = [name for _, name, _, _ in Formatter().parse(self.output) if name is not None]
-            example = self.output.format(**dict.fromkeys(FIELDS, 1))
+            fields = [(name, spec) for _, name, spec, _ in Formatter().parse(self.output) if name is not None]
+            names = [name if not re.search(r"\{|\d{3}", spec or "") else "" for name, spec in fields]  # no vast widths
+            example = "" if "" in names else self.output.format(**dict.fromkeys(FIELDS, 1))
         except (ValueError, LookupError, AttributeError, TypeError):
             names, example = [""], ""
         placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), OUTPUT_FORMATS

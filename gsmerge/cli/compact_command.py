@@ -45,7 +45,7 @@ VIEWED = (".ply", ".spz", ".sog", ".splat", ".glb")  # endings that a page shows
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that say something about Feature Gaussians, too
-OF_FEATURES = ("scenes", "k", "set", "output", "overwrite", "dry_run", "json", "quiet", "threads")
+OF_FEATURES = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads")
 
 
 PARAMETERS = (
@@ -67,7 +67,7 @@ def compact(args: opt.Args) -> None:
     _compact(args)
 
 
-@opt.command(*PARAMETERS)
+@opt.command(*PARAMETERS, "open")
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page with the result beside it: ``gsmerge SCENE``."""
     scene, features = args.scenes[0], _features_in(args.scenes)
@@ -88,7 +88,7 @@ def look(args: opt.Args) -> None:
     before, *after = shown
     cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "hint"))
     loaded = replace(loads[0], notes=()) if after else None  # which were said
-    opt.call(view, before=before, after=after, **cameras, open=not args.json, quiet=args.silent, loaded=loaded)
+    opt.call(view, before=before, after=after, **cameras, open=args.open and not args.json, quiet=args.silent, loaded=loaded)
 
 
 def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:

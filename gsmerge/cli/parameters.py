@@ -405,6 +405,7 @@ _TABLE = (
         switch("strict", "Exit with code 4, once all is written, where a result shows the scene's own photos worse "
                "than the input does, by more than .5 dB, or cameras or photos do not fit."),
         switch("dry_run", "Print what would be done; write nothing."),
+        option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True),
         switch("json", "Print JSON on stdout."),
     ),
     panel(

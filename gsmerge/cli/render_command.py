@@ -8,7 +8,7 @@ from pathlib import Path
 import typer
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.console import print_document, say, say_notes, stage_progress
+from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
 
@@ -74,10 +74,8 @@ def render(args: opt.Args) -> None:
     say_notes(document["notes"], quiet=args.silent)
     with stage_progress(quiet=args.silent) as progress:
         document |= drawings.write_drawing(drawing, overwrite=args.overwrite, progress=progress)
-    if args.json:
-        print_document(document, "", as_json=True)
-    else:
-        say(f"{args.output}: {drawings.drawing_line(document)}", quiet=args.quiet)
+    line = f"{args.output}: {drawings.drawing_line(document)}"
+    print_document(document, line, as_json=args.json, quiet=args.quiet)
 
 
 def _choose_kind(args: opt.Args) -> str:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     *opt.panel(
         opt.OUTPUT,
         opt.switch("light", "Show BEFORE in pictures alone: a page of a third of the size, with AFTER in 3D."),
-        opt.option("open", bool, "Open the page in the browser.", "--open/--no-open", default=True),
     ),
+    "open",
 )  # fmt: skip
 def view(args: opt.Args) -> None:
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D, scores in one file."""

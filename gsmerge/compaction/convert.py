@@ -95,6 +95,9 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
             raise SceneError(options.inputs[0], problem, "look where the scene lies with gsmerge inspect")
         frame = find_placement(options.placement, cameras)
         gaussians, moved = place(gaussians, cameras or NO_CAMERAS, frame, options.placement.sh_degree)
+        side = max(float(np.abs(gaussians.means).max()), float(gaussians.scales.max()))
+        if options.placement.moves and not 1e-30 < side < 1e30:  # numbers in files are of 32 bits
+            raise UsageError(f"--scale, --translate: expected a scene of 1e-30 to 1e30 across, would be {side:.0e}")
     gaussians = pad_harmonics(gaussians, NUM_FULL) if options.full_columns else gaussians
     infos = [file.info for file in files]
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
@@ -119,7 +122,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
-    kept = "" if after["num_gaussians"] == before else f" of {before:,}"
+    kept = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
     beside = document["viewer_cameras"]
     cameras = f"; cameras in {Path(beside).name}" if beside else ""
     return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians, {human_bytes(after['bytes'])}{cameras}"
@@ -158,7 +161,7 @@ def _clean(
         return clean(gaussians, options.clean, None, lambda g: g)
     photos = named_path(options.images)
     if stored is None or photos is None:
-        raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --images")
+        raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --set images=FOLDER")
     images = read_images(photos, stored.names)
     cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
     scene = PicturedScene(gaussians, cameras, images, None, stored.names)

@@ -204,14 +204,14 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_transparent']:,} transparent,"
         f" {scene['num_opaque']:,} opaque, {scene['num_saturated']:,} of opacity 0 or 1",
-        f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.2g} % beyond ten times that box",
+        f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
         " compact --drop floaters leaves them out",
         f"sky        in {scene['num_sky_views']} photos; compact --drop sky leaves it out"
         if scene["num_sky_views"]
         else "",
         f"scales     median {size['scale_median']:.3g}, largest {size['scale_max']:.3g} in a scene of"
-        f" {size['diagonal']:.3g}; {100 * size['share_huge']:.2g} % above a tenth of it",
+        f" {size['diagonal']:.3g}; {100 * size['share_huge']:.3g} % above a tenth of it",
         f"cameras    {_describe_cameras(scene)}",
         f"images     {scene['images'] or 'none found'}",
         *_alignment_lines(scene),
@@ -222,7 +222,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
     if auto := scene["auto"]:
-        share = f"{100 * auto['share']:.2g} %, {auto['num_gaussians']:,} Gaussians"
+        share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
     notes = [note for note in scene["notes"] if not note.startswith(repeated)]

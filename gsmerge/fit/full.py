@@ -64,7 +64,7 @@ def fit_full(
         if options.time_budget is not None and step == PROBE:
             steps = affordable_steps(time.perf_counter() - started, run)
         if job.progress:
-            job.progress(step, steps, decibels(error), part < run.half_part)
+            job.progress(step, steps, decibels(error), run.half_part)
     if not judged:
         after = score_state(state, run, half)
     if options.judged and after <= before:

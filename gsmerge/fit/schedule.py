@@ -34,7 +34,7 @@ DRAW_MODES = (
     (0, 1.0, False), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
 )  # fmt: skip
 
-Progress = Callable[[int, int, float, bool], None]  # step, steps, PSNR of the photos, whether these are half-size
+Progress = Callable[[int, int, float, float], None]  # step, steps, PSNR of the photos, share of half-size steps
 
 
 @dataclass(frozen=True, eq=False)

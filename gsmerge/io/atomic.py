@@ -29,6 +29,7 @@ from gsmerge.types import StrPath
 
 # What the disk itself may answer in the middle of writing; any other OSError is the caller's own.
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
+_EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"
 _MAX_SUFFIX = 32  # bytes of an ending that a temporary name keeps: names end at 255
 _STALE_SECONDS = 7 * 86400  # age at which a file of another machine, whose processes nobody here sees, is stale
 _SYNCHRONIZE, _NO_PROCESS = 0x100000, 87  # a right and an error of Windows
@@ -81,14 +82,12 @@ def atomic_outputs(*, overwrite: bool = False) -> Iterator[AddOutput]:
 
     try:
         yield add
-        for path, _ in made.values():
-            _refuse(path, overwrite)  # somebody else may have been quicker
         for temporary in made:
             _flush(temporary)
         for folder in {folder.parent for folder in folders}:
             _flush_names(folder)
         deepest_first = sorted(made.items(), key=lambda item: (-len(item[1][0].parts), item[1][1].parent))
-        _rename_all([(temporary, target) for temporary, (_, target) in deepest_first])
+        _rename_all([(temporary, target) for temporary, (_, target) in deepest_first], overwrite=overwrite)
     except SceneError as error:
         if error.path not in made:
             raise
@@ -134,16 +133,41 @@ def _make_folder(folder: Path) -> Iterator[Path]:
             raise SceneError(path, f"cannot be made ({error.strerror})", "choose another folder") from error
 
 
-def _rename_all(files: Sequence[tuple[str, Path]]) -> None:
-    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last."""
+def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
+    """Rename each temporary file to its final name, folder by folder; an interrupt takes effect after the last.
+
+    Without ``overwrite``, if somebody else was quicker with one of the names, none is left of these files.
+    """
+    renamed = list[Path]()
     try:
         for folder, group in groupby(files, lambda file: file[1].parent):
             for temporary, target in group:
-                os.replace(temporary, target)
+                (os.replace if overwrite else _rename_to_new)(temporary, target)
+                renamed.append(target)
             _flush_names(folder)
     except KeyboardInterrupt:
-        _rename_all([(temporary, target) for temporary, target in files if os.path.lexists(temporary)])
+        left = [(temporary, target) for temporary, target in files if os.path.lexists(temporary)]
+        _rename_all(left, overwrite=overwrite)
         raise
+    except FileExistsError as error:
+        for path in renamed:
+            os.unlink(path)
+        raise SceneError(error.filename, *_EXISTS) from error
+
+
+def _rename_to_new(temporary: str, target: Path) -> None:
+    """Rename a file to a name that must not exist, whoever makes it meanwhile; FileExistsError if it does."""
+    try:
+        (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail where the name exists
+    except FileExistsError:
+        if not os.path.samefile(temporary, target):  # as after an interrupt
+            raise
+    except OSError:  # a file system without links
+        if os.path.lexists(target):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), temporary) from None
+        os.replace(temporary, target)
+    with suppress(FileNotFoundError):
+        os.unlink(temporary)
 
 
 def _flush_names(folder: Path) -> None:
@@ -243,4 +267,4 @@ def _refuse(path: Path, overwrite: bool) -> None:
     if not os.path.isdir(path.parent):
         raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
     if os.path.lexists(path) and not overwrite:
-        raise SceneError(path, "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)")
+        raise SceneError(path, *_EXISTS)

@@ -252,7 +252,7 @@ def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
     places = {path.parent for path in plys}
     start = places.pop() if len(places) == 1 else folder
     problem = f"expected one .ply file in the folder, found {len(plys)}"
-    names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4])
+    names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4]) + ", ..." * (len(plys) > 4)
     if not _are_numbered(plys):
         return SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
     counts = {header_counts(path)[0] for path in plys[:_MAX_HEADERS]}

@@ -14,7 +14,7 @@ from gsmerge.settings.setting import Settings, setting
 
 SIZES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}  # bytes
 AUTO = "auto"
-# Gaussians that a device draws fluidly; docs/guide/how-many.md says where the numbers come from
+COUNT = r"\d[\d_]*|\d{1,3}(?:,\d{3})+|\d*\.?\d+(?:k|m|e\d)"  # Gaussians: 40000, 40_000, 40,000, 40k, 4e4
 DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 
 
@@ -41,9 +41,12 @@ class BudgetOptions(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.in_bytes:
+        word = str(self.budget).strip().lower()
+        if word in (AUTO, *DEVICES):
+            object.__setattr__(self, "budget", word)
+        elif self.in_bytes:
             parse_bytes(str(self.budget))
-        elif self.budget not in (None, AUTO, *DEVICES):
+        elif self.budget is not None:
             parse_budget(self.budget, sys.maxsize)
         if self.quality is not None:
             parse_quality(self.quality)
@@ -102,7 +105,7 @@ def share_text(share: float) -> str:
 
 
 def parse_budget(budget: str | int | None, num_input: int) -> int:
-    """Parse a number of Gaussians, or a share of the input as "2%", rounded down; at most ``num_input``.
+    """Parse a number of Gaussians as "40000", "40k" or "1e5", or a share of the input as "2%"; at most ``num_input``.
 
     Raises:
         ValueError: If it is neither.
@@ -113,21 +116,24 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
         (40000, 25000)
     """
     text = str(budget).strip()
-    match = re.fullmatch(r"(\d[\d_]*|\d*\.?\d+\s*%)", text, re.ASCII)
+    match = re.fullmatch(rf"(?:{COUNT})|(\d*\.?\d+)\s*%", text, re.ASCII | re.IGNORECASE)
     if not match:
         number = re.fullmatch(r"\d*\.\d+", text, re.ASCII)
         percent = float(text) * (100 if float(text) < 1 else 1) if number else 0.0
+        perhaps = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else ""
+        perhaps = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else perhaps
         raise ValueError(
             f'budget: expected a number of Gaussians as "40000", a share as "2%", a size as "5MB", auto or'
-            f" {', '.join(DEVICES)}, got {text!r}" + (f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else "")
+            f" {', '.join(DEVICES)}, got {text!r}{perhaps}"
         )
-    if text.endswith("%"):
-        share = Fraction(text[:-1].strip())
+    if match[1]:
+        share = Fraction(match[1])
         if share > 100:
             raise ValueError(f"budget: expected at most 100%, got {text!r}")
         count = int(share * num_input / 100)
     else:
-        count = min(int(text), num_input)
+        plain = re.sub("[,_]", "", text.lower()).replace("k", "e3").replace("m", "e6")
+        count = min(int(Fraction(plain)), num_input)
     if count < 1:
         raise UsageError(f"budget: expected at least one Gaussian, got {text!r}")
     return count

@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
-from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting, settings_of
+from gsmerge.settings.setting import MOST_THREADS, Settings, change_settings, flat_settings, setting, settings_of
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -77,7 +77,7 @@ class CompactOptions(Settings):
     seed: int = setting(0, "Seed of all random numbers.",
         "Runs with one seed are bit-identical.", least=0)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
-        shown="all processors")  # fmt: skip
+        most=MOST_THREADS, shown="all processors")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()

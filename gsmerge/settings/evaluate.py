@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmerge.settings.setting import Settings, setting
+from gsmerge.settings.setting import MOST_THREADS, Settings, setting
 
 NETS = ("vgg", "alex")
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory
@@ -25,7 +25,9 @@ class EvaluateOptions(Settings):
         "They are evenly spread.", least=1)  # fmt: skip
     context: bool = setting(True, "Also measure the input views.")
     own: bool = setting(True, "Also measure the input itself.")
-    threads: int | None = setting(None, "Threads; the figures do not depend on their number.", least=1)
+    threads: int | None = setting(
+        None, "Threads; the figures do not depend on their number.", least=1, most=MOST_THREADS
+    )
     photo_side: int = setting(0, "Resize larger photos and their cameras to so many pixels on the longer side; the "
         "paper measures at 476.",
         "0: they stay as they are.", least=0, unit="pixels", shown="as they are")  # fmt: skip

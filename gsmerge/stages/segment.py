@@ -139,7 +139,8 @@ def count_limits(
         exact = min(max(1, exact - num_reserved), count)
     max_count = min(max_allowed(budget, count, scene.sh_degree), count if exact is None else exact)
     if max_count < min(views, count):
-        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}")
+        perhaps = f'; {max_count} % is "{max_count}%"' if max_count <= 100 else ""
+        raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{perhaps}")
     return CountLimits(
         per_view=superpixels_per_view(scene, segment) if views else 0,
         default=default_count(scene, segment, decode),

@@ -317,10 +317,10 @@ def test_two_that_end_together_lose_no_batch(
         both_read.wait(PATIENCE)
         return extended(*arguments, **named)
 
-    def rename_together(pairs: Any) -> None:
+    def rename_together(pairs: Any, **named: Any) -> None:
         with suppress(threading.BrokenBarrierError):
             both_rename.wait(1)
-        renamed(pairs)
+        renamed(pairs, **named)
 
     monkeypatch.setattr(files, "extend_state", extend_together)
     monkeypatch.setattr(atomic, "_rename_all", rename_together)

@@ -26,6 +26,10 @@ from gsmerge.settings.budget import parse_budget, parse_bytes
         ("0.00019%", 1),
         ("100%", 1_000_000),
         ("3000000", 1_000_000),
+        ("40k", 40_000),
+        ("0.5M", 500_000),
+        ("40,000", 40_000),
+        ("4e4", 40_000),
     ],
 )
 def test_budget(text: str | int, count: int) -> None:
@@ -35,7 +39,7 @@ def test_budget(text: str | int, count: int) -> None:
 @pytest.mark.parametrize(
     ("texts", "expected"),
     [
-        (["", "many", "-5", "2.5", "5%%", "1e4", "%", "4٤", "nan", "inf%"], '"40000"'),
+        (["", "many", "-5", "2.5", "5%%", "4,4%", "40,00", "1e10", "2.5e", "%", "4٤", "nan", "inf%"], '"40000"'),
         (["0", "0%", "0.01%"], "one Gaussian"),
         (["101%"], "100%"),
     ],

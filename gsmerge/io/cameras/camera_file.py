@@ -389,5 +389,5 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
     """Describe the mean and the largest of camera moves in words."""
     turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
-    mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.2g} % of the depth" for f in (np.mean, max))
+    mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.3g} % of the depth" for f in (np.mean, max))
     return f"{mean} on average, {most} at most"

@@ -404,7 +404,7 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
     outside = (np.abs(opacities - 0.5) > 0.5 + _RAW_ROUNDING) & finite
     if outside.sum() > _MAX_OUTSIDE * finite.sum():
         share = 100 * outside.sum() / finite.sum()
-        problem = f"expected opacities in [0, 1], as hinted, found {share:.2g} % outside, as logits are"
+        problem = f"expected opacities in [0, 1], as hinted, found {share:.3g} % outside, as logits are"
         raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 

@@ -12,6 +12,7 @@ from gsmerge import Gaussians, Scene
 from gsmerge.fit import FitJob, FitOptions, report_steps, start_share, steps
 from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full, limit_moves
+from gsmerge.fit.report import HALF_COST
 from gsmerge.fit.schedule import (
     DROPOUT,
     MAX_STEPS,
@@ -292,7 +293,7 @@ def test_rates_decay() -> None:
 
 
 def test_progress_counts_the_steps(truth: Gaussians, photos: Pair) -> None:
-    calls: list[tuple[int, int, float, bool]] = []
+    calls: list[tuple[int, int, float, float]] = []
     fit_full(scenes.spoil(truth), scenes.run_for(photos, QUICK, progress=lambda *call: calls.append(call)))
     assert [call[:2] for call in calls] == [(step, 30) for step in range(1, 31)]
     assert calls[-1][2] > calls[0][2]  # of the photos
@@ -307,14 +308,19 @@ def test_photos_of_full_size_have_a_mean_and_a_name_of_their_own(
     calls: list[tuple[int, int, float, bool]] = []
     options = FitOptions(fit_steps=30, half_res_share=0.5, judged=False)
     fit_full(scenes.spoil(truth), scenes.run_for(photos, options, progress=lambda *call: calls.append(call)))
-    assert [call[3] for call in calls] == [True] * 15 + [False] * 15  # half-size photos first
+    assert {call[3] for call in calls} == {0.5}
     assert {round(call[2]) for call in calls[:15]} == {20}
     assert {round(call[2]) for call in calls[15:]} == {10}
-    said: list[str] = []
-    with record_run(lambda stage, done, total: said.append(stage)):
-        report_steps(1, 2, 20.0, True)
-        report_steps(2, 2, 10.0, False)
-    assert said[:2] == ["fit: half-size photos 20.0 dB", "fit: photos 10.0 dB"]
+    said: list[tuple[str, int, int]] = []
+    with record_run(lambda *stage: said.append(stage)):
+        report_steps(10, 20, 20.0, 0.5)
+        report_steps(15, 20, 10.0, 0.5)
+        report_steps(20, 20, 10.0, 0.5)
+    # half-size steps are quicker, so that the time left is about right
+    assert said[0] == ("fit: half-size photos 20.0 dB", round(20 * HALF_COST / (1 + HALF_COST)), 20)
+    assert said[1][0] == "fit: photos 10.0 dB"
+    assert said[0][1] < said[1][1] < 20
+    assert said[2][1:] == (20, 20)
 
 
 # the same again

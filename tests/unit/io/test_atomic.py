@@ -10,6 +10,7 @@ import sys
 from contextlib import nullcontext
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from messages import NO_FOLDER, refuses
@@ -226,6 +227,35 @@ def test_an_interrupt_between_renames_waits_for_the_last(
     assert contents(tmp_path) == ["new"] * 3
 
 
+@pytest.mark.parametrize("linked", [True, False], ids=["links", "no links"])
+def test_a_name_that_appears_meanwhile_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, linked: bool
+) -> None:
+    """Whoever renames first keeps the name, and nothing of the other is left."""
+    if not linked:
+        monkeypatch.setattr(os, "link", Mock(side_effect=OSError(errno.EPERM, "Operation not permitted")))
+    with refuses(SceneError, "b.txt", "exists already"), atomic_outputs() as add:
+        for name in ("a.txt", "b.txt"):
+            add(tmp_path / name).write_text("new")
+        (tmp_path / "b.txt").write_text("another's")
+    assert contents(tmp_path) == [None, "another's", None]
+
+
+def test_an_interrupt_of_new_names_waits_for_the_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink, interrupts = os.unlink, iter([KeyboardInterrupt()])
+
+    def interrupt_once(path: Any, **named: Any) -> None:
+        if (error := next(interrupts, None)) is not None:
+            raise error
+        unlink(path, **named)
+
+    monkeypatch.setattr(os, "unlink", interrupt_once)
+    with pytest.raises(KeyboardInterrupt), atomic_outputs() as add:
+        for name in ("a.txt", "b.txt", "c.txt"):
+            add(tmp_path / name).write_text("new")
+    assert contents(tmp_path) == ["new"] * 3
+
+
 def test_a_writer_inside_writes_the_same_file(tmp_path: Path) -> None:
     with atomic_output(tmp_path / "a.txt") as outer, atomic_output(outer, overwrite=True) as inner:
         assert inner == outer
@@ -257,13 +287,13 @@ def test_data_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(os, "fsync", note_flush)
     monkeypatch.setattr(os, "replace", note_rename)
-    with atomic_outputs() as add:
+    with atomic_outputs(overwrite=True) as add:
         for name in ("a.txt", "b.txt"):
             add(tmp_path / name).write_text("new")
     folder = [] if sys.platform == "win32" else ["folder"]  # whose names it cannot wait for
     assert events == ["file", "file", "rename", "rename", *folder]
     events.clear()
-    with atomic_outputs() as add:
+    with atomic_outputs(overwrite=True) as add:
         add(tmp_path / "index").write_text("new")
         add(tmp_path / "new" / "chunk").write_text("new")
     assert events == ["file", "file", *folder, "rename", *folder, "rename", *folder]  # the chunk before its index
