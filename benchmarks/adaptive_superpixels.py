@@ -1,6 +1,6 @@
 """What the splits and merges of bass-adaptive are worth: photos in the mean colours of their superpixels.
 
-    python benchmarks/adaptive_superpixels.py FOLDER [FOLDER ...] [--share 0.044] [--photos 2] [--side 480]
+    python benchmarks/adaptive_superpixels.py [FOLDER ...] [--share 0.044] [--photos 2] [--side 480]
 
 ``ratio`` is how many superpixels bass-adaptive ends with over those it starts with: mean, least and most. All methods
 are then compared at the number that it ends with in each photo (``at its own number``), and at the number that it
@@ -23,6 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers")]
 
 from segmentation_scores import proxy_psnr, splat_psnr  # noqa: E402
+from shared_scenes import scene_folders  # noqa: E402
 
 from gsmerge.stages.superpixels import superpixels  # noqa: E402
 
@@ -59,13 +60,14 @@ def measure(photo: np.ndarray, start: int, adapt: float | None) -> tuple[int, li
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="+", help="folders of photos")
+    parser.add_argument("folders", type=Path, nargs="*", help="folders of photos; none: the captures'")
     parser.add_argument("--share", type=float, action="append", help="superpixels per pixel; repeatable")
     parser.add_argument("--photos", type=int, default=2, help="of each folder")
     parser.add_argument("--side", type=int, default=480, help="longer side that photos are reduced to, pixels")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    photos = [photo for folder in options.folders for photo in read_photos(folder, options.photos, options.side)]
+    folders = options.folders or [scene / "images" for split in ("train", "eval") for scene in scene_folders(split)]
+    photos = [photo for folder in folders for photo in read_photos(folder, options.photos, options.side)]
     for method in METHODS:
         superpixels(photos[0], 100, method)  # compiles
     print(f"{len(photos)} photos")

@@ -96,10 +96,11 @@ def main() -> None:
     parser.add_argument("scenes", nargs="?", default="lund_door,flower,sceaux,desk")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    folders = scene_folders(args.scenes)
     print("| scene | files joined | degrees off | centre off | input | joined | true poses |")
     print("|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as cache:
-        for folder in scene_folders(args.scenes):
+        for folder in folders:
             print(measure(folder, Path(cache), args.threads), flush=True)
 
 

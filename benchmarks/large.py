@@ -94,6 +94,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-large", help="scenes")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
+    scene_folders(args.scene)  # which says at once that it is not there
     print(f"gsmerge {gsmerge.__version__}")
     print("| " + " | ".join(COLUMNS) + " |")
     print("|" + "---|" * len(COLUMNS))

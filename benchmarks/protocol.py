@@ -203,7 +203,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except gsmerge.GsmergeError as error:
-        raise SystemExit(str(error)) from error
+    import one_line_errors  # noqa: F401
+
+    main()

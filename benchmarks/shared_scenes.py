@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 from capture_exports import FLIP, read_scene
 from capture_exports import export as write_export
+from one_line_errors import CAPTURES
 
 from gsmerge.types import Cameras
 
@@ -27,16 +29,20 @@ def shared_folder() -> Path | None:
 
 
 def scene_folders(split: str) -> list[Path]:
-    """``train`` or ``eval``: the scenes of that split; otherwise a comma-separated list of names."""
+    """``train`` or ``eval``: the scenes of that split; otherwise those of names with commas between that are there."""
     root = shared_folder()
     if root is None:
-        raise SystemExit(
-            "expected captures below GSMERGE_DATA, found none: docs/internals/captures.md says how to make them"
-        )
+        raise SystemExit(f"expected captures below GSMERGE_DATA, found none; {CAPTURES}")
     known = {p.name: p for p in sorted(root.glob("scenes/*/*")) if p.is_dir()}
     if split in ("train", "eval"):
         return [p for p in known.values() if p.parent.name == split]
-    return [known[name] for name in split.split(",")]
+    names = split.split(",")
+    missing = [name for name in names if name not in known]
+    if missing:
+        print(f"left out, as not below {root}: {', '.join(missing)}; {CAPTURES}", file=sys.stderr)
+    if len(missing) == len(names):
+        raise SystemExit(1)
+    return [known[name] for name in names if name in known]
 
 
 def export(scene: Path, cache: Path, style: str = "plain") -> Path:

@@ -20,7 +20,7 @@ from gsmerge.cli import main as gsmerge
 
 CAPTURES = "beercan,flower,lund_door,redkitchen,sceaux,stitch,xuzhy,mamechun"
 CHOSEN_ON = "desk,carton"
-MADE = ("--scenes", "16", "--views", "3-12", "--set", "seed=11")
+MADE = ("--scenes", "16", "--views", "8", "--set", "seed=11")
 
 
 def draw_validation(run: Path) -> None:
@@ -43,11 +43,10 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the run")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
+    data, chosen_on = ([export(scene, args.cache) for scene in scene_folders(names)] for names in (CAPTURES, CHOSEN_ON))
     made = args.cache / "made"
     if not made.exists() and (code := gsmerge(["lab", "generate", "-o", str(made), *MADE])):
         raise SystemExit(code)
-    data = [export(folder, args.cache) for folder in scene_folders(CAPTURES)]
-    chosen_on = [export(folder, args.cache) for folder in scene_folders(CHOSEN_ON)]
     words = ["lab", "train", "--preset", args.preset, "-o", str(args.output), "--data", str(made)]
     words += [word for folder in data for word in ("--data", str(folder))]
     words += [word for folder in chosen_on for word in ("--validation", str(folder))]

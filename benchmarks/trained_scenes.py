@@ -112,4 +112,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    import one_line_errors  # noqa: F401
+
     main()

@@ -146,6 +146,38 @@ def test_benchmarks_in_pages_are_there(page: str) -> None:
         assert [option for option in re.findall(r"--[a-z-]+", words) if f'"{option}"' not in source] == [], name
 
 
+def benchmark_calls() -> list[str]:
+    """Every call of a benchmark inside the text of a page."""
+    texts = [re.sub(r"```.*?```", "", read(page), flags=re.DOTALL).replace("\n", " ") for page in WRITTEN]
+    calls = {call for text in texts for call in re.findall(r"`python (benchmarks/[^`]+)`", text)}
+    return sorted(calls - {TRAINING})
+
+
+TRAINING = "benchmarks/training.py made"  # the only one that needs no captures
+
+
+@pytest.mark.slow
+def test_the_benchmark_of_training_runs(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="torch is not installed")
+    few = ["--scenes", "2", "--steps", "2", "--size", "48x32"]
+    call = [sys.executable, *(str(ROOT / word) if "/" in word else word for word in TRAINING.split()), *few]
+    done = subprocess.run(call, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stdout.splitlines()[-1].split()[0]) == (0, "streamed"), done.stderr
+
+
+@pytest.mark.parametrize("call", benchmark_calls())
+def test_benchmarks_say_which_captures_they_need(call: str, tmp_path: Path) -> None:
+    path = {"PYTHONPATH": str(ROOT), "GSMERGE_DATA": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / shlex.split(call)[0]), *shlex.split(call)[1:]],
+        capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, **path},
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    (*_, line) = done.stderr.splitlines()
+    assert "docs/internals/captures.md" in line
+    assert "Traceback" not in done.stderr
+
+
 # What users of such tools ask: words of the question, and of its answer
 QUESTIONS = {
     "smaller files": "--budget", "look at a result": "gsmerge view", "look bad": "exposure",
