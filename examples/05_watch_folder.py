@@ -1,0 +1,51 @@
+"""Compact every scene that a model writes into a folder, as soon as it is whole; Ctrl-C ends it.
+
+python examples/05_watch_folder.py exports/ small/ --still 5
+
+A scene is a folder, or a .ply, in the watched folder. It is taken when none of its files has changed for some seconds.
+``gsmerge batch`` compacts it, which skips what is done already, also after a restart, and goes on after a bad scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+
+def last_change(scene: Path) -> float:
+    """Return the time of the last change of a scene's files; infinity before it has a .ply."""
+    files = [path for path in (scene.rglob("*") if scene.is_dir() else [scene]) if path.is_file()]
+    if not any(path.suffix == ".ply" for path in files):
+        return float("inf")
+    return max(path.stat().st_mtime for path in files)
+
+
+def main() -> None:
+    """Parse the command line, and look for new scenes again and again."""
+    parser = argparse.ArgumentParser(description="Compact scenes as they come.")
+    parser.add_argument("folder", type=Path, help="where the model writes")
+    parser.add_argument("output", type=Path, help="folder of the results")
+    parser.add_argument("--still", type=float, default=5, help="seconds without a change until a scene is whole")
+    parser.add_argument("--once", action="store_true", help="end when all that is whole is done")
+    args = parser.parse_args()
+    done: dict[Path, float] = {}  # when each was last changed
+    while True:
+        changes = {scene: last_change(scene) for scene in sorted(args.folder.iterdir())}
+        whole = {scene: t for scene, t in changes.items() if t + args.still < time.time() and done.get(scene) != t}
+        if whole:
+            call = [sys.executable, "-m", "gsmerge", "batch", *map(str, whole), "-o", str(args.output)]
+            subprocess.run(call, check=False)
+            done.update(whole)
+        elif args.once:
+            break
+        time.sleep(1)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except KeyboardInterrupt:
+        pass
