@@ -88,7 +88,8 @@ def look(args: opt.Args) -> None:
     before, *after = shown
     cameras = {} if len(shown) == 1 else args.given(("cameras", "images", "hint"))
     loaded = replace(loads[0], notes=()) if after else None  # which were said
-    opt.call(view, before=before, after=after, **cameras, open=args.open and not args.json, quiet=args.silent, loaded=loaded)
+    wanted = args.open and not args.json
+    opt.call(view, before=before, after=after, **cameras, open=wanted, quiet=args.silent, loaded=loaded)
 
 
 def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) -> None:

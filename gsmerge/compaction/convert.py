@@ -161,7 +161,8 @@ def _clean(
         return clean(gaussians, options.clean, None, lambda g: g)
     photos = named_path(options.images)
     if stored is None or photos is None:
-        raise UsageError("--drop sky: expected photos and their cameras, which say where the sky is; give --set images=FOLDER")
+        problem = "expected photos and their cameras, which say where the sky is"
+        raise UsageError(f"--drop sky: {problem}; give --set images=FOLDER")
     images = read_images(photos, stored.names)
     cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
     scene = PicturedScene(gaussians, cameras, images, None, stored.names)

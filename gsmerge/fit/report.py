@@ -68,6 +68,4 @@ def report_steps(step: int, steps: int, photos: float, half_part: float) -> None
     """
     half = half_part * steps
     done, total = (count - (1 - HALF_COST) * min(count, half) for count in (step, steps))
-    report_progress(
-        f"fit: {'half-size ' * (step <= half)}photos {photos:.1f} dB", round(done / total * steps), steps
-    )
+    report_progress(f"fit: {'half-size ' * (step <= half)}photos {photos:.1f} dB", round(done / total * steps), steps)

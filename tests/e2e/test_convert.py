@@ -211,7 +211,7 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     assert sum(document["left_out"].values()) == 400 - len(read(tmp_path / "c.ply"))
     with refuses(SceneError, "in.ply", "400", "inspect"):
         convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(crop="sphere:99,99,99,0.1")))
-    with refuses(UsageError, "--drop sky", "images="):
+    with refuses(UsageError, "--drop sky", "images"):
         convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(drop="sky")))
     assert not (tmp_path / "d.ply").exists()
 

@@ -41,7 +41,7 @@ def test_a_video_shows_the_frames_of_its_path(
     call = ("render", small_scene, "--path", kind, "--frames", 8)
     outcome = run(*call, "-o", tmp_path / name, code=0)
     seconds = "0.6 s" if name.endswith(".gif") else "0.3 s"
-    assert says(outcome.err.splitlines()[-1], tmp_path / name, "8 frames", f"{WIDTH} x {HEIGHT}", seconds)
+    assert says(outcome.out.splitlines()[-1], tmp_path / name, "8 frames", f"{WIDTH} x {HEIGHT}", seconds)
     run(*call, "-o", tmp_path / "frames", code=0)
     assert list(listing(tmp_path / "frames")) == [f"frame_{i:05d}.png" for i in range(8)]
     drawn = [cv2.imread(str(path)) for path in sorted((tmp_path / "frames").iterdir())]

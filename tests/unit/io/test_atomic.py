@@ -191,8 +191,8 @@ def fail_at(monkeypatch: pytest.MonkeyPatch, call: int, error: BaseException) ->
     monkeypatch.setattr(os, "replace", rename)
 
 
-def write_three(folder: Path) -> None:
-    with atomic_outputs(overwrite=True) as add:
+def write_three(folder: Path, *, overwrite: bool = True) -> None:
+    with atomic_outputs(overwrite=overwrite) as add:
         for name in ("a.txt", "b.txt", "c.txt"):
             add(folder / name).write_text("new")
 
@@ -250,9 +250,8 @@ def test_an_interrupt_of_new_names_waits_for_the_last(tmp_path: Path, monkeypatc
         unlink(path, **named)
 
     monkeypatch.setattr(os, "unlink", interrupt_once)
-    with pytest.raises(KeyboardInterrupt), atomic_outputs() as add:
-        for name in ("a.txt", "b.txt", "c.txt"):
-            add(tmp_path / name).write_text("new")
+    with pytest.raises(KeyboardInterrupt):
+        write_three(tmp_path, overwrite=False)
     assert contents(tmp_path) == ["new"] * 3
 
 
