@@ -74,13 +74,14 @@ def text_table(
     """Write rows as lines for a terminal, with the first column left-aligned and others right-aligned.
 
     ``columns``: width of the terminal; None: any. What does not fit is left out: the columns ``least``, by number and
-    in this order, then others from the last on, but for the first two. A first column that is too wide still is cut in
-    its middle.
+    in this order, then letters from the middle of the first column, then other columns from the last on, but for the
+    first two.
     """
     widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (columns or MAX_WIDTH) - len(indent)
     shown = list(range(len(widths)))
     for place in (*least, *reversed(shown[2:])):
-        if place in shown and sum(widths[i] + 2 for i in shown) - 2 > room:
+        name = widths[0] if place in least else min(widths[0], MIN_NAME)
+        if place in shown and name + sum(widths[i] + 2 for i in shown[1:]) > room:
             shown.remove(place)
     widths[0] = min(widths[0], max(MIN_NAME, room - sum(widths[i] + 2 for i in shown[1:])))
     cells = [[_cut(row[0], widths[0]).ljust(widths[0]), *(row[i].rjust(widths[i]) for i in shown[1:])] for row in rows]

@@ -56,9 +56,14 @@ def say(message: str, *, quiet: bool = False) -> None:
 
 
 def say_notes(notes: Sequence[str], *, quiet: bool = False) -> None:
-    """Print a line on stderr for each note about the input or the run, unless ``quiet``."""
+    """Print a line on stderr for each note about the input or the run, unless ``quiet``; a warning of a bad result."""
+    from gsmerge.raster.metrics import WORSE
+
     for note in notes:
-        say(f"note: {note}", quiet=quiet)
+        if WORSE in note:
+            say_warning(note, quiet=quiet)
+        else:
+            say(f"note: {note}", quiet=quiet)
 
 
 def say_warning(text: str, *, quiet: bool = False) -> None:

@@ -425,8 +425,8 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
 
 
 def encode_indexed(indices: np.ndarray, colors: np.ndarray) -> bytes:
-    """Encode ``indices [h,w]`` into ``colors [n,3]`` uint8 sRGB as a lossless WebP; index 0 is transparent."""
-    palette = np.pad(colors, ((0, 0), (0, 1)), constant_values=255)
+    """Encode ``indices [h,w]`` into ``colors [n,3 or 4]`` uint8 sRGB as a lossless WebP; index 0 is transparent."""
+    palette = np.pad(colors, ((0, 0), (0, 4 - colors.shape[1])), constant_values=255)
     palette[0, 3] = 0
     content = io.BytesIO()
     Image.fromarray(palette[indices]).save(content, "WEBP", lossless=True, quality=0, method=_EFFORT)

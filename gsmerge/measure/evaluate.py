@@ -75,7 +75,7 @@ class ResultScores:
     name: str  # as given
     num_gaussians: int  # their number
     ratio: float  # of the input's
-    render_seconds: float  # mean wall time of one view, all threads
+    render_seconds: float  # median wall time of one view, all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty of the input or if not asked for
 
@@ -346,9 +346,9 @@ def _score_split(
 def _join(
     name: str, parts: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
 ) -> tuple[float, tuple[ViewScore, ...]]:
-    """Return the mean seconds of a result's views, and their scores, of all splits."""
+    """Return the median seconds of a result's views, and their scores, of all splits."""
     rows = [row for part in parts for row in part[name]]
-    return sum(seconds for seconds, _ in rows) / max(len(rows), 1), tuple(score for _, score in rows)
+    return float(np.median([seconds for seconds, _ in rows])), tuple(score for _, score in rows)
 
 
 def _covered(image: np.ndarray, photo: np.ndarray, mask: NDArray[np.bool_]) -> tuple[float, Quality | None]:

@@ -17,6 +17,7 @@ from gsmerge.runtime.memory import human_bytes
 Row = Sequence[str]
 Table = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
+KINDS = {"context": "input", "target": "held-out"}  # views, for people
 ZOOMED = ("psnr", "ssim")  # what is measured at other sizes
 COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
@@ -145,25 +146,25 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     how += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
     how += f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else ""
     seen = f"against {document['reference']}, over the pixels that the input views have seen{how}"
-    means = [(result["name"], split, mean) for result in results for split, mean in result["mean"].items()]
-    yield (
-        f"Quality {seen}",
-        ("", "views", *COLUMNS.values()),
-        [(name, f"{split} ({document['num_views'][split]})", *_cells(mean)) for name, split, mean in means],
-    )
-    lacks = (means[0][2]["share" + COVERED] or 1) < WHOLE  # of the input's own views, where they are measured
-    yield "Over the pixels that the input covers", ("", "views", "of all", *(COLUMNS[name] for name in ZOOMED)), [
-        (name, split, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
-        for name, split, mean in means if lacks
-    ]  # fmt: skip
+    first = next(iter(results[0]["mean"].values()))
+    lacks = (first["share" + COVERED] or 1) < WHOLE  # of the input's own views, where they are measured
+    sizes = [entry["zoom"] for entry in first.get("zooms", ())]
+    heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
+    for split, count in document["num_views"].items():
+        means = [(result["name"], result["mean"][split]) for result in results]
+        views = f"of {count} {KINDS[split]} view{'s' * (count > 1)}"
+        yield f"Quality {views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
+        heading = f"Quality {views}, over the pixels that the input covers"
+        yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [
+            (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
+            for name, mean in means if lacks
+        ]  # fmt: skip
+        yield f"Quality {views} at other sizes, photos resized", ("", *heads), [
+            (name, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
+            for name, mean in means if sizes
+        ]  # fmt: skip
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
     yield "Seen from outside, against the input", ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
-    sizes = [entry["zoom"] for entry in means[0][2].get("zooms", ())]
-    heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
-    yield "At other sizes, photos resized", ("", "views", *heads), [
-        (name, split, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
-        for name, split, mean in means if sizes
-    ]  # fmt: skip
     yield (
         "Render time",
         ("", "threads", "pixels", "ms/frame", "faster by", "earned back after"),

@@ -105,10 +105,12 @@ class ViewData:
     def start(self) -> int:
         """Index of the view on which the page opens: the view of median score, or the first without scores.
 
-        It is a held-out view if there are any, as for the figures at the top.
+        It is a held-out view if there are any, as for the figures at the top, and one with all measures.
         """
-        held_out = [i for i, view in enumerate(self.views) if view.held_out]
-        counted = held_out or range(len(self.views))
+        every = list(enumerate(self.views))
+        held_out = [(i, view) for i, view in every if view.held_out] or every
+        measured = [i for i, view in held_out if view.scores[-1].lpips_alex is not None]
+        counted = measured or [i for i, _ in held_out]
         return counted[(len(counted) - 1) // 2] if self.scored else counted[0]
 
     @property

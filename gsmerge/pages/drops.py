@@ -17,6 +17,7 @@ from gsmerge.types import Cameras, Gaussians
 COLORS = {"floaters": (255, 45, 150), "sky": (20, 170, 255)}  # sRGB
 MOST = 300_000  # Gaussians: finding the floaters among more takes seconds
 VISIBLE = 0.15  # share of a pixel's light
+STEPS, MOST_ALPHA = 8, 190  # of such shares, each of which has an opacity; that of the whole light
 
 
 def find_drops(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -33,10 +34,12 @@ def find_drops(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray | None
 
 
 def draw_drops(gaussians: Gaussians, masks: Mapping[str, np.ndarray], camera: Cameras, near: float) -> bytes | None:
-    """Draw what the ``masks`` take, as a transparent WebP with a colour for each word; None if the view shows none."""
+    """Draw what the ``masks`` take, a colour for each word as opaque as its share, as a WebP; None if none is seen."""
     words = list(COLORS)
     flags = np.stack([masks.get(word, np.zeros(len(gaussians), bool)) for word in (*words, "")], 1)
     marked = replace(gaussians, sh0=rgb_to_sh0(flags.astype(np.float32))[:, None], shN=gaussians.shN[:, :0])
     shares = render(marked, camera, near=near).images[0][..., : len(words)]
-    ids = np.where(shares.max(2) >= VISIBLE, 1 + shares.argmax(2), 0).astype(np.uint8)
-    return encode_indexed(ids, np.array([(0, 0, 0), *COLORS.values()], np.uint8)) if ids.any() else None
+    steps = np.ceil(STEPS * shares.max(2).clip(0, 1)).astype(np.uint8)
+    ids = np.where(shares.max(2) >= VISIBLE, STEPS * shares.argmax(2) + steps, 0)
+    tints = [(*color, MOST_ALPHA * step // STEPS) for color in COLORS.values() for step in range(1, STEPS + 1)]
+    return encode_indexed(ids, np.array([(0, 0, 0, 0), *tints], np.uint8)) if ids.any() else None

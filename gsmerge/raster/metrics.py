@@ -11,6 +11,7 @@ from gsmerge.types import Array, as_array
 WINDOW, SIGMA = 11, 1.5  # pixels per side of ssim's windows, and their standard deviation in pixels
 C1, C2 = 0.01**2, 0.03**2  # ssim's stabilisers (K1 = .01, K2 = .03) for a data range of 1
 MAX_LOSS = 0.5  # dB that a result may show its own photos worse than its input without a word about it
+WORSE = "worse than the input does"  # by which commands tell warnings from notes
 POOR = 30.0  # dB from its input below which the views of a result look different, where there are no photos
 
 
@@ -58,7 +59,7 @@ def describe_loss(name: str, before: float | None, after: float | None, pictures
     if before is None or after is None or not before - after > MAX_LOSS:  # the difference of infinities is NaN
         return None
     loss = f"{after:.2f} dB, {before:.2f} dB before"
-    return f"{name} shows {pictures} worse than the input does: {loss}"
+    return f"{name} shows {pictures} {WORSE}: {loss}"
 
 
 def describe_distance(psnr: float | None) -> str | None:

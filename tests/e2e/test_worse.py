@@ -149,11 +149,11 @@ def test_pages_and_documents_of_comparisons_name_worse_results(smallest_scene: P
     said = run(
         "evaluate", smallest_scene, small, "--lpips", "none", *(part for page in pages for part in ("-o", page)), code=0
     )
-    assert "note: few.ply " in said.err
+    assert "warning: few.ply " in said.err
     (note,) = [note for note in json.loads(pages[1].read_text())["notes"] if SAID in note]
     for page in (pages[0], pages[2]):
         assert note.split("'")[1].removeprefix("s ") in page.read_text()
     page = tmp_path / "view.html"
     said = run("view", smallest_scene, small, "-o", page, "--no-open", code=0)
-    assert "note: few.ply " in said.err
+    assert "warning: few.ply " in said.err
     assert "photos worse than" in page.read_text()

@@ -34,6 +34,10 @@ def test_tables_leave_out_columns_that_a_terminal_has_no_room_for() -> None:
         "room/small.ply     52,038  28.36",
     ]
     assert text_table(rows, columns=42) == [
+        "result         Gaussians         of     dB",
+        "room/...l.ply     52,038  1,182,720  28.36",
+    ]
+    assert text_table(rows, columns=40) == [
         "result          Gaussians         of",
         "room/small.ply     52,038  1,182,720",
     ]

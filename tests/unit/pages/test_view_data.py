@@ -112,6 +112,11 @@ def test_a_page_opens_on_the_middle_view(actual: ViewData) -> None:
     assert actual.start == next(place for place, view in enumerate(actual.views) if view.held_out)
     best = max((view for view in actual.views if view.held_out), key=lambda view: view.scores[1].psnr or 0)
     assert replace(actual, views=(*inputs.views, best)).start == 3
+    some = [
+        replace(view, scores=tuple(replace(score, lpips_alex=lpips) for score in view.scores))
+        for view, lpips in zip(inputs.views, (0.1, None, None), strict=True)
+    ]
+    assert replace(inputs, views=tuple(some)).start == 0  # the one with every figure
 
 
 def test_one_scene_alone(small: Scene) -> None:
@@ -214,7 +219,10 @@ def test_what_would_be_dropped_is_drawn(small: Scene) -> None:
     mask = draw_drops(entered, {"sky": np.arange(len(half)) < len(half) / 2}, camera[[0]], near)
     picture = cv2.imdecode(np.frombuffer(mask or b"", np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (small.cameras.height, small.cameras.width, 4)
-    assert set(map(tuple, picture[picture[..., 3] > 0])) == {(255, 170, 20, 255)}
+    alphas = picture[..., 3]
+    assert set(map(tuple, picture[alphas > 0][:, :3])) == {(255, 170, 20)}
+    assert alphas.max() < 200  # what is behind the whole of it is seen
+    assert 0 < alphas[alphas > 0].min() < alphas.max() / 2  # and more where it is a part of the light
     assert draw_drops(entered, {"floaters": np.zeros(len(half), bool)}, camera[[0]], near) is None
 
 
