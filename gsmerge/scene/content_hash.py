@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES, CameraFile, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
-from gsmerge.io.cameras.pose_lines import INTRINSICS
+from gsmerge.io.cameras.layouts import INTRINSICS
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
 from gsmerge.scene.views import images_beside
 
@@ -44,8 +44,8 @@ def read_files(files: SceneFiles) -> list[Path]:
     paths = [path for path in (*files.plys, files.cameras, files.images, files.masks) if path is not None]
     if files.cameras is not None:
         root = files.cameras if files.cameras.is_dir() else files.cameras.parent
-        folders = (root, files.ply.parent)
-        paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).is_file()]
+        folders = (root, files.cameras.parent, files.ply.parent)
+        paths += [place / name for place in folders for name in EXTRA_FILES if (place / name).exists()]
         paths += photos_of(files.cameras) or ([] if files.images else images_beside(files.ply))
     return list(dict.fromkeys(paths))
 

@@ -15,6 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.cameras.layouts import check_layout, find_unread
 from gsmerge.io.cameras.read import (
     CHUNK,
     find_cameras,
@@ -134,8 +135,9 @@ def find_scene_files(
     The search goes through the given folder, that of the ``.ply``, the folder above it for ``gs_ply/``, ``ply/`` and
     ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of ``PLY_PLACES``,
     ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has cameras, the only
-    file of any name that holds cameras is taken. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over
-    a folder, because the model saw those. A result of gsmerge is taken if a folder has nothing else.
+    file of any name that holds cameras is taken, or one of a program whose cameras are not read, to say so. Images
+    inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw those. A result of
+    gsmerge is taken if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
@@ -167,7 +169,7 @@ def find_scene_files(
         above = [folder.parent.parent]
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
     if cameras is None:
-        places = (find(root) for find in (find_cameras, find_other_cameras) for root in roots)
+        places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
         own = ply.parent.parent / POSES if is_frame(ply) else ply  # by which depth maps are placed
         camera_path = own if ply.suffix == DEPTHS.ending else result_cameras(ply)
         camera_path = camera_path or next((place for place in places if place is not None), None)
@@ -210,6 +212,7 @@ def named_path(path: StrPath | None) -> Path | None:
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if not os.path.isdir(path):
+        check_layout(Path(path))
         check_file(Path(path))
     return Path(path)
 

@@ -28,7 +28,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, move_views, rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
-from gsmerge.io.cameras.read import CAMERA_PLACES, holds_images, read_depths
+from gsmerge.io.cameras.read import holds_images, read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -324,9 +324,7 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
     notes = [option] if option else []
     _check_hints(ply, hints)
     if files.images is not None:
-        places = ", ".join(place for place in CAMERA_PLACES if len(place) > 1)
-        where = "" if "cameras" in files.named else f" (looked for {places})"
-        notes += [f"the photos in {files.images} are not used: no cameras that fit them{where}"]
+        notes += [f"the photos in {files.images} are not used: no cameras that fit them"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 

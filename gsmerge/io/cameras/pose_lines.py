@@ -1,4 +1,4 @@
-"""Text files with one pose a line, as KITTI and DA3-Streaming write them, and ``intrinsic.txt`` beside them.
+"""Text files of poses, as KITTI, TUM, RealEstate10K, ScanNet and DA3-Streaming have them, and of intrinsics.
 
 DA3-Streaming has ``results_output/frame_N.npz`` beside it as well: depth map, image and intrinsics of the view of line
 N, from 0 on.
@@ -7,54 +7,108 @@ N, from 0 on.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io.bounds import read_lines
-from gsmerge.io.cameras.camera_file import StoredView, check_count, make_pinhole
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, StoredView, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
+from gsmerge.io.cameras.layouts import INTRINSICS, POSE_FOLDERS
 from gsmerge.io.cameras.npz_files import array_shape
 from gsmerge.io.formats.table import FRAMES, POSES
+from gsmerge.io.image_names import natural_key
 
-INTRINSICS = ("intrinsic.txt", "intrinsics.txt")
 _FRAME = re.compile(r"frame_(\d{1,9})\.npz")
 _POSE_COLUMNS = (12, 16)  # numbers of a pose in a line
-_MOST_COLUMNS = max(_POSE_COLUMNS)
+# of a matrix's row; of a time, shift and quaternion xyzw (TUM); of a time, intrinsics, two zeros and a pose
+_ROW, _TUM, _RE10K = 4, 8, 19
+_MOST_COLUMNS = _RE10K
+_OTHER_LINE = re.compile(r"\s*(#|https?:)")  # comments, and the address of RealEstate10K's video
 
 
 def lists_poses(path: Path) -> bool:
-    """Return whether the first line of a text file is a pose."""
-    with suppress(OSError, ValueError), path.open(encoding="utf-8-sig") as file:
-        return len(np.array(_words(file.readline(4096)), np.float64)) in _POSE_COLUMNS
+    """Return whether the first numbers of a text file, or of the files of a folder, are a pose or a matrix's row."""
+    if path.is_dir() and path.name not in POSE_FOLDERS:
+        return False
+    with suppress(OSError, ValueError, SceneError):
+        first = next(filter(str.strip, _lines(path)), "")
+        return len(np.array(_words(first), np.float64)) in (_ROW, _TUM, _RE10K, *_POSE_COLUMNS)
     return False
 
 
 def read_poses(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a text file with one pose per line, as KITTI and DA3 write it.
+    """Read the cameras of a text file, or of a folder's, with one pose per line or a matrix in four.
 
-    A line has 12 or 16 numbers: camera-to-world, OpenCV axes, row by row. Next to the file is ``intrinsic.txt`` (or
-    ``intrinsics.txt``) with fx, fy, cx, cy in pixels, one line for all views or one for each, or nothing; the size is
-    that of DA3-Streaming's frames, or of the images. SceneError if a line has another number of numbers.
+    A pose of 12 or 16 numbers, row by row, is camera-to-world with OpenCV axes, as is TUM's; RealEstate10K's is
+    world-to-camera and has intrinsics before it. Those of others are beside it, see :data:`INTRINSICS`: fx, fy, cx, cy
+    in pixels or a matrix, for all views or for each; or nothing. The size is that of DA3-Streaming's frames, or of the
+    images. Views of a folder whose matrix is not finite have no camera. SceneError if a line has another number of
+    numbers.
     """
-    path, poses = source.path, _parse(source.path, read_lines(source.path), _POSE_COLUMNS)
-    intrinsics = next((path.with_name(name) for name in INTRINSICS if path.with_name(name).is_file()), None)
-    if intrinsics is None:
-        return StoredCameras([StoredView(f"{i:06d}", pose.reshape(-1, 4), None) for i, pose in enumerate(poses)])
-    values = _parse(intrinsics, read_lines(intrinsics), (4,))
-    if len(values) not in (1, len(poses)):
-        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(values)}")
+    path, lines = source.path, list(_lines(source.path))
+    columns = len(_words(next(filter(str.strip, lines), "")))
+    rows = _parse(path, lines, (columns,) if columns in (_ROW, _TUM, _RE10K) else _POSE_COLUMNS)
+    poses, names = _join_rows(path, rows), [f"{i:06d}" for i in range(len(rows))]
+    beside = [path.parent / name for name in INTRINSICS]
+    place = next((file for file in beside if file.exists()), None)
+    Ks = [] if place is None or columns == _RE10K else _read_intrinsics(place)
+    if columns == _TUM:
+        names, turns = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
+        poses = [np.column_stack([turn, row[1:4]]) for turn, row in zip(turns, rows, strict=True)]
+    elif columns == _RE10K:
+        names, Ks = [f"{row[0]:.0f}" for row in rows], [make_pinhole(*row[1:5]) for row in rows]
+        poses = [row[7:] for row in rows]
+    elif path.is_dir():
+        names = [file.stem for file in _files(path)]
+    if place is not None and len(Ks) not in (1, len(poses)):
+        raise SceneError(place, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
     shape = array_shape(path.parent / FRAMES / "frame_0.npz", "depth")  # empty without frames
-    size = (shape[1], shape[0]) if len(shape) == 2 else (0, 0)
-    Ks = [make_pinhole(*row) for row in (values * len(poses) if len(values) == 1 else values)]
-    views = [
-        StoredView(f"{i:06d}", pose.reshape(-1, 4), K, size) for i, (pose, K) in enumerate(zip(poses, Ks, strict=True))
-    ]
-    return StoredCameras(views)
+    size = (shape[1], shape[0]) if len(shape) == 2 and Ks else (0, 0)
+    each = repeat(Ks[0] if Ks else None) if len(Ks) < 2 else Ks
+    views = [StoredView(name, pose.reshape(-1, 4), K, size) for name, pose, K in zip(names, poses, each, strict=False)]
+    views = [view for view in views if not path.is_dir() or np.isfinite(view.pose).all()]
+    return StoredCameras(views, convention=W2C_OPENCV if columns == _RE10K else None)
+
+
+def _read_intrinsics(path: Path) -> list[np.ndarray]:
+    """Read lines of fx, fy, cx, cy or of matrices, or a matrix in several lines, or SRN's and NSVF's f, cx, cy, 0."""
+    rows = _join_rows(path, _parse(path, _lines(path), (1, 2, 3, 4, 9, 16)))
+    if len(rows) > 1 and len(rows[0]) == 4 != len(rows[-1]):
+        rows = [rows[0][[0, 0, 1, 2]]]
+    if any(len(row) not in (4, 9, 16) for row in rows):
+        raise SceneError(path, "expected fx, fy, cx, cy or a matrix of 9 or 16 numbers, found other lines")
+    sides = {9: 3, 16: 4}
+    return [make_pinhole(*row) if len(row) == 4 else row.reshape(sides[len(row)], -1)[:3, :3] for row in rows]
+
+
+def _join_rows(path: Path, rows: list[np.ndarray]) -> list[np.ndarray]:
+    """Join the rows of matrices, a line each, of which the last is 0 0 1 or 0 0 0 1; unchanged where they are none."""
+    side = len(rows[-1]) if rows else 0
+    if side not in (3, 4) or rows[-1].tolist() != [0] * (side - 1) + [1]:
+        return rows
+    if len(rows) % side or {len(row) for row in rows} != {side}:
+        raise SceneError(path, f"expected {side} lines of {side} numbers for each matrix, found others")
+    return [np.concatenate(rows[i : i + side]) for i in range(0, len(rows), side)]
+
+
+def _files(path: Path) -> list[Path]:
+    texts = sorted(path.glob("[!.]*.txt"), key=lambda file: natural_key(file.name))
+    check_count(path, len(texts))
+    return texts
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Yield the lines of a text file, or of all in a folder; empty ones for comments and the indices of a ``.log``."""
+    for file in _files(path) if path.is_dir() else [path]:
+        for line in read_lines(file):
+            is_other = _OTHER_LINE.match(line) or (file.suffix == ".log" and len(line.split()) == 3)
+            yield "" if is_other else line
 
 
 def list_frames(folder: Path) -> list[Path]:

@@ -24,6 +24,8 @@ from gsmerge.io.cameras.json_files import (
     read_transforms,
     read_world_mirror,
 )
+from gsmerge.io.cameras.layouts import CAMERA_PLACES, INTRINSICS, check_layout
+from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.types import StrPath
@@ -32,16 +34,10 @@ _lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # of re10k
 array_names, holds_poses = _lazy("npz_files.array_names"), _lazy("npz_files.holds_poses")
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
-# Where cameras are in a scene's folder, the first that exists wins; a COLMAP model directly in the folder comes last,
-# because Depth Anything 3 puts one there at the photos' own size.
-CAMERA_PLACES = (
-    "views.npz", "transforms.json", "transforms_train.json", "cameras.json", "camera_params.json", "sparse/0", "sparse",
-    "colmap/sparse/0", "colmap", "exports/npz/results.npz", "exports/mini_npz/results.npz",
-    "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras",
-    "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", "0", ".",
-)  # fmt: skip
-_START = 1 << 12  # bytes of a file of Polycam that name all its values
+_KEYFRAME, _START = "t_00", 1 << 12  # value of a file of Polycam, and bytes of it that name all its values
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
+_LOG = ".log"  # text of poses
+_OTHERS = (".json", ".npz", ".xml", ".txt", _LOG)
 
 
 def is_colmap(folder: Path) -> bool:
@@ -54,7 +50,7 @@ def is_keyframes(folder: Path) -> bool:
     first = min(folder.glob("[!.]*.json"), default=folder)
     if first.is_file():
         with suppress(OSError), first.open("rb") as file:
-            return b'"t_00"' in file.read(_START)
+            return f'"{_KEYFRAME}"'.encode() in file.read(_START)
     return False
 
 
@@ -67,15 +63,19 @@ def find_cameras(folder: Path) -> Path | None:
     """Find the first known camera file below a folder, or its only ``.torch`` chunk."""
     for place in CAMERA_PLACES:
         candidate = folder / place
-        if candidate.is_file() or (candidate.is_dir() and (is_colmap(candidate) or is_keyframes(candidate))):
+        if candidate.is_file() or (candidate.is_dir() and _is_camera_folder(candidate)):
             return candidate
     chunks = [chunk for chunk in folder.glob(f"*{CHUNK}") if chunk.is_file()]
     return chunks[0] if len(chunks) == 1 else None
 
 
+def _is_camera_folder(folder: Path) -> bool:
+    return any(row.recognise(CameraSource(folder)) for row in CAMERA_FORMATS if not row.ending)
+
+
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only ``.json``, ``.npz`` or ``.xml`` in a folder that holds cameras, by any name; None without one."""
-    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in (".json", ".npz", ".xml"))
+    """Find the only file of :data:`_OTHERS` in a folder that holds cameras, by any name; None without one."""
+    files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _OTHERS and path.name not in INTRINSICS)
     files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
     camera_files = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
     return camera_files[0] if len(camera_files) == 1 else None
@@ -111,18 +111,24 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
     path = Path(path)
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
-    if path.is_dir() and not is_colmap(path) and not is_keyframes(path):
+    if path.is_dir() and not _is_camera_folder(path):
         inside = find_cameras(path) or find_other_cameras(path)
         if inside is None:
+            check_layout(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = inside
     if not path.is_dir():
+        check_layout(path)
         check_file(path)
-        if path.suffix in (".bin", ".txt") and not _lazy("pose_lines.lists_poses")(path):
+        if path.suffix == ".json" and is_keyframes(path.parent) and _KEYFRAME in CameraSource(path).object:
+            path = path.parent
+        in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
+        if path.suffix in (".bin", ".txt") and (in_model or not _LISTS_POSES(path)):
             if not is_colmap(path.parent):
                 raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
             path = path.parent
-    source, ending = CameraSource(path, scene, folder), "" if path.is_dir() else path.suffix.lower()
+    ending = "" if path.is_dir() else path.suffix.lower().replace(_LOG, ".txt")
+    source = CameraSource(path, scene, folder)
     chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if chosen is None:
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
@@ -144,6 +150,7 @@ def read_sharp_camera(path: Path) -> CameraFile | None:
 
 
 _READ_COLMAP, _READ_DA3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
+_LISTS_POSES, _READ_POSES = _lazy("pose_lines.lists_poses"), _lazy("pose_lines.read_poses")
 _READ_VIEWS = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 _SHARP = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
@@ -160,9 +167,11 @@ CAMERA_FORMATS = (
     CameraFormat("Polycam", "`keyframes/corrected_cameras` of Polycam", "", _lazy("programs.read_polycam"),
                  C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
-                 W2C_OPENCV, "pixels; lenses"),
-    CameraFormat("pose list", "text with one pose of 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"),
-                 C2W_OPENCV, "pixels, in `intrinsic.txt` beside it; may be missing"),
+                 W2C_OPENCV, "pixels; lenses", lambda file: holds_model(file.path, ".txt")),
+    CameraFormat("pose folder", "`pose/*.txt` of ScanNet, NSVF", "", _READ_POSES,
+                 C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing", lambda file: _LISTS_POSES(file.path)),
+    CameraFormat("pose list", "poses of KITTI, TUM, RealEstate10K; `.log` of Open3D", ".txt", _READ_POSES, C2W_OPENCV,
+                 "as these"),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", read_long_lrm, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
                  ".json", read_transforms, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
@@ -197,7 +206,7 @@ CAMERA_FORMATS = (
     _SHARP,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_VIEWS, W2C_OPENCV, "pixels"),
 )  # fmt: skip
-CAMERA_ENDINGS = tuple(dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")))
+CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), _LOG)
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy
     "": ("expected cameras as .json, .npz, .xml, .torch or a COLMAP folder, found another kind of file",),
     ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),

@@ -1,0 +1,102 @@
+"""What programs leave beside photos: where cameras that are read lie, and of others the export that is read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+from gsmerge.errors import SceneError
+
+
+class Layout(NamedTuple):
+    """Files of a program: those that are read without a remedy, others with one."""
+
+    files: str  # patterns of their paths in a scene's folder
+    program: str = ""
+    remedy: str = ""  # the export of it that is read
+    start: str = ""  # regular expression of what stands at the start of a file
+
+
+POSE_FOLDERS = ("pose", "poses")  # with a file for each view
+# Beside poses, the first that exists; a folder has a file for each view
+INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
+_START = 1 << 12  # bytes of a file that tell its kind
+_DEPTH, _MAX_PATHS = 3, 10_000  # of folders that are searched for it, and paths in them
+_OWN = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
+_MODEL = f"name the COLMAP model that it was made from, or {_OWN}"
+_NERFSTUDIO = "`ns-process-data {}` of nerfstudio makes a transforms.json of it"
+_KAPTURE = "kapture_import_{}.py and kapture_export_colmap.py of kapture make a COLMAP model of it"
+_OPF = "export OPF from PIX4Dmatic, of which `opf2colmap` of pyopf makes a COLMAP model"
+_REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, or use `ns-process-data realitycapture`"
+_OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
+_ODM = "ODM", "name its opensfm/reconstruction.json"
+_OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
+CAMERA_PLACES = (
+    "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
+    "cameras.json", "camera_params.json", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "exports/npz/results.npz",
+    "exports/mini_npz/results.npz", "results.npz", "cameras.npz", "camera_poses.txt", "keyframes/corrected_cameras",
+    "keyframes/cameras", "reconstruction.json", "opensfm/reconstruction.json", "cameras.xml", *POSE_FOLDERS, "0", ".",
+)  # fmt: skip
+# Of those that are read the first that exists wins; a COLMAP model directly in the folder comes last, because Depth
+# Anything 3 puts one there at the photos' own size. The others matter where none of them is there.
+LAYOUTS = (
+    *map(Layout, CAMERA_PLACES),
+    Layout("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Layout("*.rcproj *.rsproj", *_REALITY),
+    Layout("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
+    Layout("*.xml", "ContextCapture or DJI Terra", _OPENMVS.format("InterfaceMetashape and "), "<BlocksExchange"),
+    Layout("*calibrated_*camera_parameters*.txt *.p4d *.p4m *.opf", "Pix4D", _OPF),
+    Layout("*.out", "Bundler", _KAPTURE.format("bundler"), "# Bundle file"),
+    Layout("*.nvm", "VisualSFM", _KAPTURE.format("nvm")), Layout("*.pose.txt", "7-Scenes", _KAPTURE.format("7scenes")),
+    Layout("sensors/*.txt", "kapture", "kapture_export_colmap.py makes a COLMAP model of it", "kapture"),
+    Layout("*.json", *_OPENMVG, '"sfm_data_version"'), Layout("sfm_data.bin", *_OPENMVG),
+    Layout("*.sfm *.mg", "Meshroom", "its node ExportColmap, or aliceVision_exportColmap, makes a COLMAP model of it"),
+    Layout("*.mvs", "OpenMVS", _OPENMVS.format("")),
+    Layout("*.theia reconstruction-[0-9]", "Theia", "export_colmap_files of Theia makes a COLMAP model of it"),
+    Layout("cameras.json", *_ODM, '"projection_type"'), Layout("odm_report/shots.geojson", *_ODM),
+    Layout("*.db project.ini", "COLMAP's database", "name the sparse/0 of `colmap mapper`", "SQLite|database_path"),
+    Layout("poses_bounds.npy", "LLFF", "name the COLMAP model sparse/0 from which imgs2poses.py made it"),
+    Layout("*_cam.txt", "MVSNet", _MODEL, "extrinsic"),
+    Layout("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
+    Layout("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
+    Layout("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
+    Layout("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
+    Layout("*.traj", "ARKitScenes", _OWN), Layout("*.jgz", "CO3D", _OWN),
+    Layout("*.json", "Open3D", _OWN, '"PinholeCamera'), Layout("*.json", "3D Scanner App", _OWN, '"cameraPoseARFrame"'),
+    Layout("camera/*.json", "Nerfies", _OWN, '"(orientation|principal_point)"'),
+    Layout("*_par.txt *.conf", "Middlebury or Matterport", _OWN, r"^\s*\d+\s|^dataset"),
+    Layout("*.out *.mve/meta.ini", "MVE", _OWN, "drews|MVE view"),
+    Layout("*.csv", "EuRoC's body", _OWN, "#(timestamp|time)"),
+    Layout("camera/*.npz poses.npz", "CUT3R or Spann3R", _OWN, "pose"),
+    Layout("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _OWN),
+    Layout("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
+           r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
+    Layout("*.psht", "Postshot", "name the cameras that were loaded into it"),
+    Layout("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
+)  # fmt: skip
+
+
+def find_unread(place: Path) -> Path | None:
+    """Find a file of cameras that are not read: a path itself, or one below a folder; None without one."""
+    return next((path for path, _ in _unread(place)), None)
+
+
+def check_layout(place: Path) -> None:
+    """Raise SceneError with the program and its export that is read, if a file, or one below a folder, is not read."""
+    for path, layout in _unread(place):
+        raise SceneError(path, f"expected cameras that are read, found those of {layout.program}", layout.remedy)
+
+
+def _unread(place: Path) -> Iterator[tuple[Path, Layout]]:
+    """Yield files of cameras that are not read with their layouts."""
+    paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
+    files = [path for path in (sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]) if path.is_file()]
+    for layout in LAYOUTS:
+        patterns = layout.files.split() if layout.remedy else ()
+        for path in (path for path in files if any(map(path.match, patterns))):
+            with suppress(OSError), path.open("rb") as file:
+                if re.search(layout.start, file.read(_START).decode("latin-1")):
+                    yield path, layout

@@ -1,0 +1,107 @@
+"""Cameras of programs that are not read are told by their names and first bytes, with the export that is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from messages import refuses
+from tiny_scene import Tiny, write_colmap_text, write_transforms
+
+from gsmerge.errors import SceneError
+from gsmerge.io import read_cameras
+from gsmerge.io.cameras.layouts import LAYOUTS, find_unread
+from gsmerge.io.cameras.read import find_cameras
+from gsmerge.scene.files import find_scene_files
+
+# file, its start, the program, and what is read of it
+FILES = [
+    ("rc.csv", "#name,x,y,alt,heading,pitch,roll,f,px,py", "RealityScan", "COLMAP"),
+    ("rc.csv", "#cameras 5\n#name,x,y,z", "RealityCapture", "realitycapture"),
+    ("images/a.xmp", '<rdf:Description xcr:Version="3"', "RealityScan", "COLMAP"),
+    ("a.rcproj", "<RealityCaptureProject", "RealityScan", "COLMAP"),
+    ("a.psx", '<document version="1.2.0"', "Metashape", "Export Cameras"),
+    ("at.xml", '<?xml version="1.0"?>\n<BlocksExchange version="2.1">', "ContextCapture", "InterfaceMetashape"),
+    ("1_initial/params/a_calibrated_camera_parameters.txt", "fileName imageWidth", "Pix4D", "opf2colmap"),
+    ("a.p4d", "<pix4d/>", "Pix4D", "OPF"),
+    ("bundle/bundle.out", "# Bundle file v0.3\n5 9\n", "Bundler", "kapture_import_bundler.py"),
+    ("a.nvm", "NVM_V3\n\n5\n", "VisualSFM", "kapture_import_nvm.py"),
+    ("synth_0.out", "drews 1.0\n5 9\n", "MVE", "transforms.json"),
+    ("reconstruction/sfm_data.json", '{\n "sfm_data_version": "0.3"', "OpenMVG", "openMVG_main_openMVG2Colmap"),
+    ("sfm_data.bin", "\1", "OpenMVG", "openMVG_main_openMVG2Colmap"),
+    ("MeshroomCache/StructureFromMotion/cameras.sfm", '{"version": [', "Meshroom", "ExportColmap"),
+    ("scene.mvs", "MVSI", "OpenMVS", "InterfaceCOLMAP"),
+    ("reconstruction-0", "\1", "Theia", "export_colmap_files"),
+    ("cameras.json", '{"v2 a": {"projection_type": "brown"', "ODM", "opensfm/reconstruction.json"),
+    ("database.db", "SQLite format 3\0", "COLMAP's database", "colmap mapper"),
+    ("poses_bounds.npy", "\x93NUMPY", "LLFF", "sparse/0"),
+    ("cams/00000000_cam.txt", "extrinsic\n1 0 0 0\n", "MVSNet", "COLMAP model"),
+    ("cameras_sphere.npz", "PK\3\4 world_mat_0.npy", "NeuS", "views.npz"),
+    ("cameras.npz", "PK\3\4 scale_mat_0.npy", "DTU", "views.npz"),
+    ("dino_par.txt", "16\ndino0001.png 3310 0 316", "Middlebury", "transforms.json"),
+    ("camera/0001.json", '{"orientation": [[1, 0, 0]', "Nerfies", "transforms.json"),
+    ("scene0000_00.sens", "\4\0\0\0", "ScanNet", "SensReader"),
+    ("seq-01/frame-000000.pose.txt", "1 0 0 0\n", "7-Scenes", "kapture_import_7scenes.py"),
+    ("sensors/sensors.txt", "# kapture format: 1.1", "kapture", "kapture_export_colmap.py"),
+    ("metadata.json", '{"w": 1, "h": 2, "K": [1], "poses": [[', "Record3D", "ns-process-data record3d"),
+    ("a.r3d", "PK\3\4", "Record3D", "ns-process-data record3d"),
+    ("mps/slam/closed_loop_trajectory.csv", "graph_uid,tracking", "Project Aria", "ns-process-data aria"),
+    ("frame_00000.json", '{"cameraPoseARFrame": [1, 0', "3D Scanner App", "transforms.json"),
+    ("lowres_wide.traj", "1.0 0 0 0 0 0 0\n", "ARKitScenes", "transforms.json"),
+    ("frame_annotations.jgz", "\x1f\x8b", "CO3D", "transforms.json"),
+    ("mav0/state/data.csv", "#timestamp, p_RS_R_x [m]", "EuRoC", "transforms.json"),
+    ("disps.npy", "\x93NUMPY", "DROID-SLAM", "views.npz"),
+    ("camera/000000.npz", "PK\3\4 pose.npy", "CUT3R", "views.npz"),
+    ("trajectory.json", '{\n\t"class_name" : "PinholeCameraTrajectory"', "Open3D", "transforms.json"),
+    ("transforms_train.json", '[\n {"file_path": "a.png", "transform": [[', "ns-export", "of the capture"),
+    ("a.psht", "\0", "Postshot", "loaded into it"),
+    ("a.blend", "BLENDER", "3D programs", "BlenderNeRF"),
+]
+
+
+@pytest.mark.parametrize(("name", "start", "program", "remedy"), FILES)
+def test_what_lies_there_is_named_with_what_is_read_of_it(
+    tmp_path: Path, name: str, start: str, program: str, remedy: str, tiny: Tiny
+) -> None:
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(start.encode("latin-1"))
+    assert find_unread(tmp_path) == path
+    for place in {path, tmp_path, path.parent}:
+        with refuses(SceneError, name.split("/")[-1], program, remedy):
+            read_cameras(place)
+    with refuses(SceneError, name.split("/")[-1], program):
+        find_scene_files(tmp_path / "a.ply", cameras=path)
+    other = tmp_path / "other"
+    other.mkdir()
+    write_transforms(other / "transforms.json", tiny)
+    write_colmap_text(other / "sparse" / "0", tiny)
+    for export in ("transforms.json", "sparse/0"):
+        np.testing.assert_allclose(read_cameras(other / export).viewmats, tiny.w2c, atol=1e-5)
+
+
+def test_each_layout_that_is_not_read_is_tried() -> None:
+    """And a start other than its own is another file."""
+    programs = {layout.program for layout in LAYOUTS if layout.remedy}
+    assert all(any(name in program for _, _, name, _ in FILES) for program in programs)
+
+
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [
+        ("a.csv", "name,price\n"), ("a.json", '{"transform": [[1'), ("a.xml", "<a/>"), ("a.out", "x"),
+        ("metadata.json", "{}"), ("a.db", "x"), ("cameras.npz", "PK\3\4 extrinsics.npy"), ("a.xmp", "<x:xmpmeta>"),
+    ],
+)  # fmt: skip
+def test_files_of_others_are_none(tmp_path: Path, name: str, start: str) -> None:
+    (tmp_path / name).write_text(start)
+    assert find_unread(tmp_path) is None
+
+
+def test_cameras_that_are_read_go_first(tmp_path: Path, tiny: Tiny) -> None:
+    (tmp_path / "a.nvm").write_text("NVM_V3")
+    (tmp_path / "a.ply").write_text("ply\n")
+    assert find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "a.nvm"
+    write_transforms(tmp_path / "transforms.json", tiny)
+    assert find_cameras(tmp_path) == find_scene_files(tmp_path / "a.ply").cameras == tmp_path / "transforms.json"
