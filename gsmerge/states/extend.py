@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.alignment.unaligned import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
@@ -15,7 +16,7 @@ from gsmerge.facts.exposure import camera_distances
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.geometry import camera_centres
-from gsmerge.measure.coverage import shares_inside
+from gsmerge.io.photo_files import photo_array
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -23,7 +24,10 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
-SAMPLES, SEEN = 10_000, 0.02  # earlier Gaussians that are looked up in new views; share that one sees, at the least
+# Earlier Gaussians that are looked up in new views; share that these see at the least; and of the foremost, the most
+# that colours may differ from pictures, over that from random pixels: .4 to .7 in one world, .85 to 1.1 in others
+SAMPLES, SEEN, UNLIKE = 10_000, 0.02, 0.8
+OTHER_WORLD = "the pictures of this batch do not show the earlier Gaussians: are they in one world?"
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,7 @@ def extend(
     gaussians, views = result.gaussians.numpy(), _keep_pictures(prepared)
     notes = [text for text in result.report.notes if text != result.report.worse]  # that is for results
     if before is not None:
-        if len(views) and max(shares_inside(replace(views, gaussians=before.gaussians), SAMPLES)) < SEEN:
-            notes.append("no view of this batch sees the earlier Gaussians: are they in one world?")
+        notes += [] if _shows(views, before.gaussians) else [OTHER_WORLD]
         parts = before.gaussians, gaussians
         num_higher = max(part.shN.shape[1] for part in parts)
         gaussians = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
@@ -91,6 +94,15 @@ def extend(
         options=options.to_dict() | asdict(extend_options),
     )
     return joined, report
+
+
+def _shows(views: Scene, gaussians: Gaussians) -> bool:
+    """Return whether pictures of views may show Gaussians: some see them, in about their colours."""
+    if not len(views):
+        return True
+    rows = np.ones(len(gaussians), bool)
+    check = check_cameras(gaussians, rows, views.cameras, photo_array(views.images), SAMPLES, foremost=True)
+    return check.share_seen >= SEEN and not check.color_ratio > UNLIKE
 
 
 def _keep_pictures(prepared: Prepared) -> Scene:

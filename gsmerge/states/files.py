@@ -70,7 +70,7 @@ def extend_file(
         place = {"path": str(path), "bytes": path.stat().st_size, "num_batches": len(known)}
         note = f"{files.ply}: left out, as all its files are batch {known.index(sha256) + 1} of {path.name} already"
         return document | {"left_out": True, "state": place, "notes": [note]}
-    with ExitStack() as until_renamed, atomic_output(path, overwrite=identity is not None) as temporary:
+    with ExitStack() as until_renamed, atomic_output(path, overwrite=True) as temporary:
         loaded = perf_counter()
         load = read_input(files, opacity=opacity, hints=hints)
         read = perf_counter()
