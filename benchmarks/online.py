@@ -163,13 +163,13 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("scenes", help="train, eval, or names with commas between")
     parser.add_argument("--views", type=int, default=84, help="of each scene; 0: its own")
     parser.add_argument("--size", type=int, default=12, help="views of a batch")
-    parser.add_argument("--set", nargs="*", default=["recipe=paper"], help="settings, as name=value")
+    parser.add_argument("--set", nargs="*", type=setting, default=[("recipe", "paper")], help="settings, as name=value")
     parser.add_argument("--out", type=Path, default=Path("online.svg"), help="the picture")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
     args = parser.parse_args(words)
     if not lpips_available("vgg"):
         print(f"LPIPS is left out: {INSTALL}", flush=True)
-    settings = {name: setting(value) for name, value in (text.split("=", 1) for text in args.set)}
+    settings = dict(args.set)
     runs = {}
     for folder in scene_folders(args.scenes):
         plys = make_batches(folder, args.views, args.size, args.cache)

@@ -301,10 +301,10 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", choices=list(CASES), default=list(CASES))
     parser.add_argument("--shrink", type=int, default=3, help="photos so many times smaller")
     parser.add_argument("--views", type=int, default=5, help="context views; 0: all")
-    parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings, as name=value")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-photos")
     args = parser.parse_args()
-    SETTINGS.update({name: setting(value) for name, value in (text.split("=", 1) for text in args.set)})
+    SETTINGS.update(args.set)
     for scene in scene_folders(args.scenes):
         run(scene, args.cases, args.cache, args)
 

@@ -171,9 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--size", type=parse_size, help="crop and resize held-out photos, as 252x252")
     parser.add_argument("--scenes", nargs="*", help="these of the list alone")
-    parser.add_argument(
-        "--set", nargs="*", default=[], type=lambda pair: (pair.split("=")[0], setting(pair.split("=")[1]))
-    )
+    parser.add_argument("--set", nargs="*", default=[], type=setting)
     parser.add_argument("--lpips", action="store_true", help="also LPIPS-VGG, as the published figures have it")
     args = parser.parse_args(arguments)
     if (args.list is None) == (args.views is None):

@@ -54,7 +54,7 @@ def score_outside(scene: Scene, results: Mapping[str, Gaussians]) -> dict[str, t
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("scenes", help="train, eval, or names with commas between")
-    parser.add_argument("--set", nargs="*", default=[], help="settings, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings, as name=value")
     parser.add_argument("--moment-matching", action="store_true", help="also the paper's moment matching")
     parser.add_argument("--ply", help="also a .ply of another tool; {scene} stands for the scene's name")
     parser.add_argument("--unmerged-fit", action="store_true", help="also the input after the same fit")
@@ -63,7 +63,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.lpips and not lpips_available("vgg"):
         parser.error(f"--lpips needs weights: {INSTALL}")
-    settings = {k: setting(v) for k, v in (s.split("=") for s in args.set)}
+    settings = dict(args.set)
     own_name, rows = str(settings.get("method", "gsmerge")), []
     for folder in scene_folders(args.scenes):
         scene, targets = gsmerge.read_scene(export(folder, args.cache)), read_held_out(folder)
@@ -101,11 +101,13 @@ def main() -> None:
             print(f"mean {name:21s} {np.nanmean([r[name] for r in rows], 0).round(3)}")
 
 
-def setting(text: str) -> object:
+def setting(text: str) -> tuple[str, object]:
+    """A setting of compact, NAME=VALUE with the value as JSON or text, as an item of a dictionary."""
+    name, value = text.split("=", 1)
     try:
-        return json.loads(text)
+        return name, json.loads(value)
     except json.JSONDecodeError:
-        return text
+        return name, value
 
 
 def _short(value: object) -> object:

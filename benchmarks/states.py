@@ -60,10 +60,10 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs="+", default=[2], help="views of a batch")
     parser.add_argument("--share", type=float, default=0.03, help="Gaussians of the results, of the input's")
     parser.add_argument("--without", choices=("photos", "cameras"))
-    parser.add_argument("--set", nargs="*", default=[], help="settings of extend, as name=value")
+    parser.add_argument("--set", nargs="*", default=[], type=setting, help="settings of extend, as name=value")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-online")
     args = parser.parse_args()
-    settings = {name: setting(value) for name, value in (text.split("=", 1) for text in args.set)}
+    settings = dict(args.set)
     for folder in scene_folders(args.scenes):
         (whole,) = make_batches(folder, args.views, 10_000, args.cache)
         for size in args.size:

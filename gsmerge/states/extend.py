@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.alignment.unaligned import check_cameras
+from gsmerge.alignment import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
