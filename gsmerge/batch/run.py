@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.batch.jobs import BatchOptions, Job
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, check_folder, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, Result, check_folder, record
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
@@ -68,18 +68,33 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
     return Concurrency(count, threads or max(1, processors // count))
 
 
-def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[Job]:
-    """List the jobs whose result is not done; all where they are to be done again."""
-    results = RecordIndex(folder).read_on().results
-
-    def is_done(job: Job) -> bool:
+def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> list[tuple[Job, str | None]]:
+    """List the jobs whose result is not done, all where they are to be done again, each with why it is refused."""
+    if options.overwrite:
+        return [(job, None) for job in jobs]
+    results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
+    for job in jobs:
         known = results.get(job.output)
         try:
-            return known is not None and known.holds(folder, job.call.key(job.find_files()))
-        except SceneError:
-            return False
+            key = job.call.key(job.find_files())
+            if known is None or not known.holds(folder, key):
+                pending.append((job, refusal(job, folder, known, key)))
+        except SceneError as error:
+            pending.append((job, str(error)))
+    return pending
 
-    return [job for job in jobs if options.overwrite or not is_done(job)]
+
+def refusal(job: Job, folder: Path, known: Result | None, key: str, *, begun: bool = False) -> str | None:
+    """Return why a result is not replaced without being asked; ``begun``: what is there may be of a run that ended."""
+    names = () if known is None else [file["path"] for file in known.files]
+    foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]
+    if foreign and not begun:
+        return f"{folder / foreign[0]}: exists already, and no batch wrote it; pass --overwrite to replace it"
+    former = "" if known is None else known.key.partition(".")[2]  # which stands for the settings
+    if former in ("", key.partition(".")[2]) or not any(os.path.lexists(folder / name) for name in names):
+        return None
+    remedy = "pass --overwrite to make it again, or name another --output"
+    return f"{folder / job.output}: was made with other settings; {remedy}"
 
 
 def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Generator[dict[str, Any], None, None]:
@@ -148,16 +163,9 @@ def _make(job: Job, run: Run, begun: Path) -> dict[str, Any]:
     if known is not None and is_new and known.key not in (key, ""):
         problem = "another run with other settings has made it meanwhile; wait for that run, or name another --output"
         raise UsageError(f"{run.folder / job.output}: {problem}")
-    names = () if known is None else [file["path"] for file in known.files]
-    foreign = [name for name in job.outputs if os.path.lexists(run.folder / name) and name not in names]
-    if foreign and not begun.exists() and not run.overwrite:
-        problem = "exists already, and no batch wrote it; pass --overwrite to replace it"
-        raise UsageError(f"{run.folder / foreign[0]}: {problem}")
-    former = "" if known is None else known.key.partition(".")[2]  # which stands for the settings
-    there = any(os.path.lexists(run.folder / name) for name in names)
-    if there and former not in ("", key.partition(".")[2]) and not run.overwrite:
-        problem = "was made with other settings; pass --overwrite to make it again, or name another --output"
-        return record(FAILED, job.scene, job.output, key=key, error=f"{run.folder / job.output}: {problem}")
+    refused = None if run.overwrite else refusal(job, run.folder, known, key, begun=begun.exists())
+    if refused:
+        return record(FAILED, job.scene, job.output, key=key, error=refused)
     mark(begun)
     out = run.folder / job.output
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -243,7 +243,7 @@ def print_plan(
     from gsmerge.report import document_head
 
     out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
-    left = {job.output for job in pending}
+    left = {job.output for job, _ in pending}
     document = {
         **document_head(),
         "dry_run": True,
@@ -259,7 +259,7 @@ def print_plan(
         "options": options.settings.to_dict(),
         "notes": list(notes),
     }
-    lines = [f"{job.scene} -> {out / job.output}" for job in pending]
+    lines = [f"{job.scene} -> {f'refused: {why}' if why else out / job.output}" for job, why in pending]
     lines += [f"note: {note}" for note in notes]
     lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do, {concurrency}")
     print_document(document, lines, as_json=args.json)

@@ -48,6 +48,7 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.stages.segment import largest_count
 from gsmerge.types import Scene
 
+COARSER = 0.5  # of the time of a result, that each coarser level takes
 MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
 
 
@@ -106,12 +107,13 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
 
 def _search(size: SceneSize, options: CompactOptions, choices: SceneChoices, inside: float) -> dict[str, Any]:
-    """Return what the search for the number of Gaussians adds, as arguments of :func:`wall_seconds`."""
+    """Return what a search for the number of Gaussians, and levels, add, as arguments of :func:`wall_seconds`."""
     budget, limits = options.budget, choices.limits
+    coarser = COARSER * (budget.levels - 1)
     if choices.keeps_input or budget.target_psnr is not None:
-        return {"tries": TRIED_BY_PHOTOS}
+        return {"tries": TRIED_BY_PHOTOS + coarser}
     if size.rendered or not (budget.auto or budget.max_drop is not None):
-        return {}
+        return {"tries": 1 + coarser}
     shares, steps = (RUNGS, LONG) if budget.max_drop is not None else (AUTO_RUNGS, SHORT)
     counts = rungs(shares, limits.default, limits.min_count, limits.max_count)
     return {"short_steps": steps, "short_drawn": [count * inside for count in counts]}

@@ -40,7 +40,7 @@ BYTES_ELSEWHERE = 40  # per Gaussian of the whole scene while a block of it is i
 
 
 def work_seconds(
-    pixels: int, view_pixels: float, options: Mapping[str, Any], *, fit_steps: int, num_drawn: float, tries: int = 1,
+    pixels: int, view_pixels: float, options: Mapping[str, Any], *, fit_steps: int, num_drawn: float, tries: float = 1,
     short_steps: int = 0, short_drawn: Sequence[float] = (),
 ) -> float:  # fmt: skip
     """Estimate the processor seconds of compacting a scene, without imports.

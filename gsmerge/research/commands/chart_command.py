@@ -71,7 +71,7 @@ def chart(args: opt.Args) -> None:
         print_plan(args, jobs, options, "runs", notes)
         return
     say_notes(notes, quiet=args.silent)
-    pending, failed = pending_jobs(jobs, out, options), list[tuple[str, str]]()
+    pending, failed = [job for job, _ in pending_jobs(jobs, out, options)], list[tuple[str, str]]()
 
     def add(record: dict[str, Any]) -> None:
         if record["error"] is not None:
