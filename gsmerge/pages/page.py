@@ -140,10 +140,11 @@ def speed(data: ViewData, place: int = 1) -> float | None:
 
 
 def speed_words(ratio: float | None) -> str:
-    """Write the end of the headline; empty where a result is not clearly faster."""
+    """Write the end of the headline, to one digit from 3 times on; empty where a result is not clearly faster."""
     if ratio is None or ratio < FASTER:
         return ""
-    return f", {ratio:.{0 if ratio >= 3 else 1}f}\u00a0\u00d7\u00a0faster to draw"
+    said = f"about {float(f'{ratio:.1g}'):.0f}" if ratio >= 3 else f"{ratio:.1f}"
+    return f", {said}\u00a0\u00d7\u00a0faster to draw"
 
 
 def size_words(data: ViewData, place: int) -> str:

@@ -51,7 +51,7 @@ function showScore(line, named) {
 // The end of the headline.
 function showSpeed(ratio, by = "As drawn by the processor that made this page") {
   const isFaster = ratio !== null && ratio >= FASTER;
-  id("speed").textContent = isFaster ? `, ${ratio.toFixed(ratio >= 3 ? 0 : 1)}\u00a0×\u00a0faster to draw` : "";
+  id("speed").textContent = isFaster ? `, ${ratio >= 3 ? `about ${Number(ratio.toPrecision(1))}` : ratio.toFixed(1)}\u00a0×\u00a0faster to draw` : "";
   id("speed").title = isFaster ? by : "";
 }
 

@@ -144,7 +144,8 @@ def test_the_slider_is_over_sizes(data: ViewData) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        (0.27, 0.03, ", 9\u00a0\u00d7\u00a0faster to draw"),
+        (0.27, 0.03, ", about 9\u00a0\u00d7\u00a0faster to draw"),
+        (0.35, 0.03, ", about 10\u00a0\u00d7\u00a0faster to draw"),
         (0.03, 0.02, ", 1.5\u00a0\u00d7\u00a0faster to draw"),
         (0.03, 0.03, ""),
     ],
