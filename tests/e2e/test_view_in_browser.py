@@ -344,9 +344,12 @@ def test_the_picture_fits_the_window(size: tuple[int, int], opened: tuple[Browse
 
 
 def test_a_phone(opened: tuple[Browser, Any]) -> None:
-    """Both pictures are whole and fill their part of the stage, and the table begins with what matters most."""
+    """The picture comes first, with its controls in sight; both are whole; the table begins with what matters most."""
     tab, _ = opened
     resize(tab, 390, 844)
+    assert tab.box("stage")["y"] < 20
+    for control in ("id('left-source')", "id('right-source')", "document.querySelector('[data-set=drops]')"):
+        assert 0 < tab.box(control)["y"] < 844
     for mode, shown in {"swipe": 2, "side": 2, "blink": 1, "difference": 2}.items():
         side = mode == "side"
         expected = [[0, 0, 1, 0.5], [0, 0.5, 1, 0.5]] if side else [[0, 0, 1, 1]] * shown
