@@ -97,7 +97,7 @@ class _Search:
                 folders[:] = [name for name in folders if name not in SCENE_PARTS]
                 scenes = [inside]
             else:
-                scenes = other_plys(inside) if any(name.endswith(".ply") for name in names) else []
+                scenes = other_plys(inside) if any(name.endswith(SCENE_SUFFIXES) for name in names) else []
             self.num_empty = 0 if scenes else self.num_empty
             yield from scenes
 

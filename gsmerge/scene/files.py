@@ -25,7 +25,18 @@ from gsmerge.io.cameras.read import (
     read_sharp_camera,
 )
 from gsmerge.io.formats.ply import header_content, header_counts
-from gsmerge.io.formats.table import DEPTHS, FRAMES, META, POSES, SEVERAL_USES, input_format, is_frame
+from gsmerge.io.formats.table import (
+    DEPTHS,
+    FRAMES,
+    META,
+    POSES,
+    SCENE_SUFFIXES,
+    SEVERAL_USES,
+    SITE,
+    input_format,
+    is_frame,
+    may_hold_gaussians,
+)
 from gsmerge.io.image_names import list_images
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.extend import SUFFIX
@@ -57,6 +68,7 @@ _USUAL_END = re.compile(
 # what files are called that have a view or a part each
 _PARTS = {"view", "chunk", "part", "block", "tile"}
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
+_PACKED = {*SCENE_SUFFIXES} - {".ply", DEPTHS.ending}
 _MAX_HEADERS = 1_000  # of a folder that are read; the other files are taken for scenes
 _MAX_DEPTH = 3  # of the folders that are searched below one without a scene
 _MAX_ENTRIES = 10_000  # in them
@@ -350,9 +362,14 @@ def named_ply(folder: Path) -> Path | None:
 
 
 def other_plys(folder: Path) -> list[Path]:
-    """List the other files directly in a folder that may be scenes: no results of gsmerge, no point clouds."""
+    """List the other files directly in a folder that may be scenes: no results of gsmerge, no point clouds.
+
+    Without any it is the only file of another format, except in a web site.
+    """
     plys = sorted(folder.glob("[!.]*.ply"))
-    return [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
+    scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
+    packed = [] if scenes or (folder / SITE).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
+    return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
 
 
 def _results_in(folder: Path) -> list[Path]:

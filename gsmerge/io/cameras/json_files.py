@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -373,7 +374,7 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
 
 
 def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
-    """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean; empty without the file.
+    """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean, or Metashape's file of cameras.
 
     The file says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]). ``transform`` starts
     from the world of the capture. Poses of a ``transforms.json`` with ``applied_transform`` (and ``applied_scale``)
@@ -383,17 +384,20 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
     if path is None:
-        return []
+        from gsmerge.io.cameras.programs import read_metashape_world  # few files need it
+
+        world = read_metashape_world(cameras) if cameras is not None and cameras.suffix == ".xml" else None
+        return [] if world is None else [world, replace(world, scale=1.0, shift=world.shift / world.scale)]
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         moved = _square(data["transform"])
         scale = _number(data["scale"])
-    frames = [_similarity(path, moved, scale)]
+    frames = [make_similarity(path, moved, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
             applied, factor = _square(camera_data["applied_transform"]), _number(camera_data.get("applied_scale") or 1)
-            frames.append(_similarity(path, matmul(moved, invert(applied)), scale / factor))
+            frames.append(make_similarity(path, matmul(moved, invert(applied)), scale / factor))
     return frames
 
 
@@ -404,8 +408,10 @@ def _square(values: Any) -> np.ndarray:
     return np.concatenate([matrix[:3], [[0.0, 0, 0, 1]]])
 
 
-def _similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
+def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
+    """Make the similarity of a matrix ``[3,4]`` and the scale after it; SceneError if it is none."""
     R = matrix[:3, :3]
-    if not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER:
+    odd = not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER
+    if odd or not np.all(np.abs(matrix) < MAX_NUMBER):
         raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
-    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {DATAPARSER}", "other")
+    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {path.name}", "other")

@@ -5,18 +5,20 @@ Each reader makes the frames of a ``transforms.json`` from its file, which are t
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import motion_matrices
+from gsmerge.geometry import Similarity, motion_matrices
 from gsmerge.io.bounds import read_budget, read_json, read_text
 from gsmerge.io.cameras.camera_file import check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.cameras.json_files import number_errors, transforms_views
+from gsmerge.io.cameras.json_files import make_similarity, number_errors, transforms_views
 from gsmerge.io.image_names import natural_key
 
 _MODELS = {  # of OpenSfM, by names of lenses that mean the same
@@ -73,19 +75,11 @@ def read_polycam(source: CameraSource) -> StoredCameras:
 
 
 def read_metashape(source: CameraSource) -> StoredCameras:
-    """Read the cameras that Metashape placed; SceneError if the file is damaged, or a value is missing or no number."""
-    path, text = source.path, read_text(source.path)
-    read_budget(path).check_memory(_ELEMENT_BYTES * text.count("<"), "XML")
-    if "<!DOCTYPE" in text:  # entities could make a short text endless
-        raise SceneError(path, "expected XML as Metashape writes it, found <!DOCTYPE")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise SceneError(path, f"expected XML, found something else ({error})") from error
+    """Read the cameras of Metashape's largest component; SceneError if a value is missing or no number."""
+    path = source.path
+    root, cameras = _metashape_cameras(path)
     with number_errors(path, "expected sensors with 'calibration', and cameras with 'transform'"):
         sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
-        cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-        check_count(path, len(cameras))
         intrinsics = {
             name: _metashape_sensor(sensors[name]) for name in {camera.get("sensor_id") for camera in cameras}
         }
@@ -98,6 +92,39 @@ def read_metashape(source: CameraSource) -> StoredCameras:
             for camera in cameras
         ]
     return StoredCameras(transforms_views(path, frames))
+
+
+def read_metashape_world(path: Path) -> Similarity | None:
+    """Read how Metashape places the cameras in its world, in which it may have exported them otherwise; None if not."""
+    root, cameras = _metashape_cameras(path)
+    component = cameras[0].get("component_id") if cameras else None
+    places = (f".//component[@id='{component}']/transform", "./chunk/transform")
+    move = next((found for place in places if (found := root.find(place)) is not None), None)
+    if move is None:
+        return None
+    text = "expected rotation, translation and scale of 'transform' as numbers"
+    with number_errors(path, text), np.errstate(all="ignore"):
+        R, shift, scale = (
+            np.array(move.findtext(tag, default).split(), np.float64)
+            for tag, default in (("rotation", "1 0 0 0 1 0 0 0 1"), ("translation", "0 0 0"), ("scale", "1"))
+        )
+        return make_similarity(path, np.column_stack([R.reshape(3, 3), shift.reshape(3) / scale]), scale.item())
+
+
+def _metashape_cameras(path: Path) -> tuple[ElementTree.Element, list[ElementTree.Element]]:
+    """Parse a file, and list the cameras that were placed, of the component that has most of them."""
+    text = read_text(path)
+    read_budget(path).check_memory(_ELEMENT_BYTES * text.count("<"), "XML")
+    if "<!DOCTYPE" in text:  # entities could make a short text endless
+        raise SceneError(path, "expected XML as Metashape writes it, found <!DOCTYPE")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise SceneError(path, f"expected XML, found something else ({error})") from error
+    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+    check_count(path, len(cameras))
+    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
+    return root, [camera for camera in cameras if camera.get("component_id") in largest]
 
 
 def _metashape_sensor(sensor: ElementTree.Element) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import write_gaussians
-from gsmerge.scene.files import find_scene_files
+from gsmerge.scene.files import find_scene_files, list_plys
 from gsmerge.scene.no_gaussians import POINTS_ONLY
 
 
@@ -97,12 +97,19 @@ def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, s
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog", ".splat", ".glb"])
-def test_a_scene_in_another_format_is_named(tmp_path: Path, tiny: Tiny, ending: str) -> None:
+def test_the_only_file_of_another_format_is_the_scene(tmp_path: Path, tiny: Tiny, ending: str) -> None:
     path = tmp_path / f"room{ending}"
     write_gaussians(path, tiny.gaussians)
-    with refuses(SceneError, tmp_path, path.name, "name"):
+    assert find_scene_files(tmp_path).ply == find_scene_files(path).ply == path
+    assert list(find_scenes([str(tmp_path)], tmp_path / "out")) == [path]
+    (tmp_path / "index.html").touch()  # a web site, whose file is a result
+    assert not list_plys(tmp_path)
+    (tmp_path / "index.html").unlink()
+    write_gaussians(tmp_path / f"other{ending}", tiny.gaussians)
+    with refuses(SceneError, tmp_path, f"other{ending}", "name"):
         find_scene_files(tmp_path)
-    assert find_scene_files(path).ply == path
+    write_gaussians(tmp_path / "room.ply", tiny.gaussians)
+    assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
 
 
 def test_no_pattern_is_in_two_rows() -> None:

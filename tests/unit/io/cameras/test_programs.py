@@ -16,6 +16,7 @@ from tiny_scene import FLIP, save_json
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
+from gsmerge.io.cameras.json_files import read_dataparser
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 
 C2W = np.linalg.inv(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
@@ -131,6 +132,33 @@ def test_a_focal_length_for_both_axes(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_cameras(path).Ks[0], middle, atol=1e-9)
 
 
+MOVE = "<transform><rotation>0 -1 0 1 0 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale></transform>"
+
+
+@pytest.mark.parametrize("place", ["<chunk>", '<components><component id="1"/><component id="0">'])
+def test_metashape_s_world_is_a_frame_of_its_largest_component(tmp_path: Path, place: str) -> None:
+    """In it Metashape's other exports are, and at the scale of the cameras those of nerfstudio."""
+    path = write_metashape(tmp_path)
+    end = "</component></components>" if "id" in place else ""
+    text = path.read_text().replace("<chunk>", f"<chunk>{place.replace('<chunk>', '')}{MOVE}{end}")
+    path.write_text(text.replace("<camera id", '<camera component_id="0" id').replace('"0" id="0"', '"1" id="0"'))
+    cameras, frames = read_cameras(path), read_dataparser(tmp_path / "a.ply", path)
+    assert cameras.names == ("1", "2")
+    np.testing.assert_allclose(cameras.viewmats, np.linalg.inv(C2W)[1:], atol=1e-9)
+    assert [frame.scale for frame in frames] == [2, 1]
+    np.testing.assert_allclose([frame.shift for frame in frames], [(2, 4, 6), (1, 2, 3)])
+    np.testing.assert_allclose(frames[0].rotation @ (1, 0, 0), (0, 1, 0), atol=1e-9)
+    assert read_dataparser(tmp_path / "a.ply", write_metashape(tmp_path)) == []
+
+
+@pytest.mark.parametrize("value", ["1 0 0", "0 0 0 0 0 0 0 0 0", "nan nan nan nan nan nan nan nan nan", "a"])
+def test_metashape_s_world_is_checked(tmp_path: Path, value: str) -> None:
+    path = write_metashape(tmp_path)
+    path.write_text(path.read_text().replace("<chunk>", f"<chunk>{MOVE}").replace("0 -1 0 1 0 0 0 0 1", value))
+    with refuses(SceneError, "cameras.xml", "expected"):
+        read_dataparser(tmp_path / "a.ply", path)
+
+
 def replace_text(old: str, new: str) -> Callable[[Path], object]:
     def replace(path: Path) -> None:
         place = path / "8.json" if path.is_dir() else path
@@ -153,6 +181,7 @@ def replace_text(old: str, new: str) -> Callable[[Path], object]:
         (write_metashape, "</document>", "", ("cameras.xml", "XML")),
         (write_metashape, "transform", "turn", ("cameras.xml", "at least one")),
         (write_metashape, "<calibration", "<c", ("cameras.xml", "mismatched")),
+        (write_metashape, "<f>", "<k4>0.1</k4><f>", ("cameras.xml: view 0", "k4")),
         (write_metashape, "resolution", "r", ("cameras.xml", "sensors")),
         (write_metashape, 'sensor_id="0"', 'sensor_id="7"', ("cameras.xml", "'7'")),
         (write_metashape, "</transform>", " 1</transform>", ("cameras.xml", "17")),
