@@ -44,9 +44,11 @@ def output_file(output: Path, name: str, *, site: bool = False) -> Path:
 
     That is the page of a ``site``, the points of a folder named ``colmap``, and otherwise ``name``.
     """
-    from gsmerge.io.formats.table import FOLDER, HTML, PLACE, POINTS, SITE
+    from gsmerge.io.formats.table import FOLDER, HTML, OUTPUT_FORMATS, PLACE, POINTS, SITE
 
     if site:
+        if output.suffix.lower() in OUTPUT_FORMATS:
+            raise UsageError(f"site: expected a folder to write into, got {output}")
         return output if HTML.names(output) else output / SITE
     if output.name == FOLDER:
         return output / PLACE / POINTS

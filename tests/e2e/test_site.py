@@ -41,6 +41,8 @@ def test_compact_writes_a_site_where_one_is_asked_for(run: Run, smallest_copy: P
     assert document["output"]["path"] == str(site / "index.html")
     assert document["output"]["bytes"] == sum((site / name).stat().st_size for name in FILES)
     assert_refused(run("compact", smallest_copy, "-o", site, "--budget", "50", *SITE), 2, site / "index.html")
+    for words in ((), ("-o", smallest_copy / "a.sog")):
+        assert_refused(run("compact", smallest_copy, *words, *SITE), 2, "site", "folder")
     run("compact", smallest_copy, "-o", site, *QUICK, code=0)
     assert "scene.compact.ply" in names(site)
 
