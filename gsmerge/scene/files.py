@@ -13,7 +13,6 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.embedded import holds_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.layouts import check_layout, find_unread
 from gsmerge.io.cameras.read import (
@@ -212,9 +211,9 @@ def scene_title(ply: Path) -> str:
 
 
 def result_cameras(ply: Path) -> Path | None:
-    """Find the cameras that ``compact`` wrote into or beside a result; None without them."""
+    """Find the cameras that ``compact`` wrote beside a result; None without them."""
     beside = viewer_cameras_path(ply)
-    return ply if holds_cameras(ply) else beside if beside.is_file() else None
+    return beside if beside.is_file() else None
 
 
 def named_path(path: StrPath | None) -> Path | None:
@@ -337,7 +336,7 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
 
 def _has_own_camera(path: Path) -> bool:
     with suppress(SceneError):  # which reading the part raises again
-        return holds_cameras(path) or read_sharp_camera(path) is not None
+        return read_sharp_camera(path) is not None
     return False
 
 

@@ -19,10 +19,8 @@ from fuzz.mutate import mutate
 from hostile import array_files, camera_models, places
 from hostile.case import cameras_of, without_transforms
 from messages import says
-from saved_cameras import embed as embed_cameras
 from tiny_scene import make_tiny
 
-import gsmerge
 from gsmerge.cli import main
 from gsmerge.file_checks import check_content
 
@@ -31,13 +29,6 @@ FEWER = 10  # of kinds that take one or two seconds for each mutation: their row
 LIMITS = Limits(1 << 30, 100)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
-
-
-def embed(folder: Path) -> None:
-    cameras = gsmerge.read_cameras(folder / "transforms.json")
-    scene = gsmerge.read_scene(folder)
-    without_transforms(folder)
-    embed_cameras(folder / "scene.ply", scene.cameras, cameras.names)
 
 
 def of_views(kind: str) -> Callable[[Path], None]:
@@ -79,7 +70,6 @@ STATE = ("compact", "--fit", "none", "-o", "made.ply", "--overwrite", "a.gsm")
 KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
     "parts": Kind("view_*.ply", places.in_parts(lambda path: None), many=FEWER),
-    "cameras inside": Kind("scene.ply", embed, many=FEWER),
     "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
     "photos": Kind("images/*.png", named=("--images", "images")),
     "views.npz": Kind("views.npz", of_views("views.npz"), named=("--cameras", "views.npz")),

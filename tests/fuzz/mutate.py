@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import io
 import json
@@ -13,8 +12,6 @@ import zlib
 from collections.abc import Callable
 from random import Random
 from typing import Any
-
-from gsmerge.io.cameras.embedded import PREFIX
 
 Change = Callable[[bytes, Random], bytes]
 
@@ -116,15 +113,8 @@ def change_glb(data: bytes, random: Random, leaf: Change) -> bytes:
 
 
 def change_ply(data: bytes, random: Random, leaf: Change) -> bytes:
-    """Change lines of the header, cameras in it, or the rows."""
+    """Change lines of the header, or the rows."""
     head, mark, rows = data.partition(b"end_header\n")
-    start = f"comment {PREFIX}".rstrip().encode()
-    lines = head.splitlines(keepends=True)
-    stored = [line[len(start) :].strip() for line in lines if line.startswith(start)]
-    if stored and random.random() < 0.6:
-        text = zlib.compress(mutate(zlib.decompress(base64.b64decode(b"".join(stored))), random, leaf))
-        others = b"".join(line for line in lines if not line.startswith(start))
-        return others + start + b" " + base64.b64encode(text) + b"\n" + mark + rows
     if random.random() < 0.5:
         return change_text(head, random, leaf) + mark + rows
     return head + mark + (change_text if b"format ascii" in head else leaf_alone)(rows, random, leaf)

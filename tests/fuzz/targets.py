@@ -19,7 +19,6 @@ import numpy as np
 from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
-from saved_cameras import camera_comments
 from splat_transform_programs import write_set
 from tiny_scene import (
     make_tiny,
@@ -47,7 +46,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Gaussians
 
 PHOTO_ENDINGS = (".png", ".jpg", ".bmp", ".webp", ".tiff", ".ppm")
 PLAIN = re.compile(r"([\w-]+/)?[\w-]+\.\w+")
@@ -185,8 +184,8 @@ def of_bytes(encode: Callable[[Gaussians], bytes]) -> Seeds:
 
 
 def plys(folder: Path) -> Iterable[bytes]:
-    """Make a ``.ply`` as binary of both orders, as text, with a list element, and with comments."""
-    g, tiny = random_gaussians(5, 1, degree=1), make_tiny(4, 4)
+    """Make a ``.ply`` as binary of both orders, as text, and with a list element."""
+    g = random_gaussians(5, 1, degree=1)
     gsmerge.write_ply(folder / "a.ply", g)
     data = (folder / "a.ply").read_bytes()
     head, rows = data.split(b"end_header\n")
@@ -198,9 +197,6 @@ def plys(folder: Path) -> Iterable[bytes]:
     faces = b"element face 2\nproperty list uchar int vertex_indices\n"
     yield head + faces + b"end_header\n" + rows + b"\1\0\0\0\0\2\0\0\0\0\1\0\0\0"
     yield head.replace(b"element vertex", faces + b"element vertex") + b"end_header\n" + bytes(2) + rows
-    cameras = Cameras(tiny.w2c, np.tile(tiny.K, (3, 1, 1)), tiny.width, tiny.height)
-    gsmerge.write_ply(folder / "b.ply", g, comments=camera_comments(cameras, tiny.names))
-    yield (folder / "b.ply").read_bytes()
 
 
 def sharp(folder: Path) -> Iterable[bytes]:
@@ -334,7 +330,6 @@ TARGETS: dict[str, Target] = {
     "long-lrm": Target("moved/opencv_cameras.json", moved, check_cameras),
     "dataparser": Target("moved/transforms.json", dataparser, lambda path: read_dataparser(path, path)),
     "npz": Target("results.npz", arrays, check_arrays),
-    "cameras-embedded": Target("a.ply", plys, check_cameras),
     "sharp": Target("a.ply", sharp, read_sharp_camera),
     "gsm": Target("a.gsm", states, load_state),
     "checkpoint": Target("a.safetensors", checkpoint, load_checkpoint),

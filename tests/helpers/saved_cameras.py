@@ -1,11 +1,8 @@
-"""Cameras as ``transforms.json``, in a file or in the header of a ``.ply``, where older versions wrote them."""
+"""Cameras as ``transforms.json``."""
 
 from __future__ import annotations
 
-import base64
 import json
-import textwrap
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.io.cameras.camera_file import C2W_OPENGL, from_viewmats
-from gsmerge.io.cameras.embedded import PREFIX
 from gsmerge.types import Cameras
 
 
@@ -33,16 +29,3 @@ def transforms_document(cameras: Cameras, names: Sequence[str]) -> dict[str, Any
 
 def write_transforms(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
     path.write_text(json.dumps(transforms_document(cameras, names)), encoding="utf-8")
-
-
-def camera_comments(cameras: Cameras, names: Sequence[str]) -> list[str]:
-    """Comments for the header of a ``.ply``."""
-    text = json.dumps(transforms_document(cameras, names))
-    packed = base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")
-    return [PREFIX + line for line in textwrap.wrap(packed, 900)]
-
-
-def embed(path: Path, cameras: Cameras, names: Sequence[str]) -> None:
-    """Write cameras into the header of a ``.ply``."""
-    lines = "".join(f"comment {line}\n" for line in camera_comments(cameras, names))
-    path.write_bytes(path.read_bytes().replace(b"element", lines.encode() + b"element", 1))

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import struct
-import textwrap
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -188,31 +185,6 @@ def _pose_lists() -> dict[str, Case]:
     return cases | {"pose list as it is": Case(spoil(lambda x: x), READ)}
 
 
-def _embedded() -> dict[str, Case]:
-    def spoil(change: Callable[[bytes], bytes] = lambda text: text, before: int = 0) -> Spoil:
-        """The cameras inside the .ply, after so many bytes of other comments."""
-
-        def both(folder: Path) -> None:
-            text = zlib.compress(change((folder / "transforms.json").read_bytes()), 9)
-            (folder / "transforms.json").unlink()
-            wrapped = textwrap.wrap(base64.b64encode(text).decode(), 900)
-            lines = [b"x" * 91] * (before // 100) + [b"gsmerge cameras: " + line.encode() for line in wrapped]
-            start, end, rest = (folder / "scene.ply").read_bytes().partition(b"element vertex")
-            comments = b"".join(b"comment " + line + b"\n" for line in lines)
-            (folder / "scene.ply").write_bytes(start + comments + end + rest)
-
-        return both
-
-    cases = {"after 60,000 bytes": Case(spoil(before=60_000), READ)}
-    texts: dict[str, Callable[[bytes], bytes]] = {
-        "of empty lists": lambda _: b'{"frames":[' + b"[]," * (10 << 20) + b"[]]}",
-        "of wide letters": lambda _: '{"a":"\U0001f600'.encode() + b"a" * (16 << 20) + b'"}',
-        "of nested lists": lambda _: b"[" * 100_000, "of spaces": lambda _: b" " * (32 << 20),
-    }  # fmt: skip
-    cases |= {word: Case(spoil(change), (3,), "scene.ply") for word, change in texts.items()}
-    return {f"inside the ply, {word}": case for word, case in cases.items()}
-
-
-GROUPS = (_embedded, _other_json, _binary, _text, _pose_lists)
+GROUPS = (_other_json, _binary, _text, _pose_lists)
 CASES = {f"cameras: {name}": case for group in GROUPS for name, case in group().items()}
 CASES["cameras: input_frame_idx.txt with 3,000,000 numbers"] = Case(many_numbers, EITHER)

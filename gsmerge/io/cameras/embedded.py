@@ -1,61 +1,18 @@
-"""Cameras inside a ``.ply``: comments of its header, which other readers skip, or the elements of SHARP."""
+"""Cameras inside a ``.ply``: the elements of SHARP."""
 
 from __future__ import annotations
-
-import base64
-import binascii
-import zlib
-from pathlib import Path
 
 import numpy as np
 from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import ReadBudget, check_file, parse_json, read_errors
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.cameras.json_files import transforms_views
-from gsmerge.io.formats.ply import MAX_HEADER_BYTES
 from gsmerge.io.formats.table import PLY, input_format
 
-EMBEDDED = "inside the .ply"  # source of such cameras
-PREFIX = "gsmerge cameras: "
-_TEXT_COPIES = 8  # bytes of memory for each of unpacked JSON: as it comes, and four for each character
-SHARP = "SHARP"  # the same
+SHARP = "SHARP"  # source of such cameras
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
 SHARP_LAYERS = 2  # Gaussians per cell: a front and a back layer
-
-
-def holds_cameras(path: Path) -> bool:
-    """Return whether a file is a ``.ply`` with cameras in its header."""
-    return path.suffix.lower() == ".ply" and bool(camera_lines(path))
-
-
-def camera_lines(path: Path) -> list[bytes]:
-    """Return the comment lines of a ``.ply`` that hold cameras; empty without any."""
-    check_file(path)
-    with read_errors(path), path.open("rb") as file:
-        header = file.read(MAX_HEADER_BYTES if file.peek(3)[:3] == b"ply" else 0).partition(b"\nend_header")[0]
-    start = f"comment {PREFIX}".encode()
-    return [line[len(start) :].strip() for line in header.splitlines() if line.startswith(start)]
-
-
-def read_embedded(source: CameraSource) -> StoredCameras:
-    """Read the cameras in the header of a ``.ply``; SceneError if they are damaged."""
-    path, lines = source.path, camera_lines(source.path)
-    try:
-        packed, unpacking = base64.b64decode(b"".join(lines), validate=True), zlib.decompressobj()
-        budget = ReadBudget(path, len(packed))
-        text = unpacking.decompress(packed, budget.memory // _TEXT_COPIES)
-        if not unpacking.eof:
-            raise ValueError("they are cut off or too long")
-        data = parse_json(text.decode("utf-8"), budget)
-        if not isinstance(data, dict) or "frames" not in data:
-            raise ValueError("they have no 'frames'")
-    except (ValueError, zlib.error, binascii.Error) as error:
-        problem = f"expected whole cameras in its header, found damaged ones ({error})"
-        raise SceneError(path, problem, "name others with --cameras") from error
-    return StoredCameras(transforms_views(path, data))
 
 
 def read_sharp(source: CameraSource) -> StoredCameras | None:

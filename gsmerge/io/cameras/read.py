@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
-from gsmerge.io.cameras.embedded import EMBEDDED, SHARP, camera_lines, read_embedded, read_sharp
+from gsmerge.io.cameras.embedded import SHARP, read_sharp
 from gsmerge.io.cameras.json_files import (
     FFGS,
     VIEWER_CAMERAS,
@@ -201,8 +201,6 @@ CAMERA_FORMATS = (
     CameraFormat("npz of poses", "`.npz` of what VGGT, or MapAnything or AnySplat (camera-to-world), returns",
                  ".npz", _READ_DA3, W2C_OPENCV, "pixels; of AnySplat divided by the size; may be missing"),
     _RE10K,
-    CameraFormat(EMBEDDED, "inside a `.ply` of gsmerge ([below](#cameras-inside-a-ply))", ".ply", read_embedded,
-                 C2W_OPENGL, "pixels", lambda file: bool(camera_lines(file.path))),
     _SHARP,
     CameraFormat("state", "inside a `.gsm` of gsmerge extend", SUFFIX, _READ_VIEWS, W2C_OPENCV, "pixels"),
 )  # fmt: skip
