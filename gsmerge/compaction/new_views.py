@@ -18,12 +18,15 @@ from gsmerge.facts.prepare import Prepared, Reference
 from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.facts.views import pick_views, subset
 from gsmerge.geometry import nearest_views
+from gsmerge.kernels.elementary import power
 from gsmerge.measure.visibility import visible_pixels
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, make_plan
 from gsmerge.raster.photos import NEAR, scene_photos, score_photos, shrink_pictures
 from gsmerge.runtime.record import add_seconds, record_part
+from gsmerge.settings.budget import parse_share
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.stages import SHARE
 from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
@@ -37,6 +40,9 @@ LEAST_SEEN = 0.02  # share of a left-out photo that the others must cover
 # ten training captures it is .1 to .95, at most .07 above the share of confirmed depth; small pictures alone say more
 # where detail is finer than they show.
 MOST_KEPT = 0.85
+# Small pictures have more detail to a pixel, so that fewer Gaussians cost them more: theirs are as many times the usual
+# share as the result's times, to this power. Gains at 1 % of five captures: 1.0 dB off for 2.3.
+USUAL, LESS = parse_share(SHARE), 0.3
 # What a run of these settings decides by work on the whole scene, or leaves out of the result
 LEFT_TO_RUN: dict[str, Any] = {
     "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None, "time_budget": None, "photo_scale": 1.0,
@@ -96,7 +102,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
         return None
     with record_part(silent=True) as record:
         small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // SIDE))
-        share = min(1.0, count / scene.pixels_per_view / len(scene))
+        times = count / (USUAL * scene.pixels_per_view * len(scene))
+        share = min(1.0, USUAL * float(power(times, LESS)))
         rounds = [_leave_out(small, part, prepared, plan, build, share) for part in choose_views(small, views)]
     add_seconds({"new views": sum(record.seconds.values())})
     shares, *scores = np.concatenate(rounds, 1)
