@@ -97,8 +97,9 @@ def stage(name: str) -> Iterator[None]:
 
 
 def note(text: str) -> None:
-    """Add a sentence for the user to the current record."""
-    current_record().notes.append(text)
+    """Add a sentence for the user to the current record, once."""
+    notes = current_record().notes
+    notes += [] if text in notes else [text]
 
 
 def choose(**choices: Any) -> None:

@@ -39,7 +39,7 @@ def test_stages_notes_and_choices_go_to_the_current_run() -> None:
         assert encode() == encode() == 3
         report_progress("fit: step", 1, 2)
     assert list(record.seconds) == ["encode"]
-    assert record.notes == ["odd", "odd"]
+    assert record.notes == ["odd"]
     assert record.choices == {"groups": 3}
     count = len(STAGES)
     assert events == [("encode", STAGES.index("encode"), count), ("fit: step", 1, 2), ("done", count, count)]
