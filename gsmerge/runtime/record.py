@@ -118,7 +118,7 @@ def adopt(part: Record) -> None:
     """Copy choices and notes of a part's record into the current record."""
     record = current_record()
     record.choices |= part.choices
-    record.notes += part.notes
+    record.notes += [text for text in part.notes if text not in record.notes]
 
 
 def report_progress(text: str, done: int, total: int) -> None:
