@@ -15,6 +15,7 @@ NO_TEXT = (".ply", *_PACKED_SCENES, *_PHOTOS, ".torch", ".safetensors", ".bin") 
 _START = 1 << 10  # bytes of a file that are looked at
 _DOWNLOAD = "download it again, from a browser if it needs a click or a login"
 _UNPACK = "unpack it, and name the scene that is in it"
+_GLB = "export it as .glb, which is one file"
 _AGAIN = "copy or download it again"
 
 
@@ -51,6 +52,7 @@ OTHER_CONTENTS = (
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
+    OtherContent("glTF in several files", r"\s*\{", _GLB, wrong=(".gltf",)),
     OtherContent("a PLY file", r"ply\r?\n", "give it the ending .ply", wrong=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
@@ -75,5 +77,5 @@ def check_first_bytes(path: Path, size: int) -> None:
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
-            expected = "scene" if row.remedy == _UNPACK else f"{ending} file".strip()
+            expected = "scene" if row.remedy in (_UNPACK, _GLB) else f"{ending} file".strip()
             raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

@@ -2,7 +2,8 @@
 
 Its axis y points up, that of a ``.ply`` down: Gaussians are turned by half a turn about z, and the reader turns them
 back. Viewers that do not know the extension show points in the base colours. Drafts of the extension are read,
-too: scales as logarithms, of which some are negative, and ``_ROTATION``, ``_SCALE`` and ``COLOR_0``.
+too: scales as logarithms, of which some are negative, and ``_ROTATION``, ``_SCALE`` and ``COLOR_0``; and a ``.spz`` in
+the place of the values, as Cesium writes it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
+from gsmerge.io.formats import spz
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, to_bytes, to_columns, to_stored, turn_half, turner
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
@@ -29,7 +31,8 @@ MAX_DEGREE = 3
 NAME = "KHR_gaussian_splatting"
 HARMONICS = [f"{NAME}:SH_DEGREE_{degree}_COEF_{i}" for degree in range(MAX_DEGREE + 1) for i in range(2 * degree + 1)]
 COLOR_SPACE = "srgb_rec709_display"
-READ_EXTENSIONS = {NAME, "KHR_mesh_quantization", "KHR_materials_unlit"}
+SPZ_NAMES = (f"{NAME}_compression_spz_2", f"{NAME}_compression_spz")  # a .spz as one part of the binary chunk
+READ_EXTENSIONS = {NAME, *SPZ_NAMES, "KHR_mesh_quantization", "KHR_materials_unlit"}
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0  # numbers of glTF
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _WIDTHS = {name: width for width, name in _TYPES.items()}
@@ -127,7 +130,7 @@ def read_rows(path: Path) -> StoredRows:
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # what is not finite is set aside later
         document = _read_document(file, budget)
-        content = _Content(file, document, file.tell(), budget.file_bytes)
+        content = _Content(path, file, document, file.tell(), budget.file_bytes)
         for mesh, place in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
             parts.append(_read_splats(content, mesh, place, sizes))
@@ -168,11 +171,27 @@ class _Values:
 class _Content:
     """The content of a ``.glb`` whose binary chunk, of ``end - start`` bytes, is read part by part."""
 
+    path: Path
     file: IO[bytes]
     document: dict[str, Any]
     start: int
     end: int
     num_read: list[int] = field(default_factory=lambda: [0])  # bytes of all parts so far, which are different ones
+
+    def packed(self, view_id: int) -> bytes:
+        """Read the bytes of a view, which must lie in the chunk."""
+        view = self.document["bufferViews"][view_id]
+        at, size = self.start + view.get("byteOffset", 0), check_whole(view["byteLength"], "byteLength", 1)
+        self.num_read[0] += size
+        if view["buffer"] != 0 or "uri" in self.document["buffers"][0] or not self.start <= at <= self.end - size:
+            raise _ForeignError(f"one that is cut, or in another file: {size} bytes are not in its {self.end} bytes")
+        self._check_read()
+        self.file.seek(at)
+        return self.file.read(size)
+
+    def _check_read(self) -> None:
+        if self.num_read[0] > self.end - self.start:
+            raise _ForeignError("one that shows the same values in several places")
 
     def values(self, accessor_id: int) -> _Values:
         """Read the values of an accessor, which must lie in the chunk."""
@@ -190,8 +209,7 @@ class _Content:
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
         if not each <= stride <= _MAX_STRIDE or not inside:
             raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
-        if self.num_read[0] > self.end - self.start:
-            raise _ForeignError("one that shows the same values in several places")
+        self._check_read()
         self.file.seek(at)
         rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
@@ -247,11 +265,17 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
 
 def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int]) -> Packed:
     """Read one primitive, which ``place [4,4]`` moves, and add its bytes to ``sizes`` by attribute."""
-    splats, attributes = primitive["extensions"][NAME], primitive["attributes"]
+    splats, attributes = primitive["extensions"][NAME], primitive.get("attributes", {})
     kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
-    if splats.get("extensions") or (kernel, space) != ("ellipse", COLOR_SPACE):
-        more = ", ".join(map(str, splats.get("extensions") or (kernel, space)))
-        raise _ForeignError(f"Gaussians of another kind ({more})")
+    more = dict(splats.get("extensions") or {})
+    spz_part = next((more.pop(name) for name in SPZ_NAMES if name in more), None)
+    if more or (kernel, space) != ("ellipse", COLOR_SPACE):
+        raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, more or (kernel, space)))})")
+    if spz_part is not None:
+        rows, _, _, parts = spz.unpack_rows(content.path, content.packed(spz_part["bufferView"]))
+        sizes.update({name: sizes.get(name, 0) + size for name, size in parts.items()})
+        turn = _mover(place, rows.num_higher)
+        return replace(rows, unpack=lambda block: turn(rows.unpack(block)))
 
     def read(kind: str, width: int, *names: str) -> _Values:
         name = next((name for name in names if name in attributes), None)

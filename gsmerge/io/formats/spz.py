@@ -21,11 +21,10 @@ from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
@@ -52,8 +51,6 @@ GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # which 
 SYSTEM, UNIX = 9, b"\3"  # place of the system in the header of gzip, and the one that is written for all
 FINE = 14  # bits of a position within the scene: a sixteenth of a pixel where it fills a thousand
 MAX_FRACTION = 23
-# As the extra asks for; the second works beside a wheel and in a checkout
-INSTALL = 'install gsmerge[spz4], or pip install "zstandard>=0.23,<1"'
 LARGEST = 2**23 - 1
 COLOR_SCALE = 0.15  # of sh0: colours somewhat outside [0, 1] survive
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")  # in the order of the file
@@ -63,7 +60,9 @@ AGAIN = "copy or export it again"
 
 
 @dataclass(frozen=True)
-class _Header:
+class Header:
+    """Numbers at the start of a file."""
+
     version: int
     count: int
     degree: int
@@ -83,26 +82,31 @@ class _Header:
 
 
 def read_rows(path: Path) -> arrays.StoredRows:
-    """Read the Gaussians of a ``.spz``; SceneError if damaged, UsageError without ``zstandard`` for version 4."""
+    """Read the Gaussians of a ``.spz``; SceneError if it is damaged."""
     check_file(path)
     with read_errors(path), path.open("rb") as file:
         packed = file.read(len(ZSTANDARD_MAGIC))
         if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # others are refused, whatever their size
             file.seek(0)
             packed = file.read()
-    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions = read(path, packed)
+    rows, header, extensions, sizes = unpack_rows(path, packed)
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
     turn = arrays.turner(_axes_turn(axes), header.num_higher)
-    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
-
-    def unpack(block: slice) -> arrays.Columns:
-        return turn(_unpack([part[block] for part in parts], header))
-
-    rows = arrays.Packed(header.count, header.num_higher, unpack)
-    stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
+    turned = replace(rows, unpack=lambda block: turn(rows.unpack(block)))
+    stored = arrays.to_stored([turned], f".spz version {header.version}", sizes, mip=bool(header.flags & MIP_FLAG))
     notes = (f"the file says that its axes are {axes}: turned to {PLY_AXES}, those of a .ply",)
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
+
+
+def unpack_rows(path: Path, packed: bytes) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
+    """Return the Gaussians in their own axes, header, extensions and bytes by attribute; SceneError if damaged."""
+    read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
+    header, parts, extensions = read(path, packed)
+    sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
+    rows = arrays.Packed(
+        header.count, header.num_higher, lambda block: _unpack([part[block] for part in parts], header)
+    )
+    return rows, header, extensions, sizes
 
 
 def _stored_axes(path: Path, extensions: bytes) -> str:
@@ -128,12 +132,12 @@ def _axes_turn(axes: str) -> np.ndarray:
     return turn * (1, -1, -1) if axes in _REVERSED else turn
 
 
-def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> _Header:
+def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
     """Read the header, and check it against the number of bytes of the file."""
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
     magic, *numbers = HEADER.unpack(start)
-    header = _Header(*numbers)
+    header = Header(*numbers)
     if magic != MAGIC or header.version not in versions or header.degree > MAX_READ_DEGREE or header.fraction > 30:
         found = f"version {header.version}, SH degree {header.degree}" if magic == MAGIC else "another file"
         raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
@@ -143,7 +147,7 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
     return header
 
 
-def _gzip_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray], bytes]:
+def _gzip_parts(path: Path, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
     stream = zlib.decompressobj(wbits=31)
     try:
         header = _read_header(path, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
@@ -181,8 +185,10 @@ def problem_at_end(path: Path) -> str | None:
     return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
 
 
-def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarray], bytes]:
+def _zstandard_parts(path: Path, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
     """Read header, parts and extensions of version 4."""
+    import zstandard  # few files need it
+
     header = _read_header(path, packed, packed[: HEADER.size], (4,))
     sizes = [header.count * width for width in header.widths if width]
     try:
@@ -197,14 +203,13 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
     if ends[-1] > len(packed):
         problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
         raise SceneError(path, problem, AGAIN)
-    library = zstandard()
-    unpacker = library.ZstdDecompressor()
+    unpacker = zstandard.ZstdDecompressor()
     try:  # one byte more than expected at most, whatever a stream says of its size
         columns = [
             unpacker.stream_reader(packed[i:j]).read(size + 1)
             for (i, j), size in zip(pairwise(ends), sizes, strict=True)
         ]
-    except library.ZstdError as error:
+    except zstandard.ZstdError as error:
         raise SceneError(path, "damaged: expected Zstandard streams of .spz version 4, found others", AGAIN) from error
     if [len(column) for column in columns] != sizes:
         raise SceneError(path, "truncated or damaged: a column of .spz version 4 is of another size", AGAIN)
@@ -214,7 +219,7 @@ def _zstandard_parts(path: Path, packed: bytes) -> tuple[_Header, list[np.ndarra
     return header, parts, packed[start : min(at, start + _MAX_EXTENSIONS)]
 
 
-def _unpack(parts: list[np.ndarray], header: _Header) -> arrays.Columns:
+def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
     version, fraction = header.version, header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
     words = np.zeros((len(means), 3, 4), np.uint8)  # signed numbers of three little-endian bytes
@@ -306,12 +311,3 @@ def gzip_bytes(data: bytes, level: int = 9, strategy: int = zlib.Z_DEFAULT_STRAT
     packer = zlib.compressobj(level, wbits=31, strategy=strategy)  # without a time
     packed = packer.compress(data) + packer.flush()
     return packed[:SYSTEM] + UNIX + packed[SYSTEM + 1 :]
-
-
-def zstandard() -> ModuleType:
-    """Import the package ``zstandard``, which version 4 needs; UsageError if it is not installed."""
-    try:
-        import zstandard
-    except ImportError as error:
-        raise UsageError(f".spz of version 4: zstandard is not installed; {INSTALL}") from error
-    return zstandard

@@ -50,6 +50,7 @@ CONTENTS = (
     (b"7z\xbc\xaf\x27\x1c\0\4", SCENES, ("7z", "unpack")),
     (b"Rar!\x1a\x07\x01\0", SCENES, ("rar", "unpack")),
     (b"ply\nformat ascii 1.0\n", SCENES[1:], ("PLY", ".ply")),
+    (b'{"asset": {"version": "2.0"}}', (".gltf",), ("glTF", ".glb")),
 )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from former_formats import spz4_bytes
 from messages import refuses
 from slow_readers import drawn
 
@@ -19,6 +20,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import multiply_quats, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import holds_gaussians
+from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.kernels import elementary
 from gsmerge.types import SH_C0
 
@@ -170,6 +172,48 @@ def test_quantised_values(scene: Scene, tmp_path: Path) -> None:
     assert np.abs((actual.quats * expected.quats).sum(1)).min() > 0.9998
     np.testing.assert_allclose(actual.scales, expected.scales.clip(0, 1), atol=1 / 65535)
     np.testing.assert_allclose(actual.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
+
+
+def save_glb_of_spz(path: Path, packed: bytes, name: str, **view: Any) -> None:
+    """Write a ``.spz`` as one primitive of a ``.glb``, as Cesium's tiles have it, in a node that moves it."""
+    columns = {"POSITION": np.frombuffer(packed + bytes(-len(packed) % 12), "<f4").reshape(-1, 3)}
+    document = save_glb(path, columns, [{"mesh": 0, "translation": [1, 2, 3]}], extensions={name: {"bufferView": 0}})
+    document["bufferViews"][0].update({"byteLength": len(packed), **view})
+    document["accessors"] = [{"componentType": 5126, "count": 2, "type": "VEC3"}]
+    put(path, document | {"extensionsRequired": [NAME, name]}, columns["POSITION"].tobytes())
+
+
+@pytest.mark.parametrize("name", [f"{NAME}_compression_spz_2", f"{NAME}_compression_spz"])
+@pytest.mark.parametrize("write", [spz_bytes, spz4_bytes])
+def test_a_spz_inside(scene: Scene, tmp_path: Path, name: str, write: Callable[[Gaussians], bytes]) -> None:
+    """Its axes are those of glTF."""
+    path, packed = tmp_path / "a.glb", write(drawn(scene, 3))
+    (tmp_path / "a.spz").write_bytes(packed)
+    save_glb_of_spz(path, packed, name)
+    inside = read_gaussians(tmp_path / "a.spz").gaussians
+    save_glb(tmp_path / "b.glb", attributes_of(inside), [{"mesh": 0, "translation": [1, 2, 3]}])
+    actual = read_gaussians(path)
+    same(actual.gaussians, read_gaussians(tmp_path / "b.glb").gaussians)
+    assert holds_gaussians(path)
+    assert actual.info.file_bytes == path.stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("view", "said"),
+    [
+        ({"byteLength": 10**9}, "cut"),
+        ({"byteOffset": -900}, "cut"),
+        ({"byteOffset": 4}, "gzip"),
+        ({"buffer": 1}, "cut"),
+    ],
+)
+def test_a_damaged_spz_inside(scene: Scene, tmp_path: Path, view: Document, said: str) -> None:
+    packed = spz_bytes(drawn(scene, 1))
+    if "byteOffset" in view:
+        view = view | {"byteLength": 500}
+    save_glb_of_spz(tmp_path / "a.glb", packed, f"{NAME}_compression_spz_2", **view)
+    with refuses(SceneError, "a.glb", said):
+        read_gaussians(tmp_path / "a.glb")
 
 
 def of_primitive(change: Callable[[Document], object]) -> Callable[[Document], object]:

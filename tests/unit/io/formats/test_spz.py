@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import gzip
 import struct
-import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 from former_formats import spz4_bytes
 from hostile.case import sparse
 from messages import refuses
 from slow_readers import assert_damage_is_one_line, corners
 
 from gsmerge import Gaussians
-from gsmerge.cli import main
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError
 from gsmerge.geometry import covariances, turn_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.read import file_notes
 from gsmerge.io.formats.spz import AXES, gzip_bytes, spz_bytes
-
-zstandard = pytest.importorskip("zstandard")
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
 NIANTIC = bytes.fromhex(
@@ -238,17 +235,3 @@ def test_a_wrong_version_leaks_no_warning(tmp_path: Path) -> None:
     data = gzip.decompress(spz_bytes(some(0, 2000)))
     (tmp_path / "a.spz").write_bytes(gzip.compress(data[:4] + struct.pack("<I", 1) + data[8:]))
     assert 0 < read_gaussians(tmp_path / "a.spz").info.num_nonfinite < 2000  # warnings are errors in tests
-
-
-def test_without_the_library(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.spz"
-    path.write_bytes(NIANTIC)
-    monkeypatch.setitem(sys.modules, "zstandard", None)
-    with refuses(UsageError, ".spz of version 4", "gsmerge[spz4]", 'pip install "zstandard'):
-        read_gaussians(path)
-    assert main(["inspect", str(path)]) == 2
-    assert "zstandard is" in capsys.readouterr().err
-    write_gaussians(tmp_path / "b.spz", some(0))
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.spz", "b.spz"]
