@@ -25,7 +25,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import new_member, open_archive, read_member
-from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, read_budget, read_errors, read_text
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
@@ -110,9 +110,10 @@ def read_rows(path: Path) -> arrays.StoredRows:
 
 def read_unbundled(path: Path) -> SogContent:
     """Read the Gaussians of a ``meta.json`` and the textures beside it; SceneError as in :func:`read_rows`."""
-    check_file(path)
+    names = read_text(path)
     with _damage(path):
-        size = sum(entry.stat().st_size for entry in os.scandir(path.parent))
+        entries = (entry for entry in os.scandir(path.parent) if f'"{entry.name}"' in names or entry.name == path.name)
+        size = sum(entry.stat().st_size for entry in entries)
         return _read_content(_Folder(path.parent, size), ReadBudget(path, size))
 
 
