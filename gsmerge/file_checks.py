@@ -103,7 +103,7 @@ def _read(path: Path) -> FileCheck:
     if suffix in CAMERAS:
         return _read_cameras(path)
     check_file(path)
-    endings = ", ".join((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX))
+    endings = ", ".join(dict.fromkeys((*SCENE_SUFFIXES, *CAMERAS, SUFFIX, NETWORKS, streamed.INDEX)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
 
 

@@ -177,7 +177,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts["notes"] += [] if odd is None else [odd]
     facts["notes"] += [agreement.doubt] if agreement is not None and agreement.doubt else []
     if not is_result:
-        facts["exporter"] = exporter_names(load.exporters)
+        is_known = load.scene.aligned or any(exporter.is_marked for exporter in load.exporters)
+        facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
     if shows_nothing(scene):
         return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
     if load.recovery is None or load.alignment is None:

@@ -143,7 +143,7 @@ def find_scene_files(
     Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
     result, ``NAME.cameras.json``, over all others.
 
-    The search goes through the given folder, that of the ``.ply``, the folder above it for ``gs_ply/``, ``ply/`` and
+    The search goes through the given folder, that of the ``.ply`` and of what it links to, the folder above it for ``gs_ply/``, ``ply/`` and
     ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of ``PLY_PLACES``,
     ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has cameras, the only
     file of any name that holds cameras is taken, or one of a program whose cameras are not read, to say so. Images
@@ -178,7 +178,8 @@ def find_scene_files(
     above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
-    roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, *above)))
+    target = Path(os.path.realpath(ply)).parent  # of a link
+    roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
     if cameras is None:
         places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
         own = ply.parent.parent / POSES if is_frame(ply) else ply  # by which depth maps are placed
