@@ -143,12 +143,12 @@ def find_scene_files(
     Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
     result, ``NAME.cameras.json``, over all others.
 
-    The search goes through the given folder, that of the ``.ply`` and of what it links to, the folder above it for ``gs_ply/``, ``ply/`` and
-    ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of ``PLY_PLACES``,
-    ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has cameras, the only
-    file of any name that holds cameras is taken, or one of a program whose cameras are not read, to say so. Images
-    inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw those. A result of
-    gsmerge is taken if a folder has nothing else.
+    The search goes through the given folder, that of the ``.ply`` and of what it links to, the folder above it for
+    ``gs_ply/``, ``ply/`` and ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of
+    ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has
+    cameras, the only file of any name that holds cameras is taken, or one of a program whose cameras are not read, to
+    say so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw
+    those. A result of gsmerge is taken if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one

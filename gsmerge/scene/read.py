@@ -117,7 +117,7 @@ class Loaded:
         cameras, recovery, info = self.scene.cameras, self.recovery, self.info
         facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
         facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
-        facts["moved_cameras"] = list(self.moves)
+        facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
         if self.files.parts:
             facts["parts"] = [str(path) for path in self.files.parts]
         if self.joined:
