@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from gsmerge.errors import SceneError
+from gsmerge.io.image_names import IMAGE_SUFFIXES
 
 
 class Layout(NamedTuple):
-    """Files of a program: those that are read without a remedy, others with one."""
+    """Patterns of a program's files, the export of it that is read if they are not, and what they start with."""
 
-    files: str  # patterns of their paths in a scene's folder
+    files: str
     program: str = ""
-    remedy: str = ""  # the export of it that is read
-    start: str = ""  # regular expression of what stands at the start of a file
+    remedy: str = ""
+    start: str = ""  # regular expression
 
 
 POSE_FOLDERS = ("pose", "poses")  # with a file for each view
@@ -79,24 +79,23 @@ LAYOUTS = (
 )  # fmt: skip
 
 
-def find_unread(place: Path) -> Path | None:
-    """Find a file of cameras that are not read: a path itself, or one below a folder; None without one."""
-    return next((path for path, _ in _unread(place)), None)
-
-
 def check_layout(place: Path) -> None:
     """Raise SceneError with the program and its export that is read, if a file, or one below a folder, is not read."""
-    for path, layout in _unread(place):
+    if (path := find_unread(place)) is not None:
+        layout = next(layout for layout in LAYOUTS if _is_of(path, layout))
         raise SceneError(path, f"expected cameras that are read, found those of {layout.program}", layout.remedy)
 
 
-def _unread(place: Path) -> Iterator[tuple[Path, Layout]]:
-    """Yield files of cameras that are not read with their layouts."""
+def find_unread(place: Path) -> Path | None:
+    """Find a file of cameras that are not read: a path itself, or one below a folder; None without one."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
-    files = [path for path in (sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]) if path.is_file()]
-    for layout in LAYOUTS:
-        patterns = layout.files.split() if layout.remedy else ()
-        for path in (path for path in files if any(map(path.match, patterns))):
-            with suppress(OSError), path.open("rb") as file:
-                if re.search(layout.start, file.read(_START).decode("latin-1")):
-                    yield path, layout
+    files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
+    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
+    return next((path for layout in LAYOUTS for path in others if _is_of(path, layout)), None)
+
+
+def _is_of(path: Path, layout: Layout) -> bool:
+    if layout.remedy and any(map(path.match, layout.files.split())) and path.is_file():
+        with suppress(OSError), path.open("rb") as file:
+            return re.search(layout.start, file.read(_START).decode("latin-1")) is not None
+    return False

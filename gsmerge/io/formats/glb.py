@@ -185,13 +185,13 @@ class _Content:
         self.num_read[0] += size
         if view["buffer"] != 0 or "uri" in self.document["buffers"][0] or not self.start <= at <= self.end - size:
             raise _ForeignError(f"one that is cut, or in another file: {size} bytes are not in its {self.end} bytes")
-        self._check_read()
-        self.file.seek(at)
-        return self.file.read(size)
+        return self._read(at, size)
 
-    def _check_read(self) -> None:
+    def _read(self, at: int, size: int) -> bytes:
         if self.num_read[0] > self.end - self.start:
             raise _ForeignError("one that shows the same values in several places")
+        self.file.seek(at)
+        return self.file.read(size)
 
     def values(self, accessor_id: int) -> _Values:
         """Read the values of an accessor, which must lie in the chunk."""
@@ -209,9 +209,7 @@ class _Content:
         inside = first >= 0 and first + span <= view["byteLength"] and self.start <= at and at + span <= self.end
         if not each <= stride <= _MAX_STRIDE or not inside:
             raise _ForeignError(f"one that is cut: {count} values of {each} bytes are not in its {self.end} bytes")
-        self._check_read()
-        self.file.seek(at)
-        rows = np.ndarray((count, width), dtype, self.file.read(span), strides=(stride, dtype.itemsize))
+        rows = np.ndarray((count, width), dtype, self._read(at, span), strides=(stride, dtype.itemsize))
         return _Values(np.ascontiguousarray(rows), np.iinfo(dtype).max if accessor.get("normalized") else 1)
 
 

@@ -14,7 +14,7 @@ from messages import noted, refuses
 from model_files import MODELS
 from model_rows import check_cameras, check_pixels
 from sweeps import sweep
-from tiny_scene import frames_of, save_json, write_images, write_npz
+from tiny_scene import Tiny, frames_of, save_json, write_images, write_npz, write_transforms
 
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
@@ -122,6 +122,17 @@ def test_a_folder_of_too_many_files_is_not_searched(tmp_path: Path, monkeypatch:
         (tmp_path / f"{i}.txt").touch()
     with refuses(SceneError, tmp_path, "none"):
         find_scene_files(tmp_path)
+
+
+def test_beside_what_a_link_leads_to(tmp_path: Path, tiny: Tiny) -> None:
+    write_transforms(tmp_path / "transforms.json", tiny)
+    write_images(tmp_path / "images", tiny)
+    (tmp_path / "a.ply").write_text("ply\n")
+    link = tmp_path / "elsewhere" / "link.ply"
+    link.parent.mkdir()
+    link.symlink_to(tmp_path / "a.ply")
+    files = find_scene_files(link)
+    assert (files.ply, files.cameras, files.images) == (link, tmp_path / "transforms.json", tmp_path / "images")
 
 
 @pytest.mark.parametrize("ends", ["recon_sampled", "da3", "da3_pred"])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from hostile.case import sparse
 from messages import NO_FOLDER, refuses
 from slow_readers import corners, drawn
 from splat_transform_programs import needs_program, put_stand_in, write_set
@@ -25,6 +26,7 @@ from gsmerge.io import output_format, read_gaussians, write_gaussians
 from gsmerge.io.formats import splat_transform
 from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.streamed import read_index, read_level, write_levels
+from gsmerge.scene.read import load_scene
 
 from .test_sog import webp
 from .test_write import psnr
@@ -46,6 +48,17 @@ def test_a_small_level_is_the_sog_of_the_same(degree: int, scene: Scene, tmp_pat
             np.testing.assert_array_equal(getattr(actual.gaussians, name), array, name)
         assert actual.info.comments == ("SplatRenderMode: mip",)
     assert len(read_gaussians(tmp_path / "lod-meta.json").gaussians) == len(gaussians)
+
+
+def test_other_files_beside_a_chunk_do_not_count(scene: Scene, tmp_path: Path) -> None:
+    """They would raise the memory that reading may take."""
+    write_set(tmp_path / "lod-meta.json", [drawn(scene, 1)])
+    before = read_gaussians(tmp_path / "lod-meta.json").info.file_bytes
+    for meta in list(tmp_path.rglob("*/meta.json")):
+        sparse(meta.with_name("unused"), 40 << 30)
+    assert read_gaussians(tmp_path / "lod-meta.json").info.file_bytes == before
+    assert load_scene(tmp_path / "lod-meta.json").recognised["bytes"] == before  # as reports have it
+    assert before > 2 * (tmp_path / "lod-meta.json").stat().st_size
 
 
 def test_a_tree_and_an_environment_are_read(scene: Scene, tmp_path: Path) -> None:
