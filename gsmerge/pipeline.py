@@ -19,7 +19,7 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import MergedViews, merge, refine
+from gsmerge.stages.merge import MergedViews, merge
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
 from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, Gaussians
@@ -114,6 +114,6 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
     networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
     pooled = encode(scene, members, segmentation.groups)
     features = correct(pooled, members, scene.cameras, networks, weaken=plan.weakens)
-    merged = refine(merge(features, match(features, plan.match), networks), networks)
+    merged = networks.refine(merge(features, match(features, plan.match), networks))
     choose(groups=len(features), clusters=len(merged), **plan.network_facts)
     return MergedViews(merged, members, segmentation, len(features), networks)

@@ -270,10 +270,7 @@ def run_heads(
 
 
 def _families(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find first row, number and parent of the children that a head reads together.
-
-    Many children of one parent are read in two halves.
-    """
+    """Find first row, number and parent of the children that a head reads together: of many, those of each half."""
     sizes = np.bincount(parents, minlength=count)
     first = np.cumsum(sizes) - sizes
     large = (sizes > SLOTS[-1]) & halves

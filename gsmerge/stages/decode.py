@@ -39,7 +39,8 @@ def decode(
         counts = np.full(len(features), options.max_k)
     if counts.shape != (len(features),) or counts.min(initial=1) < 1:
         raise ValueError(f"counts: expected {len(features)} numbers from 1 on, got shape {list(counts.shape)}")
-    gaussians = networks.decode(*make_children(features, members, counts, networks), features)
+    children, parents = repeat(features, counts) if networks.makes_children else divide(features, members, counts)
+    gaussians = networks.decode(children, parents, features)
     return gaussians[gaussians.opacities >= options.min_opacity]
 
 
@@ -153,13 +154,6 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     return min(segmentation.count, options.max_k * (len(merged.features) + len(groups) - num_filled))
 
 
-def make_children(
-    features: FeatureGaussians, members: Members, counts: np.ndarray, networks: Corrector
-) -> tuple[Gaussians, np.ndarray]:
-    """Return ``counts [g]`` children of every group for networks to correct, and the group ``[n]`` of each."""
-    return repeat(features, counts) if networks.makes_children else divide(features, members, counts)
-
-
 def repeat(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Return every Feature Gaussian as ``counts [g]`` equal Gaussians for heads to replace, and the group of each."""
     parents = np.repeat(np.arange(len(features)), counts)
@@ -172,7 +166,9 @@ def divide(features: FeatureGaussians, members: Members, counts: np.ndarray) -> 
     gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
     if divided.any():
         starts, ids, of_children = halve(features, members, np.flatnonzero(divided), counts)
-        children = pool_children(features, members, starts, ids, of_children)
+        moments = pool_members(members, starts, ids)
+        extinctions = moments.extinctions * features.gains[of_children]
+        children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
         whole = np.flatnonzero(~divided)
         parents = np.concatenate([whole, of_children])
         order = np.argsort(parents, kind="stable")
@@ -199,15 +195,6 @@ def halve(
     parts = parallel_map(run, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
     sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
     return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
-
-
-def pool_children(
-    features: FeatureGaussians, members: Members, starts: np.ndarray, ids: np.ndarray, parents: np.ndarray
-) -> Gaussians:
-    """Pool each run of members into one Gaussian, with the gain of its parent Feature Gaussian."""
-    moments = pool_members(members, starts, ids)
-    extinctions = moments.extinctions * features.gains[parents]
-    return to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:

@@ -77,18 +77,15 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
 
 
 def _rows_by_view(scene: Scene, groups: Groups) -> tuple[np.ndarray, np.ndarray]:
-    """Sort the pixels of each view by superpixel.
-
-    One view is sorted at a time, to save memory.
-    """
+    """Sort the pixels of each view by superpixel, one view at a time to save memory."""
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
         labels = np.where(scene.valid[view], groups.labels[view], -1).reshape(-1).astype(np.int32)
         starts, ids = group_members(labels, groups.counts[view])
         return np.diff(starts), (ids + view * scene.pixels_per_view).astype(np.int32)
 
-    parts = parallel_map(one_view, range(len(scene)))
-    return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    sizes, ids = zip(*parallel_map(one_view, range(len(scene))), strict=True)
+    return np.concatenate(sizes), np.concatenate(ids)
 
 
 def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
@@ -109,18 +106,6 @@ def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: n
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:
     """Lower the optical depth of single-view groups that other views see through."""
-    factors = agreement_factors(features.means, features.sh0, features.views, members, cameras)
-    return replace(features, gains=features.gains * factors)
-
-
-def agreement_factors(
-    means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Members, cameras: Cameras
-) -> np.ndarray:
-    """Return factors ``[g]`` float32, at most 1, on the optical depth of points.
-
-    They are lower where other views see through. Arguments are those of
-    :func:`gsmerge.networks.cross_view_stats.cross_view_stats`.
-    """
-    _, same, behind, *_ = cross_view_stats(means, sh0, views, members, cameras).T
+    _, same, behind, *_ = cross_view_stats(features.means, features.sh0, features.views, members, cameras).T
     disputed = np.where(same > 0, DISPUTED, ALONE)
-    return np.where(behind > same, disputed, 1).astype(np.float32)
+    return replace(features, gains=features.gains * np.where(behind > same, disputed, 1).astype(np.float32))

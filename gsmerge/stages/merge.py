@@ -38,11 +38,6 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
     return FeatureGaussians.concat([take(features, alone), pooled])
 
 
-def refine(features: FeatureGaussians, networks: Corrector) -> FeatureGaussians:
-    """Apply the refiner's corrections, if there is one (paper section 4.5)."""
-    return networks.refine(features)
-
-
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Split rows by cluster: rows that are alone, the other rows sorted by cluster, and the start of each cluster."""
     clusters = matches.clusters

@@ -32,7 +32,7 @@ from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
 from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, refine
+from gsmerge.stages.merge import merge
 from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.extend import BatchReport, number_names
@@ -209,7 +209,7 @@ def _refine(
     unseen: Gaussians,
 ) -> FeatureState:  # fmt: skip
     """Refine merged Feature Gaussians, and describe them for the heads."""
-    refined = refine(merged, context)
+    refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
     num_members = context.trace(refined)[1] if isinstance(context, _JoinContext) else np.diff(refined.starts)
@@ -232,10 +232,7 @@ def _join(
     state: FeatureState, features: FeatureGaussians, saliency: np.ndarray, context: NetworkContext,
     samples: ViewSamples, options: MatchOptions,
 ) -> FeatureState:  # fmt: skip
-    """Match a batch's Feature Gaussians with those of a state, merge and refine them.
-
-    The state's come first, so that a cluster of the merger begins with one of them.
-    """
+    """Match a batch's Feature Gaussians with a state's, which come first in clusters, and merge and refine them."""
     size, members = (state.cameras.width, state.cameras.height), context.members
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)

@@ -35,17 +35,6 @@ def own_gaussians(scene: Scene) -> Gaussians:
     return scene.gaussians
 
 
-def most_important(importance: np.ndarray, count: int) -> np.ndarray:
-    """Return the rising indices of the ``count`` most important Gaussians; among equal ones the first.
-
-    ``importance [n]`` is for instance the summed blending weight over all photos. ValueError if ``count`` is below 0.
-    """
-    if count < 0:
-        raise ValueError(f"count: expected at least 0, got {count}")
-    order = np.argsort(-np.nan_to_num(importance, nan=-np.inf, neginf=-np.inf), kind="stable")
-    return np.sort(order[:count])
-
-
 def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Return all Gaussians, whatever the count."""
     return own_gaussians(prepared.scene)
@@ -68,7 +57,8 @@ def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prep
     """
     gaussians = own_gaussians(prepared.scene)
     with stage("reduce"):
-        return gaussians[most_important(importance(gaussians, prepared.scene.cameras), count)]
+        order = np.argsort(-importance(gaussians, prepared.scene.cameras), kind="stable")
+        return gaussians[np.sort(order[:count])]
 
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:

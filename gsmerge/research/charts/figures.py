@@ -160,10 +160,7 @@ def _over_views(results: Results) -> Figure | None:
 
 
 def draw_figures(figures: Sequence[Figure], folder: Path) -> dict[str, bytes]:
-    """Draw figures as ``NAME.png`` and ``NAME.svg`` in a folder; return the SVG by name.
-
-    The same numbers give the same bytes.
-    """
+    """Draw figures as ``NAME.png`` and ``NAME.svg``, the same numbers as the same bytes; return the SVG by name."""
     folder.mkdir(parents=True, exist_ok=True)
     names = dict.fromkeys((line.name, line.ours) for f in figures for panel in f.panels for line in panel.lines)
     drawn, styles = {}, line_styles(names)

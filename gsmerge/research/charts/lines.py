@@ -249,10 +249,7 @@ def _mean_cost(points: ByScene) -> float:
 
 
 def _intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute an interval for each column, with differences between scenes removed.
-
-    Intervals have no width if the columns have different scenes.
-    """
+    """Compute an interval for each column, with scene differences removed; without a width if the scenes differ."""
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
         return paired_intervals(np.array(values, np.float64))

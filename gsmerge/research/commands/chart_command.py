@@ -109,10 +109,7 @@ def _make_jobs(args: opt.Args, scenes: Sequence[str]) -> tuple[list[Job], BatchO
 
 
 def _draw(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
-    """Draw charts, page and table of all runs in the folder, and print a summary.
-
-    ``notes`` were printed before.
-    """
+    """Draw charts, page and table of all runs in the folder, and print a summary; ``notes`` were printed before."""
     from gsmerge.report import document_head
     from gsmerge.research.charts.chart_page import make_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures

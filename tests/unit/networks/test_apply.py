@@ -16,7 +16,7 @@ from gsmerge.pooling import feature_to_gaussians
 from gsmerge.settings.stages import DecodeOptions, MatchOptions
 from gsmerge.stages.decode import decode, divide
 from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, refine, take
+from gsmerge.stages.merge import merge, take
 from gsmerge.types import FeatureGaussians, Gaussians, Matches, as_array
 
 PAPER = replace(SMALL, outputs="absolute", merger_start="first", geometry="carried", group_numbers=False)
@@ -53,7 +53,7 @@ def test_untrained_networks_change_no_bit(scene: Made) -> None:
     assert_close(context.encode(scene.features), encoded)
     merged = merge(encoded, pairs(encoded), context)
     assert_close(merged, merge(encoded, pairs(encoded)))
-    assert_close(refine(merged, context), merged)
+    assert_close(context.refine(merged), merged)
     for k in (1, 2, 3, 4, 6):
         options = DecodeOptions(k=k)
         assert_close(decode(merged, scene.members, options, networks=context), decode(merged, scene.members, options))
@@ -66,7 +66,7 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
     assert np.array_equal(encoded.covars, scene.features.covars)  # paper: the encoder leaves the geometry to the head
     merged, plain = merge(encoded, pairs(encoded), context), merge(encoded, pairs(encoded))
     assert np.array_equal(merged.means[:2], plain.means[:2])  # alone
-    refined, children = refine(merged, context), decode(merged, scene.members, DecodeOptions(k=2))
+    refined, children = context.refine(merged), decode(merged, scene.members, DecodeOptions(k=2))
     decoded = decode(merged, scene.members, DecodeOptions(k=2, min_opacity=0), networks=context)
     for after, before in ((merged, plain), (refined, merged)):
         for name in ("means", "covars", "extinctions", "sh0"):
@@ -76,10 +76,10 @@ def test_trained_networks_change_every_stage(scene: Made) -> None:
 
 
 def test_no_networks_and_nothing_to_do(scene: Made) -> None:
-    assert refine(scene.features, ANALYTIC) is scene.features
+    assert ANALYTIC.refine(scene.features) is scene.features
     context = scene.networks(noisy())
     none = take(encode_features(scene.features, context), np.zeros(0, np.int64))
-    assert len(refine(none, context)) == 0
+    assert len(context.refine(none)) == 0
     assert len(encode_features(none, context)) == 0
     assert len(decode(none, scene.members, DecodeOptions(), networks=context)) == 0
 
@@ -301,7 +301,7 @@ def test_a_network_that_is_left_out_has_no_weights_and_corrects_nothing(scene: M
     for networks in (whole, without):
         context = scene.networks(networks)
         encoded = encode_features(scene.features, context)
-        refined = refine(merge(encoded, pairs(encoded), context), context)
+        refined = context.refine(merge(encoded, pairs(encoded), context))
         results.append((refined, decode(refined, scene.members, DecodeOptions(k=2), networks=context)))
     assert_close(results[0][0], results[1][0])
     assert_close(results[0][1], results[1][1])

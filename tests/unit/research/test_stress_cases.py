@@ -78,9 +78,12 @@ def test_rows_that_are_spoilt(scene: Scene) -> None:
     broken = pixel_scene(module.break_rows(scene_in))
     assert int((~broken.valid).sum()) == round(0.01 * n)
     assert broken.gaussians.opacities[~broken.valid.reshape(-1)].max() == 0
-    large = module.enlarge(scene_in).scene.gaussians.scales / scene.gaussians.scales
+    oversized, flyaways = CASES["oversized"].change, CASES["flyaways"].change
+    assert oversized is not None
+    assert flyaways is not None
+    large = oversized(scene_in).scene.gaussians.scales / scene.gaussians.scales
     assert sorted(set(large[:, 0].round().tolist())) == [1.0, 8.0]
-    away = (module.throw_away(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
+    away = (flyaways(scene_in).scene.gaussians.means != scene.gaussians.means).any(1)
     assert int(away.sum()) == 1
     unaligned = Scene(scene.gaussians, scene.cameras, scene.images, None, scene.names)
     assert len(module.break_rows(StressScene(unaligned, None)).scene.gaussians) == n - round(0.01 * n)
