@@ -42,10 +42,6 @@ class Grid:
         """(width, height) of the grid, pixels."""
         return self.cameras.width, self.cameras.height
 
-    def with_poses(self, camera_file: CameraFile) -> Grid:
-        """Return a grid whose cameras have the poses of another file."""
-        return replace(self, camera_file=camera_file, cameras=replace(self.cameras, viewmats=camera_file.viewmats))
-
 
 def with_photo_size(camera_file: CameraFile, size: Size | None, most: float = 1) -> CameraFile:
     """Return the cameras with the photos' size if theirs is up to ``most`` pixels off, as twice a principal point is.

@@ -105,7 +105,8 @@ def match_views(source: Source, places: Sequence[Place]) -> list[Fit]:
     for poses in other_conventions(usual, convention) if shown and not fits else ():
         for grid, layout in shown:
             file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
-            fits += _fit_views(source, grid.with_poses(file), layout)
+            moved = replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
+            fits += _fit_views(source, moved, layout)
     return fits
 
 
@@ -156,10 +157,7 @@ def _fit_views(source: Source, grid: Grid, layout: Layout) -> list[Fit]:
 
 
 def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
-    """Find the cameras whose poses are nearest to those of ``count`` views; None where two have one, or no pose.
-
-    Distances are in units of the cameras' spread.
-    """
+    """Find the cameras nearest to the poses of ``count`` views, in units of their spread; None where two have one."""
     if len(own) < count:
         return None
     viewmats, centres = np.stack([own[view] for view in range(count)]), cameras.centres

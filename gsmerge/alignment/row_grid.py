@@ -179,10 +179,7 @@ def _find_periods(gaussians: Gaussians, valid: np.ndarray) -> tuple[int, list[in
 
 
 def _power(values: np.ndarray, lag: int) -> np.ndarray:
-    """Compute the power spectrum, as shares of its sum, of differences over ``lag`` rows.
-
-    ``values [n]`` may have NaN.
-    """
+    """Compute the power spectrum, as shares of its sum, of differences over ``lag`` rows; ``values [n]`` may be NaN."""
     values = values.astype(np.float64)
     with np.errstate(invalid="ignore"):
         steps = np.nan_to_num(values[lag:] - values[:-lag], posinf=0.0, neginf=0.0)

@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity
 from gsmerge.io.formats.read import FileInfo
 from gsmerge.kernels.matrices import matmul
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras
 
 _QUANTILE = 0.95  # of the distances along the widest axis, which is 1 in such a file
 _SMALL = 1e-3  # how exactly
@@ -54,10 +54,7 @@ class _Try:
 
 
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
-    """Return the rotation of rows that are centred, rescaled and turned upright; None for other rows.
-
-    It may be computed from any camera.
-    """
+    """Return the rotation, from any camera, of rows centred, rescaled and turned upright; None for other rows."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
     few = means[:: max(1, len(means) // _ROUGH_SAMPLES)]
     if not len(few) or _uneven(few) > _ROUGH:
@@ -107,7 +104,8 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
 def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) -> Correspondences:
     """Find stretches in the photos; return rows of those that are alike and in one place, a part for each."""
-    colors, images = _byte_colors(inputs.gaussians), inputs.images
+    colors, images = base_colors(inputs.gaussians), inputs.images
+    colors = np.ascontiguousarray(np.rint(255 * colors).astype(np.int16).T)
     shown = [_shown_colors(np.rint(255 * photo).astype(np.uint8), pixels, _LENGTH) for photo in images]
     rows = np.array([t.start + t.step * np.arange(_LENGTH) for t in tries])
     bounds = [(max(0, t.low), min(len(pixels), t.high)) for t in tries]
@@ -126,11 +124,6 @@ def _match(inputs: AlignmentInput, tries: Sequence[_Try], pixels: np.ndarray) ->
         inputs.gaussians.means[ids].astype(np.float64), np.stack([x, y], 1) + 0.5, views, parts, ids
     )
     return pairs.select(inputs.valid[ids])
-
-
-def _byte_colors(gaussians: Gaussians) -> np.ndarray:
-    """Return the base colours ``[3,n]`` of Gaussians as int16 from 0 to 255."""
-    return np.ascontiguousarray(np.rint(255 * base_colors(gaussians)).astype(np.int16).T)
 
 
 def _shown_colors(photo: np.ndarray, pixels: np.ndarray, length: int) -> np.ndarray:

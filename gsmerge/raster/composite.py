@@ -165,10 +165,7 @@ def draw_views(
     with_depths: bool,
     first: int = 0,
 ) -> Rendering:
-    """Tile and draw all views; ``shape`` is (views, height, width).
-
-    View numbers start at ``first``.
-    """
+    """Tile and draw all views, numbered from ``first``; ``shape`` is (views, height, width)."""
     images, alphas = np.empty((*shape, 3), np.float32), np.empty((*shape, 1), np.float32)
     depths = np.empty((*shape, 1), np.float32) if with_depths else None
 

@@ -65,10 +65,6 @@ class TiledView:
         return self.conics, self.flatten_ids, self.isect_offsets, -(-self.width // projection.TILE)
 
 
-def _float32(array: Array) -> Array:
-    return np.ascontiguousarray(array, dtype=np.float32)
-
-
 def _spread_origin(means: Array) -> Array:
     """Return zero, or the centre of Gaussians that are too far from zero for float32."""
     sample = means[:: max(1, len(means) // 4096)].astype(np.float64)
@@ -90,7 +86,7 @@ def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     gaussians = gaussians.numpy()
     start = _spread_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
     columns = vars(gaussians) | {"means": gaussians.means - start if start.any() else gaussians.means}
-    return Splats(**{name: _float32(column) for name, column in columns.items()}, origin=start)
+    return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=start)
 
 
 def num_pieces(count: int, threads: int, least: int = PIECE) -> int:
@@ -234,12 +230,6 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
 
-def check_range(near: float, far: float, eps2d: float) -> None:
-    """Raise ValueError for an impossible depth range or dilation."""
-    if not (0 < near < far and eps2d >= 0):
-        raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
-
-
 def tile_view(
     splats: Splats,
     viewmat: ArrayLike,
@@ -271,7 +261,8 @@ def tile_view(
     """
     viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
-    check_range(near, far, eps2d)
+    if not (0 < near < far and eps2d >= 0):
+        raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
     num_flags = len(splats) if keep is None else len(keep)

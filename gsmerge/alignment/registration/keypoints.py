@@ -143,10 +143,7 @@ def _any_processor() -> Iterator[None]:
 
 
 def _surface(scene: Scene, layers: Sequence[int], viewmat: np.ndarray) -> np.ndarray:
-    """Return the depths ``[h,w]`` of the nearest opaque layer of a camera; infinite where there is none.
-
-    ``layers`` are the views with that camera.
-    """
+    """Return depths ``[h,w]`` of the nearest opaque one of the views ``layers`` of a camera; infinite without any."""
     views = list(layers)
     shape = len(scene), scene.cameras.height, scene.cameras.width
     means = scene.gaussians.means.reshape(*shape, 3)[views].astype(np.float64)

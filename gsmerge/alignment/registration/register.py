@@ -188,10 +188,7 @@ def _both_ways(places: Places, matches: KeypointMatches, spread: float) -> list[
 
 
 def _measure_spreads(places: Places, matches: Sequence[KeypointMatches]) -> tuple[list[KeypointMatches], float]:
-    """Measure the errors of keypoints and of the logarithms of depths, robustly.
-
-    Returns the matches with the error of keypoints, and the error of logarithmic depths.
-    """
+    """Measure errors robustly; return the matches with that of keypoints, and that of the logarithms of depths."""
     values = [_both_ways(places, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
@@ -243,10 +240,7 @@ def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]],
 
 
 def _refine(places: Places, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None) -> Places:
-    """Move all placed scenes but one to the best agreement of matches, by damped Gauss-Newton steps.
-
-    ``fixed``: the scene that stays; None: the first placed scene.
-    """
+    """Move all placed scenes but ``fixed`` (None: the first) until matches agree best, by damped Gauss-Newton steps."""
     placed = [i for i, place in enumerate(places) if place is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
 
