@@ -289,10 +289,7 @@ def blocks_problems(scene: SceneSize, options: CompactOptions) -> list[str]:
 
 
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
-    """Return the largest number of blocks that the options ask for; 1: one piece.
-
-    ``num_views``: 0 for few.
-    """
+    """Return the largest number of blocks that the options ask for; 1: one piece. ``num_views``: 0 for few."""
     asked = options.blocks.blocks
     if asked == "auto":
         return 1 if _whole_needed(options) else usual_blocks(num_gaussians, num_views)

@@ -90,7 +90,9 @@ def compact_in_blocks(
         def pieces() -> Iterator[tuple[Any, ...]]:
             for block, factor in zip(blocks, factors, strict=True):
                 piece_options = block_options(options, scene, block, factor, most)
-                yield take_views(scene, block.views), block, seen, piece_options, frame
+                piece = subset(scene, block.views)
+                free_scene(scene)
+                yield piece, block, seen, piece_options, frame
 
         parts = [part for part, _ in adopt_records(work.run("merge", start_part, count, pieces()))]
         with stage("join"):
@@ -275,13 +277,6 @@ def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, 
 
         for place, weights in zip(places, in_turn(weights_of, range(len(photos))), strict=True):
             yield number, place, weights
-
-
-def take_views(scene: Scene, views: Sequence[int]) -> Scene:
-    """Copy views of a scene, and release its memory as :func:`free_scene` does."""
-    piece = subset(scene, views)
-    free_scene(scene)
-    return piece
 
 
 def free_scene(scene: Scene) -> None:

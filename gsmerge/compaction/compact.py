@@ -63,14 +63,9 @@ def compact(
             blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
                 return replace(compact_in_blocks(scene, options, choices, blocks, covisibility), scene=given)
-        return replace(compact_piece(scene, options), scene=given)
-
-
-def compact_piece(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene in one piece."""
-    method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
-    prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
-    return compact_prepared(prepared, method, options).to(scene.gaussians.device)
+        method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
+        prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
+        return replace(compact_prepared(prepared, method, options).to(scene.gaussians.device), scene=given)
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
@@ -174,9 +169,8 @@ def _note_clean(counts: Mapping[str, Any], left: int, count: int | None) -> None
         "surplus": "more than the budget",
     }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
-    shown = [name for name in ("cropped", "sky") if counts.get(name)]
     note(f"left out by clean-up: {parts}")
-    if shown:
+    if counts.get("cropped") or counts.get("sky"):
         note("PSNR of the input views counts what is left out as errors")
     if count is not None and left < count:
         note(f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up")

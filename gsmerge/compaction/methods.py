@@ -103,10 +103,7 @@ def _unused_alone(options: CompactOptions) -> list[str]:
 
 
 def choose_method(options: CompactOptions, scene: Scene) -> Method:
-    """Choose the method for a scene by its options, with a note on ignored settings.
-
-    Raises as :func:`check_method` does.
-    """
+    """Choose the method for a scene as :func:`check_method` does, with a note on ignored settings."""
     method, notes = check_method(options, scene)
     for text in notes:
         note(text)

@@ -51,10 +51,7 @@ def find_placement(options: PlacementOptions, cameras: Cameras | None) -> Simila
 
 
 def turn_to(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation ``[3,3]`` of one unit vector ``[3]`` to another; about x if they are opposite.
-
-    Computed by Rodrigues' formula.
-    """
+    """Return the smallest rotation ``[3,3]`` of a unit vector to another (Rodrigues); about x if they are opposite."""
     cosine = float((start * end).sum())
     if cosine < -1 + 1e-12:
         about = np.eye(3)[0] if abs(start[0]) < 0.9 else np.eye(3)[1]

@@ -137,10 +137,7 @@ def shrink(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan:
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
-    """Measure the PSNR (dB) of Gaussians on the scored photos, or against renders of the input.
-
-    The second number is that of the pixels that decide the count.
-    """
+    """Measure the PSNR (dB) of the scored photos, or of renders of the input, and of pixels that decide the count."""
     if moved.reference.name == RENDERS:
         fidelity = _fidelity(moved.frame.enter(_written(gaussians, plan)), moved, plan)
         views, placed = len(plan.scored_views), moved.reference.placed
@@ -188,10 +185,7 @@ def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
 def measure_result(
     gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
 ) -> PhotoScore | None:
-    """Score a result's Gaussians, as its file keeps them, on the scored photos, and over ``covered`` pixels of each.
-
-    None without photos.
-    """
+    """Score a result, as its file keeps it, on the scored photos, and over ``covered`` pixels; None without photos."""
     if not prepared.reference.of_views:
         return None
     return _score_photos("score", _written(gaussians, plan), prepared.result_views(), prepared, plan, covered)
@@ -216,10 +210,7 @@ def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
 def _score_photos(
     name: str, gaussians: Gaussians, views: Scene, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None
 ) -> PhotoScore:
-    """Score Gaussians on the scored photos of ``views``: a quarter of each, or all if a quality is the target.
-
-    ``name``: name of the stage in the record.
-    """
+    """Score Gaussians in the stage ``name`` on the scored photos: a quarter of each, or all if a quality is sought."""
     with stage(name):
         near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_input
         photos = scene_photos(views)
@@ -227,10 +218,7 @@ def _score_photos(
 
 
 def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
-    """Score a result over the pixels that the input covers; None if it covers all.
-
-    ``before`` is the score of the input.
-    """
+    """Score a result over the pixels that the input covers, whose score is ``before``; None if it covers all."""
     if before is None or covers_all(before) or prepared.scene.empty is not None:  # whose photos count where it covers
         return None
     after = measure_result(gaussians, prepared, plan, before.covered)

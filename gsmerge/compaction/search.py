@@ -246,8 +246,6 @@ def curve_knee(points: Sequence[CurvePoint]) -> int:
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
-    if len(points) == 1:
-        return points[0].count
     scale = [float(log(p.count) / log(2)) for p in points]
     quality = [p.psnr + SSIM_DB * p.ssim for p in points]
     pairs = list(pairwise(range(len(points))))

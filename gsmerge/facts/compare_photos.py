@@ -141,36 +141,27 @@ def _is_other(photo: np.ndarray, cover: np.ndarray) -> bool:
 
 def _leave_out(scene: PicturedScene, odd: Sequence[int]) -> bool:
     """Note which photos do not show the scene; return whether the others are used."""
-    names, few = [scene.names[view] for view in odd], 2 * len(odd) <= len(scene)
-    choose(photos_left_out=names)
-    problem = f"{len(odd)} of {len(scene)} {STRAY_PHOTOS}"
-    which = list_names(scene.names, odd)
-    if few:
-        note(f"{problem} and are not used: {which}")
-    else:
-        note(f"{problem}, so none is used: {which}; check their names and order")
+    choose(photos_left_out=[scene.names[view] for view in odd])
+    few, which = 2 * len(odd) <= len(scene), list_names(scene.names, odd)
+    result = f" and are not used: {which}" if few else f", so none is used: {which}; check their names and order"
+    note(f"{len(odd)} of {len(scene)} {STRAY_PHOTOS}{result}")
     return few
 
 
 def _change(
     scene: PicturedScene, changes: Sequence[PhotoChange], covers: np.ndarray, pictures: np.ndarray | None
 ) -> PicturedScene:
-    """Change the photos at view size and at full size; where ``covers [v,h,w]``, they become ``pictures [v,h,w,3]``.
-
-    Without pictures the Gaussians are drawn there.
-    """
+    """Change photos at both sizes; where ``covers [v,h,w]`` they become ``pictures [v,h,w,3]``, None: drawings."""
     covered = np.flatnonzero(covers.any((1, 2)))
     if len(covered) == 0 and not any(changes):
         return scene
-    colors = pictures
-    if pictures is None and len(covered):
-        drawn = np.asarray(render(scene.gaussians, scene.cameras[covered]).images).clip(0, 1)
-        colors = np.zeros_like(scene.images)
-        colors[covered] = drawn
     changes = list(changes)
-    for view in covered:
-        assert colors is not None
-        changes[view] = replace(changes[view], cover=covers[view], colors=colors[view])
+    if len(covered):
+        drawn = (
+            render(scene.gaussians, scene.cameras[covered]).images.clip(0, 1) if pictures is None else pictures[covered]
+        )
+        for view, colors in zip(covered, drawn, strict=True):
+            changes[view] = replace(changes[view], cover=covers[view], colors=colors)
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     return replace(scene, images=images, large_photos=large)
@@ -284,12 +275,10 @@ def _is_reversed(shown: Shown, views: Sequence[int]) -> bool:
 
 
 def _is_reversed_alone(shown: Shown, view: int) -> bool:
-    """Return whether red and blue are exchanged in one photo: red less blue falls where that of its Gaussians rises.
-
-    No change of tone has this effect.
-    """
+    """Return whether red and blue are exchanged in one photo: red less blue falls where that of its Gaussians rises."""
     if not _is_reversed(shown, [view]):
         return False
+    # No change of tone has this effect
     photo, picture = (colors[:, 0] - colors[:, 2] for colors in shown.pairs([view]))
     return bool(((photo - np.median(photo)) * (picture - np.median(picture))).sum() < 0)
 

@@ -71,7 +71,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     """
     bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > FAINT) if scene.aligned else ~shown
     bare, free = ~bare, shown & ~scene.valid if scene.aligned else shown
-    if not (free.any() or (scene.aligned and not everywhere and any(map(_any_large, bare)))):
+    cut = [] if everywhere or not scene.aligned else bare
+    if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
         return scene
     holes, empty, parts = np.zeros_like(free), np.zeros_like(free), dict[int, Gaussians]()
     gap = 2 * round(GAP * max(shown.shape[1:]) / 2) + 1
@@ -107,10 +108,6 @@ def _add_holes(scene: PicturedScene, holes: np.ndarray, parts: Mapping[int, Gaus
     for name, values in vars(added).items():
         columns[name][holes.reshape(-1)] = values
     return replace(scene, gaussians=Gaussians(**columns), pixel_ids=grid_ids(scene.valid | holes))
-
-
-def _any_large(empty: np.ndarray) -> bool:
-    return bool(empty.any()) and bool(large_parts(empty).any())
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:

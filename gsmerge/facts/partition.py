@@ -232,10 +232,7 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def exchange(weights: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Move views between blocks while that weakens the edges between blocks; sizes stay nearly equal.
-
-    ``labels [v]`` are the blocks of the views.
-    """
+    """Move views between blocks ``labels [v]`` while that weakens the edges between them; sizes stay nearly equal."""
     labels, count = labels.copy(), int(labels.max()) + 1
     mean = len(labels) / count
     least, most = int(np.floor((1 - SLACK) * mean)), int(np.ceil((1 + SLACK) * mean))

@@ -124,10 +124,7 @@ def draw_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a canonical scene from outside, and from between its views if they are few; these come last.
-
-    A scene of one view stays as it is.
-    """
+    """Add renders of a scene of several views from outside and, if they are few, from between them; these come last."""
     means, views = scene.gaussians.means, len(scene)
     if views == 1:
         return scene
@@ -208,12 +205,8 @@ def _sphere(count: int) -> np.ndarray:
 
 def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
-    eyes, looks = [], []
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    for place in grid:
-        eyes.append(np.broadcast_to(centre + place * half, (LOOKS, 3)))
-        looks.append(_sphere(LOOKS))
-    inside = [_look(e, d) for e, d in zip(np.concatenate(eyes), np.concatenate(looks), strict=True)]
+    inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(LOOKS)]
     return np.concatenate([_around(centre, half, FAR, AROUND), inside])
 
 

@@ -266,9 +266,7 @@ def _prepare_others(
     """Prepare a scene whose rows belong to no pixels: without photos that show it renders of it replace them."""
     scene, views = _with_pictures(canonical, blank_pictures, options.look)
     every = tuple(range(len(scene)))
-    reference = Reference(PHOTOS, views, views)
-    if not views:
-        reference = Reference(RENDERS, every, every)
+    reference = Reference(PHOTOS, views, views) if views else Reference(RENDERS, every, every)
     unseen = scene.gaussians[:0]
     if options.unseen == "keep":
         scene, unseen = _split_unseen(scene)
@@ -286,10 +284,7 @@ def _prepare_others(
 def _with_pictures(
     scene: Scene, stand_in: Callable[[Scene], PicturedScene], look: Look
 ) -> tuple[PicturedScene, tuple[int, ...]]:
-    """Return a scene with a picture of every view, and the views whose photos a fit may use.
-
-    If no photo shows the scene, its pictures are made by ``stand_in``, and there are no such views.
-    """
+    """Return a scene with pictures, made by ``stand_in`` if no photo shows it, and the views whose photos show it."""
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.of(scene, scene.images, scene.masks), look)
         if views:

@@ -112,10 +112,7 @@ def _front(part: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _blurred_difference(first: np.ndarray, second: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Blur two pictures ``[h,w,3]`` and return their difference ``[h,w]``, averaged over the channels.
-
-    ``weights [h,w]`` are the weights of the pixels in the blur.
-    """
+    """Blur two pictures ``[h,w,3]`` by ``weights [h,w]``; return their difference ``[h,w]``, a mean of the channels."""
     apart = np.abs(blur((first - second) * weights[..., None], BLUR))
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / (3 * np.maximum(blur(weights, BLUR), np.float32(1e-6)))
 

@@ -214,10 +214,7 @@ def _check_frames(output: Path, width: int, height: int, count: int) -> None:
 
 
 def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
-    """Make the cameras of a path, and read the scenes that they are placed in.
-
-    Returns the scenes, the cameras, the near plane, and the views that the path uses.
-    """
+    """Read scenes and place the cameras of a path in them; return both, the near plane, and the views of the path."""
     assert options.path is not None
     path = parse_path(options.path)
     file, separate = None if path else Path(options.path), True

@@ -100,10 +100,7 @@ def outside_pictures(
 
 
 def contact_sheet(views: Sequence[Sequence[tuple[str, Picture]]], *, min_width: int = 320) -> Picture:
-    """Arrange pictures in a sheet: one labelled row per view.
-
-    Small pictures are enlarged by a whole factor so that each has at least ``min_width`` columns.
-    """
+    """Arrange pictures in a sheet, a labelled row per view, enlarged by a whole factor to ``min_width`` columns."""
     factor = max(1, -(-min_width // views[0][0][1].shape[1]))
     rows = []
     for pictures in views:

@@ -52,7 +52,8 @@ def measure_costs(
         for base, speed in zip(costs[first]["speeds"], costs[name]["speeds"], strict=True):
             before, after = base["seconds"], speed["seconds"]
             speed["speedup"] = before / after
-            speed["break_even_frames"] = None if merge is None else break_even(merge, before, after)
+            # Frames after which merging has saved its own time (paper, supplement: timing)
+            speed["break_even_frames"] = None if merge is None or after >= before else merge / (before - after)
     return costs
 
 
@@ -79,14 +80,6 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
     start = time.perf_counter()
     render(gaussians, view, near=near)
     return time.perf_counter() - start
-
-
-def break_even(merge_seconds: float, before: float, after: float) -> float | None:
-    """Compute the number of frames after which merging has saved its own time (paper, supplement: timing).
-
-    ``before`` and ``after`` are seconds per frame; None if the result does not render faster.
-    """
-    return merge_seconds / (before - after) if after < before else None
 
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:

@@ -174,10 +174,7 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
     ]
     views = "held-out photos" if data.held_out else "its own photos" if data.reference == PHOTOS else data.reference
-    qualities = [
-        (f"PSNR, {views}", "psnr", before.mean, after.mean),
-        (f"SSIM, {views}", "ssim", before.mean, after.mean),
-    ]
+    qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in ("psnr", "ssim")]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
         qualities.append((label, "psnr", before.covered, after.covered))
@@ -268,10 +265,8 @@ def render_template(name: str, policy: str, **values: Any) -> str:
 
 
 def _hashes(page: str, kind: str) -> list[str]:
-    """Return the hashes of a page's own scripts or styles, as a content security policy names them.
-
-    Elements of another type are data, which a browser does not run.
-    """
+    """Return the hashes of a page's own scripts or styles, as a content security policy names them."""
+    # Elements of another type are data, which a browser does not run
     contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
     digests = [hashlib.sha256(content.encode()).digest() for content in contents]
     return [f"'sha256-{base64_text(digest)}'" for digest in dict.fromkeys(digests)]

@@ -74,10 +74,7 @@ def pack_splats(
 
 
 def _pixel_places(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:
-    """Return pixels, shifts from their middles, and logarithms of depths, ``[4,m]``, of ``rows [m]`` with ``ids [n]``.
-
-    None if a row is not in front of its camera.
-    """
+    """Return pixels, shifts in them, log depths ``[4,m]`` of ``rows [m]`` with ``ids [n]``; None if one is behind."""
     places = np.empty((4, len(rows)), np.uint32)
     viewmats, Ks = (np.ascontiguousarray(part, np.float64) for part in (cameras.viewmats, cameras.Ks))
     sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)

@@ -93,7 +93,8 @@ def view(
         shown = read if read.aligned else add_views(read)
     given = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
     files = {name: read_gaussians(value) for name, value in given.items() if isinstance(value, str | PathLike)}
-    gaussians = {name: _gaussians_of(files[name] if name in files else given[name]) for name in given}
+    loaded: dict[str, Any] = {**given, **files}
+    gaussians = {name: value if isinstance(value, Gaussians) else value.gaussians for name, value in loaded.items()}
     gains = file_gains(files) | {
         name: expected.gain
         for name, value in given.items()
@@ -117,10 +118,6 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
     """Return what new views are expected to gain, dB, by the names of results whose files say it."""
     known = {name: read_new_views(file.info.comments) for name, file in files.items()}
     return {name: after - before for name, scores in known.items() if scores for before, after in [scores]}
-
-
-def _gaussians_of(result: Any) -> Gaussians:
-    return result if isinstance(result, Gaussians) else result.gaussians
 
 
 def _num_bytes(value: Scene | Result | Gaussians | StrPath) -> int:

@@ -90,7 +90,8 @@ def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
     """Find the number of Gaussians at the knee of the scene's distortion curve, within the limits."""
     limits = choices.limits
     tree = choices.tree or scene_tree(scene, choices.options, limits, limits.default)
-    return max(limits.min_count, min(auto_count(tree), limits.max_count))
+    usable = tree.counts >= tree.min_regions  # none larger than MAX_EXTENT
+    return max(limits.min_count, min(knee(tree.counts[usable], tree.distortions[usable]), limits.max_count))
 
 
 @dataclass(frozen=True)
@@ -153,10 +154,7 @@ def count_limits(
 
 
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
-    """Return the superpixels per view.
-
-    A share refers to the Gaussians if there are fewer Gaussians than pixels, unless they are few.
-    """
+    """Return the superpixels per view; a share is one of the Gaussians if they are fewer than pixels, but not few."""
     per_view = count_for(segment, scene.height, scene.width)
     if scene.aligned or segment.per_view is not None:
         return per_view
@@ -295,12 +293,6 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
 
     labels, counts = zip(*parallel_map(one_view, range(num_views)), strict=True)
     return Groups(np.stack(labels), counts)
-
-
-def auto_count(tree: RegionTree) -> int:
-    """Find the :func:`knee` of a scene among the counts that need no region larger than ``MAX_EXTENT``."""
-    usable = tree.counts >= tree.min_regions
-    return knee(tree.counts[usable], tree.distortions[usable])
 
 
 def knee(counts: np.ndarray, distortions: np.ndarray) -> int:

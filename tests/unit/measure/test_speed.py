@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.speed import break_even, measure_costs, overdraw
+from gsmerge.measure.speed import measure_costs, overdraw
 from gsmerge.raster import prepare, tile_view
 from gsmerge.raster.weights import view_weights
 from gsmerge.types import Scene
@@ -25,12 +25,6 @@ def test_overdraw_counts_what_is_blended(scene: Scene) -> None:
     assert overdraw(scene.gaussians, one, 0.01) == len(view_weights(tiled).lanes) / (48 * 36)
     assert overdraw(scene.gaussians[:0], one, 0.01) == 0
     assert 1 < overdraw(scene.gaussians[::4], one, 0.01) < overdraw(scene.gaussians, one, 0.01)
-
-
-def test_break_even() -> None:
-    assert break_even(10.0, 0.3, 0.1) == pytest.approx(50)
-    assert break_even(10.0, 0.1, 0.1) is None
-    assert break_even(0.0, 0.3, 0.1) == 0
 
 
 def test_costs_are_compared_with_those_of_the_first(scene: Scene) -> None:

@@ -11,22 +11,23 @@ from messages import refuses
 
 from gsmerge import Scene
 from gsmerge.pooling import Members, scene_members
-from gsmerge.research.baselines.simple import most_important
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages import segment as module
 from gsmerge.stages.decode import decode, split_counts
 from gsmerge.stages.encode import encode
 from gsmerge.stages.segment import (
+    CountLimits,
     RegionTree,
     SegmentOptions,
-    auto_count,
+    SuperpixelChoices,
     cut_tree,
     knee,
+    knee_count,
     pixel_depths,
     region_tree,
     segment,
 )
-from gsmerge.types import FeatureGaussians, Groups
+from gsmerge.types import FeatureGaussians, Groups, PicturedScene
 
 HEIGHT, WIDTH = 40, 60
 
@@ -176,13 +177,22 @@ def test_knee_of_a_wall_and_of_a_texture() -> None:
     assert knee(texture.counts, texture.distortions) > 100
 
 
-def test_auto_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
+def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     wall, texture = tree_of(grey(), slanted()), tree_of(noise(), slanted())
-    assert auto_count(wall) == wall.min_regions < 150
+    scene = PicturedScene.of(
+        scenes.make_scene(scenes.room(), scenes.arc(1, WIDTH, HEIGHT)), noise(), None
+    )  # whose tree is there
+
+    def count(tree: RegionTree, most: int = 1000) -> int:
+        limits = CountLimits(1, 1, min_count=1, max_count=most, exact=None, num_pixels=1, num_input=1000)
+        return knee_count(scene, SuperpixelChoices(SegmentOptions(), limits, 1.0, tree))
+
+    assert count(wall) == wall.min_regions < 150
+    assert count(wall, most=5) == 5
     labels = cut_tree(wall, wall.min_regions).labels[0]
     boxes = [np.nonzero(labels == i) for i in range(wall.min_regions)]
     assert max(max(np.ptp(y), np.ptp(x)) for y, x in boxes) < WIDTH / 8
-    assert auto_count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
+    assert count(texture) == knee(texture.counts, texture.distortions) > wall.min_regions
 
 
 def test_knee_is_where_the_slope_is_the_one_that_is_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,17 +276,3 @@ def test_decode_refuses_strange_counts(features: FeatureGaussians, members: Memb
     for counts in (np.ones(3, int), np.zeros(24, int)):
         with refuses(ValueError, "counts", 24):
             decode(features, members, DecodeOptions(), counts)
-
-
-# ---------------------------------------------------------------- keeping the best
-
-
-def test_most_important_keeps_the_most_important() -> None:
-    importance = np.array([3.0, 1.0, 3.0, np.nan, 0.0, 5.0])
-    assert most_important(importance, 3).tolist() == [0, 2, 5]
-    assert most_important(importance, 2).tolist() == [0, 5]
-    assert most_important(importance, 5).tolist() == [0, 1, 2, 4, 5]
-    assert most_important(importance, 9).tolist() == [0, 1, 2, 3, 4, 5]
-    assert most_important(importance, 0).tolist() == []
-    with refuses(ValueError, "count", 0, -1):
-        most_important(importance, -1)
