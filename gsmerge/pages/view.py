@@ -108,8 +108,8 @@ def view(
     is_light = len(read.gaussians) > MOST_SOLID if light is None else light
     data = collect(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown, gaussians,
-        [_num_bytes(value) for value in (scene, *given.values())], held_out, cameras=cameras,
-        new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
+        [_num_bytes(scene), *(_num_bytes(files.get(name, value)) for name, value in given.items())], held_out,
+        cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data), headline(data))
 
@@ -120,8 +120,10 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
     return {name: after - before for name, scores in known.items() if scores for before, after in [scores]}
 
 
-def _num_bytes(value: Scene | Result | Gaussians | StrPath) -> int:
-    """Return the size of a file; of what is in memory that of a ``.ply`` with it."""
+def _num_bytes(value: Any) -> int:
+    """Return the size of a scene's files, or of a file that was read; of other Gaussians that of a ``.ply``."""
+    if isinstance(value, GaussianFile):
+        return value.info.file_bytes
     if isinstance(value, str | PathLike):
         return sum(path.stat().st_size for path in find_scene_files(value).plys)
     gaussians = value if isinstance(value, Gaussians) else value.gaussians
