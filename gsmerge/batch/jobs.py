@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 from gsmerge import __version__
 from gsmerge.batch.find import find_scenes, main_file, scene_plys
-from gsmerge.compaction.files import Outputs, compact_files, level_output
+from gsmerge.compaction.files import Outputs, compact_files
+from gsmerge.compaction.placement import level_output
 from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts

@@ -100,7 +100,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
         _decode(args, features, start)
         return
     hints = args.hints()
-    from gsmerge.compaction.files import level_output
+    from gsmerge.compaction.placement import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
     from gsmerge.io.formats.table import COLMAP, HTML, INDEX, output_format
 

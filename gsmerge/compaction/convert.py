@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.compaction.placement import (
     NUM_FULL,
-    add_colmap,
+    add_result,
     add_views,
     find_placement,
     name_photos,
@@ -20,22 +20,14 @@ from gsmerge.compaction.placement import (
 )
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.prepare import scene_frame
-from gsmerge.io import (
-    GaussianFile,
-    atomic_outputs,
-    file_notes,
-    output_format,
-    read_cameras,
-    read_gaussians,
-    write_gaussians,
-)
+from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
+from gsmerge.io.formats.streamed import remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, HTML, INDEX, input_format
 from gsmerge.io.formats.write import Photos, output_notes
 from gsmerge.io.photo_files import read_images
@@ -185,26 +177,14 @@ def _write(
     """Write the Gaussians, and the cameras beside them; return the bytes and the path of the cameras."""
     out, beside = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
-        first = add(out)
-        if ending == COLMAP.ending:
-            written = add_colmap(add, out, first, gaussians, cameras, photos)
-        elif ending == HTML.ending:
-            from gsmerge.pages.site import add_site, site_contents
-
-            title = scene_title(options.inputs[0])
-            written = add_site(add, first, site_contents(gaussians, cameras, title, comments, apart=options.site))
-        elif ending == INDEX:
-            ((_, files),) = add_levels(add, out, first, [gaussians], comments)
-            written = [first, *files]
-        else:
-            write_gaussians(
-                first, gaussians, overwrite=True, comments=comments, ending=ending, normals=options.normals,
-            )  # fmt: skip
-            written = [first]
+        views = cameras, photos, scene_title(options.inputs[0])
+        written = add_result(
+            add, out, add(out), [gaussians], comments, views, normals=options.normals, site=options.site
+        )
         if len(cameras) and ending not in (COLMAP.ending, HTML.ending):
             beside = viewer_cameras_path(out)
             add_views(add, beside, cameras, names, overwrite=options.overwrite)
-        num_bytes = sum(path.stat().st_size for path in written)
+        num_bytes = sum(path.stat().st_size for path in written[out])
     if ending == INDEX:
         remove_unused_chunks(out)
     return num_bytes, None if beside is None else str(beside)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -11,19 +11,18 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.placement import add_colmap, add_views, name_photos, named_cameras, other_cameras
+from gsmerge.compaction.placement import add_result, add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.compare_photos import STRAY_PHOTOS
-from gsmerge.io import atomic_outputs, output_format, write_gaussians
-from gsmerge.io.atomic import AddOutput
+from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.streamed import add_levels, remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, HTML, INDEX
-from gsmerge.io.formats.write import Photos, output_notes
+from gsmerge.io.formats.streamed import remove_unused_chunks
+from gsmerge.io.formats.table import COLMAP, INDEX
+from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, record_part
 from gsmerge.scene.exporters import AUTO, ReadHints
@@ -32,7 +31,7 @@ from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.stages.clean import BOX_QUANTILES
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Scene
 
 # Opacity times area of a scene's Gaussians together, of each view, as a share of its box's squared diagonal: all of it
 # that is left once they are merged is at most a tenth of this where each result is too transparent to be kept
@@ -95,7 +94,8 @@ def compact_files(
             comments.append(new_views_comment(expected.before, expected.after))
         views_named = result.cameras[views], name_photos(load.files.images, names), scene_title(files.ply)
         notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
-        written = _write_results(add, outputs, first, results, comments, views_named)
+        levels = [level.gaussians for level in results]
+        written = add_result(add, out, first, levels, comments, views_named, normals=outputs.normals, site=outputs.site)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
@@ -133,43 +133,6 @@ def shows_nothing(scene: Scene) -> bool:
     settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})
     with record_part(silent=True):
         return len(compact(scene, settings).gaussians) == 0
-
-
-def _write_results(
-    add: AddOutput,
-    outputs: Outputs,
-    first: Path,
-    results: Sequence[CompactResult],
-    comments: Sequence[str],
-    views: tuple[Cameras, Photos, str],
-) -> dict[Path, list[Path]]:
-    """Write a result, whose file is ``first`` now, and its coarser levels, each with ``comments`` in its header.
-
-    A COLMAP model and a page have the ``views``, too: cameras, names with photos, and the scene's title. Returns
-    the path of each result, in their order, with its files as they are before they are renamed.
-    """
-    out = outputs.result
-    ending = output_format(out, levels=True, cameras=True).ending
-    cameras, photos, title = views
-    if ending == COLMAP.ending:
-        return {out: add_colmap(add, out, first, results[0].gaussians, cameras, photos)}
-    if ending == HTML.ending:
-        from gsmerge.pages.site import add_site, site_contents
-
-        contents = site_contents(results[0].gaussians, cameras, title, comments, apart=outputs.site)
-        return {out: add_site(add, first, contents)}
-    if ending == INDEX:
-        (_, finest), *coarser = add_levels(add, out, first, [result.gaussians for result in results], comments)
-        return {out: [first, *finest], **dict(coarser)}
-    written = {out: [first]}
-    for level in range(1, len(results)):
-        path = level_output(out, level)
-        written[path] = [add(path)]
-    for (file,), result in zip(written.values(), results, strict=True):
-        write_gaussians(
-            file, result.gaussians, overwrite=True, comments=comments, ending=ending, normals=outputs.normals,
-        )  # fmt: skip
-    return written
 
 
 def sized(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
@@ -214,9 +177,3 @@ def _compact_notes(loaded: Loaded) -> tuple[str, ...]:
         return ()
     count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
     return (f"the scene is compact already ({count}, written by gsmerge): start from the original for more detail",)
-
-
-def level_output(output: Path, level: int) -> Path:
-    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
-    cut = len(output.name) - len(output_format(output).ending)
-    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")

@@ -142,7 +142,7 @@ def test_several_outputs_are_all_there_or_none(
     def no_room(*_: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.compaction.files.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.compaction.placement.write_gaussians", full)
     monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", no_room)
     before = listing(smallest_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")
