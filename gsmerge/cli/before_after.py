@@ -76,7 +76,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     scene, held_out, adapted = held_out_views(load, args.targets, vars(args).get("target_images"), views)
     if not scene.aligned:
         with record_run() as record:
-            scene = add_views(scene)
+            scene = add_views(scene, shown=True)
         notes = record.notes
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     cameras, moved = own_cameras(args.after, scene)

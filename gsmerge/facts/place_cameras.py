@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.facts.views import concat_cameras
 from gsmerge.fit.outside import outside_cameras
-from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views
+from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster import contributions, prepare, render, tile_view
@@ -25,6 +25,7 @@ FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
+LEVEL = 0.4  # share of their heights that cameras to look from keep
 FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
@@ -49,13 +50,24 @@ NO_VIEWS = (
 )
 
 
-def add_views(scene: Scene) -> Scene:
-    """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note."""
+def add_views(scene: Scene, *, shown: bool = False) -> Scene:
+    """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note.
+
+    ``shown``: to look at, half of them from around the scene (:func:`look_around`).
+    """
     scene = keep_finite(scene)
     if len(scene) == 0:
-        scene = _with_cameras(scene, place_cameras(scene.gaussians))
+        scene = _with_cameras(scene, (look_around if shown else place_cameras)(scene.gaussians))
         note(NO_VIEWS)
     return scene
+
+
+def look_around(gaussians: Gaussians) -> Cameras:
+    """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
+    inside = place_cameras(gaussians, NUM_VIEWS // 2)
+    centre, half = _extent(sampled(gaussians).means.astype(np.float64))
+    around = replace(inside, viewmats=_around(centre, half, FAR, len(inside), level=LEVEL))
+    return concat_cameras(around, inside)
 
 
 def keep_finite(scene: Scene) -> Scene:
@@ -210,10 +222,14 @@ def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     return np.concatenate([_around(centre, half, FAR, AROUND), inside])
 
 
-def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int) -> np.ndarray:
-    """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre."""
+def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int, *, level: float = 1.0) -> np.ndarray:
+    """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre.
+
+    ``level``: share of their heights on a sphere; the less, the nearer all are to a ring.
+    """
     distance = radii * float(np.sqrt((half * half).sum()))
-    return np.stack([_look(centre + distance * away, -away) for away in _sphere(count)])
+    directions = normalize(_sphere(count) * np.array([1, level, 1]))
+    return np.stack([_look(centre + distance * away, -away) for away in directions])
 
 
 def _walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:

@@ -276,7 +276,7 @@ def _with_views(load: Loaded) -> Loaded:
     if len(load.scene):
         return load
     with record_run() as record:
-        scene = add_views(load.scene)
+        scene = add_views(load.scene, shown=True)
     views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
     return replace(load, scene=scene, views=views, notes=(*load.notes, *record.notes))
 

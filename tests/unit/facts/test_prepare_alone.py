@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.facts.place_cameras import JUDGES
+from gsmerge.facts.place_cameras import JUDGES, look_around
 from gsmerge.facts.prepare import Prepared, prepare_alone
 from gsmerge.geometry import project
 from gsmerge.plan import stands_alone
@@ -92,3 +92,16 @@ def test_nothing_is_left_out(bare: Scene) -> None:
     result = compact(replace(bare, gaussians=Gaussians.concat([bare.gaussians, far])), budget="20%")
     middle = far.means.mean(0)
     assert (np.abs(result.gaussians.means - middle) < np.ptp(far.means, 0) + 1).all(1).any()
+
+
+def test_half_of_the_views_to_look_from_stand_around_the_scene(bare: Scene) -> None:
+    """So that an object is seen whole; corners of a room may be cut."""
+    cameras = look_around(bare.gaussians)
+    low, high = np.percentile(bare.gaussians.means, (5, 95), axis=0)
+    count = len(cameras) // 2
+    centres = cameras.centres[:count]
+    assert ((centres < low) | (centres > high)).any(1).all()
+    alphas = render(bare.gaussians, cameras[:count]).alphas[..., 0]
+    borders = np.concatenate([alphas[:, [0, -1]].reshape(count, -1), alphas[:, :, [0, -1]].reshape(count, -1)], 1)
+    assert (borders.mean(1) < 0.1).mean() > 0.7
+    assert (alphas.mean((1, 2)) > 0.05).all()
