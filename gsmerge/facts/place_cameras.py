@@ -25,7 +25,7 @@ FEWER = 3  # of the candidates every third is tried where views only judge
 SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
-LEVEL = 0.4  # share of their heights that cameras to look from keep
+ABOVE = -0.25  # height of the ring of cameras to look from, in its radii: y points down
 FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
@@ -66,7 +66,9 @@ def look_around(gaussians: Gaussians) -> Cameras:
     """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(sampled(gaussians).means.astype(np.float64))
-    around = replace(inside, viewmats=_around(centre, half, FAR, len(inside), level=LEVEL))
+    turns = 2 * np.pi * np.arange(len(inside)) / len(inside)
+    ring = np.stack([sin(turns), np.full(len(turns), ABOVE), -cos(turns)], 1)  # the first where most models look from
+    around = replace(inside, viewmats=_around(centre, half, FAR, normalize(ring)))
     return concat_cameras(around, inside)
 
 
@@ -108,7 +110,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """
     means = sampled(scene.gaussians).means.astype(np.float64)
     centre, half = _extent(means)
-    outside = [_around(centre, half, radii, count) for radii in (FAR, NEAR)]
+    outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR, NEAR)]
     within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
     viewmats = np.concatenate([*outside, *within])
     more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
@@ -219,16 +221,12 @@ def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(LOOKS)]
-    return np.concatenate([_around(centre, half, FAR, AROUND), inside])
+    return np.concatenate([_around(centre, half, FAR, _sphere(AROUND)), inside])
 
 
-def _around(centre: np.ndarray, half: np.ndarray, radii: float, count: int, *, level: float = 1.0) -> np.ndarray:
-    """Return the world-to-camera matrices ``[count,4,4]`` of cameras around the scene that look at its centre.
-
-    ``level``: share of their heights on a sphere; the less, the nearer all are to a ring.
-    """
+def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
+    """Return world-to-camera matrices ``[c,4,4]`` of cameras in directions ``[c,3]`` that look at a scene's centre."""
     distance = radii * float(np.sqrt((half * half).sum()))
-    directions = normalize(_sphere(count) * np.array([1, level, 1]))
     return np.stack([_look(centre + distance * away, -away) for away in directions])
 
 
