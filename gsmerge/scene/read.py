@@ -324,7 +324,8 @@ def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> 
     notes = [option] if option else []
     _check_hints(ply, hints)
     if files.images is not None:
-        notes += [f"the photos in {files.images} are not used: no cameras that fit them"]
+        wanted = "no cameras that fit them, such as a transforms.json or a COLMAP model; name them with --cameras"
+        notes += [f"the photos in {files.images} are not used: {wanted}"]
     problem = "expected one Gaussian per pixel, found no cameras that have any"
     return _make_load(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 
