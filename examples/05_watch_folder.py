@@ -33,15 +33,16 @@ def main() -> None:
     parser.add_argument("--once", action="store_true", help="end when all that is whole is done")
     args = parser.parse_args()
     done: dict[Path, float] = {}  # when each was last changed
+    code = 0  # of the last call that failed
     while True:
         changes = {scene: last_change(scene) for scene in sorted(args.folder.iterdir())}
         whole = {scene: t for scene, t in changes.items() if t + args.still < time.time() and done.get(scene) != t}
         if whole:
             call = [sys.executable, "-m", "gsmerge", "batch", *map(str, whole), "-o", str(args.output)]
-            subprocess.run(call, check=False)
+            code = subprocess.run(call, check=False).returncode or code
             done.update(whole)
         elif args.once:
-            break
+            sys.exit(code)
         time.sleep(1)
 
 

@@ -72,11 +72,13 @@ def batch(args: opt.Args) -> None:
     from gsmerge.batch.records import RecordIndex
 
     settings, place = args.make(CompactOptions, Engine)
-    with opt.usage_errors():
+    try:
         options = BatchOptions(
             settings, args.opacity, hints, args.cameras, args.images, args.name, args.jobs or None,
             args.overwrite, place.engine, place.address,
         )  # fmt: skip
+    except ValueError as error:
+        raise UsageError(str(error).replace("output:", "--name:", 1)) from error
     if options.engine == "ray" and not args.dry_run:
         from gsmerge.runtime.work import require_ray
 
@@ -244,12 +246,14 @@ def print_plan(
 
     out, pending, concurrency = args.output, pending_jobs(jobs, args.output, options), choose_concurrency(jobs, options)
     left = {job.output for job, _ in pending}
+    num_refused = sum(why is not None for _, why in pending)
+    num_left = len(pending) - num_refused
     document = {
         **document_head(),
         "dry_run": True,
         "output": str(out),
         f"num_{unit}": len(jobs),
-        "num_pending": len(pending),
+        "num_pending": num_left,
         "jobs": concurrency.jobs,
         "threads": concurrency.threads,
         unit: [
@@ -261,5 +265,6 @@ def print_plan(
     }
     lines = [f"{job.scene} -> {f'refused: {why}' if why else out / job.output}" for job, why in pending]
     lines += [f"note: {note}" for note in notes]
-    lines.append(f"would write {out}: {len(pending):,} of {len(jobs):,} {unit} to do, {concurrency}")
+    refused = f", {num_refused:,} refused" if num_refused else ""
+    lines.append(f"would write {out}: {num_left:,} of {len(jobs):,} {unit} to do{refused}, {concurrency}")
     print_document(document, lines, as_json=args.json)

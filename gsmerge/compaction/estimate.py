@@ -58,7 +58,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     Returns:
         ``num_gaussians``: the most that the result can have or, where ``psnr_kept`` or ``loss_kept`` is a
         number, the fewest: more are taken until the result is so many dB from the input, or shows the photos at most so
-        much worse; ``ratio`` to the input, ``bytes`` as a ``.ply``;
+        much worse, or until ``quality`` is met; ``ratio`` to the input, ``bytes`` as a ``.ply``;
         ``blocks``, ``method``, ``superpixels_per_view`` (None where a budget distributes them, 0 where neighbours are
         merged), ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` as they are used; ``seconds`` and
         ``memory_bytes``, to two digits and right within a factor of about two; ``memory_problem``, None where this
@@ -91,6 +91,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     return {
         "num_gaussians": count,
         "psnr_kept": KEPT_PSNR if choices.keeps_input and size.rendered else None,
+        "quality": options.budget.quality,
         "loss_kept": KEPT_LOSS if choices.keeps_input and not size.rendered else None,
         "ratio": count / max(1, scene.num_gaussians),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
@@ -129,7 +130,11 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     if per_view == 0:
         method = "neighbours merged pair by pair, because no photo shows them"
     count, kept = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)", run["psnr_kept"]
-    number = f"at most {count}" if kept is None else f"{count}, or more until {kept:g} dB from the input are kept"
+    number = count if per_view is None else f"at most {count}"
+    if kept is not None:
+        number = f"{count}, or more until {kept:g} dB from the input are kept"
+    if run["quality"] is not None:
+        number = f"{count}, or more or fewer until --quality {run['quality']} is met"
     if run["loss_kept"] is not None:
         number = f"{count}, or more until the photos are shown within {run['loss_kept']:g} dB of the input"
     return [
@@ -168,9 +173,10 @@ def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict
 def plan_lines(document: Mapping[str, Any]) -> list[str]:
     """Write the document of :func:`plan_files` as lines for people."""
     scene, out = document["input"], document["output"]["path"]
+    number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
     levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
     return [
-        f"would read {scene['ply']}: {scene['num_views']} views of {scene['width']} x {scene['height']}",
+        f"would read {scene['ply']}: {f'{number} views of {size}' if number else 'no views'}",
         f"would write {out}{levels}",
         *estimate_lines(document["compact"]),
         *(f"note       {note}" for note in document["notes"]),

@@ -92,7 +92,7 @@ class Trial:
         most = MOST_KEPT if agreement is None else agreement.confirmed
         before = self.before + min(0.0, own_before - self.own_before)
         gain = min(self.after - before, most * max(0.0, own_after - own_before))
-        return NewViews(before, before + gain, self.views)
+        return NewViews(round(before, 2), round(before + gain, 2), self.views)  # as files say it
 
 
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:

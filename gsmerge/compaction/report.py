@@ -191,7 +191,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         source = f"expected, from {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", source)]
     if psnr["before"] is not None and psnr["after"] is not None:
-        views = f"in {document['choices']['scored_views']} of its views"
+        views = f"a sample, of {document['choices']['scored_views']} of its views"
         rows += [(_own(document), f"{psnr['before']:.2f} dB", f"{psnr['after']:.2f} dB", views)]
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
@@ -251,7 +251,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     judged = document["choices"].get("fidelity")
     quality = f"; {judged['psnr']:.1f} dB {_judged_by(judged)}" if judged else ""
     if psnr["before"] is not None and psnr["after"] is not None:
-        quality = f"; {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
+        quality = f"; a sample of {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
     if new := document["new_views"]:
         quality = f"; new views {new['after'] - new['before']:+.1f} dB expected{quality}"
     if covered := document["psnr_covered"]:

@@ -53,16 +53,16 @@ NO_VIEWS = (
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
     """Keep the finite Gaussians, at least one, and place cameras if there are none, with a note.
 
-    ``shown``: to look at, half of them from around the scene (:func:`look_around`).
+    ``shown``: to look at, half of them from around the scene (:func:`place_viewpoints`).
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
-        scene = _with_cameras(scene, (look_around if shown else place_cameras)(scene.gaussians))
+        scene = _with_cameras(scene, (place_viewpoints if shown else place_cameras)(scene.gaussians))
         note(NO_VIEWS)
     return scene
 
 
-def look_around(gaussians: Gaussians) -> Cameras:
+def place_viewpoints(gaussians: Gaussians) -> Cameras:
     """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
     centre, half = _extent(sampled(gaussians).means.astype(np.float64))

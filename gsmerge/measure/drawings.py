@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.place_cameras import add_views
+from gsmerge.facts.place_cameras import keep_finite, place_viewpoints
 from gsmerge.facts.views import pick_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
@@ -34,7 +34,7 @@ from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.runtime.record import Progress, record_run
+from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
@@ -263,7 +263,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
     rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
-    load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos))
+    load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos), inside=photos)
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
@@ -271,14 +271,20 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, named if plys else list(notes[0]), load)
 
 
-def _with_views(load: Loaded) -> Loaded:
-    """Place views about a scene that has none."""
+def _with_views(load: Loaded, *, inside: bool) -> Loaded:
+    """Place views about a scene that has none, for a path without those ``inside`` of it."""
     if len(load.scene):
         return load
-    with record_run() as record:
-        scene = add_views(load.scene, shown=True)
-    views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
-    return replace(load, scene=scene, views=views, notes=(*load.notes, *record.notes))
+    scene = keep_finite(load.scene)
+    cameras = place_viewpoints(scene.gaussians)
+    cameras = cameras if inside else cameras[: len(cameras) // 2]
+    names = tuple(f"placed {view}" for view in range(len(cameras)))
+    scene = replace(scene, cameras=cameras, names=names)
+    views = SceneViews(cameras, NO_IMAGES, names, tuple(range(len(cameras))))
+    where = "around and inside" if inside else "around"
+    return replace(
+        load, scene=scene, views=views, notes=(*load.notes, f"no cameras: views are placed {where} the scene")
+    )
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:

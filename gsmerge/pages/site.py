@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from gsmerge.facts.place_cameras import look_around
+from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
@@ -48,7 +48,7 @@ def site_contents(
     """
     scene, expected = sog_bytes(gaussians, comments), read_new_views(comments)
     is_free = len(cameras) == 0
-    shown = look_around(gaussians.numpy()) if is_free else cameras.numpy()
+    shown = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     middle = 0 if is_free else median_camera(shown)  # of placed ones the first stands outside
     poster = encode_still(to_picture(render(gaussians.numpy(), shown[[middle]]).images[0]))
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})

@@ -84,7 +84,8 @@ def parse_quality(text: str) -> float:
     match = re.fullmatch(r"(-?)(\d*\.?\d+)\s*db", str(text).strip().lower(), re.ASCII)
     value = float(match[2]) if match else math.inf
     if match is None or not math.isfinite(value) or (value == 0 and not match[1]):
-        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}')
+        perhaps = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
+        raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{perhaps}')
     return -value if match[1] else value
 
 

@@ -27,7 +27,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 # Earlier Gaussians that are looked up in new views; share that these see at the least; and of the foremost, the most
 # that colours may differ from pictures, over that from random pixels: .4 to .7 in one world, .85 to 1.1 in others
 SAMPLES, SEEN, UNLIKE = 10_000, 0.02, 0.8
-OTHER_WORLD = "the pictures of this batch do not show the earlier Gaussians: are they in one world?"
+OTHER_WORLD = "the pictures of this batch do not show the earlier Gaussians: a .gsm is for one world, begin another"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,9 @@ def test_examples_run_one_after_the_other(
     assert len(values) == 2
     assert all(10 < value < 60 for value in values)
     (tmp_path / "unfinished").mkdir()
-    run_example("05_watch_folder.py", tmp_path, tmp_path.with_name("results"), "--still", 0, "--once")
+    with pytest.raises(SystemExit) as ended:
+        run_example("05_watch_folder.py", tmp_path, tmp_path.with_name("results"), "--still", 0, "--once")
+    assert ended.value.code == 0
     assert sorted(path.name for path in tmp_path.with_name("results").glob("*.ply")) == ["scene.ply"]
 
 

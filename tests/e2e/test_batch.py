@@ -109,7 +109,7 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
     assert f"{rooms / 'bad'} -> {out / 'bad.ply'}" in outcome.out
     assert "1 of 3 scenes" in outcome.out
     plan = json.loads(batch(run, rooms, out, "--dry-run", "--json", "--seed", 1, "--jobs", 3).out)
-    assert (plan["dry_run"], plan["num_scenes"], plan["num_pending"], plan["jobs"]) == (True, 3, 3, 3)
+    assert (plan["dry_run"], plan["num_scenes"], plan["num_pending"], plan["jobs"]) == (True, 3, 1, 3)
     assert plan["scenes"][0]["num_gaussians"] == 3 * 24 * 16
     assert listing(out) == before
     new = batch(run, rooms, out.parent / "new", "--dry-run")

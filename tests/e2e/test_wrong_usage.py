@@ -53,7 +53,7 @@ USAGE = {
     "compact room out.ply": "out.ply*-o",
     "compress room": "*'compress'*'compact'",
     "batch room -o out --set fit=none --quality 30": "quality*'30'",
-    "batch room -o out --name {{stem:>999999999}}.ply": "output*{{stem}}*'{{stem:>999999999}}.ply'",
+    "batch room -o out --name {{stem:>999999999}}.ply": "--name*{{stem}}*'{{stem:>999999999}}.ply'",
     "batch room -o out --jobs many": "--jobs*auto*'many'",
     "batch room/scene.ply alone.ply -o out --name same.ply": "out/same.ply*room/scene.ply*alone.ply*--name",
     "batch room -o room": "room*results",

@@ -64,7 +64,7 @@ def test_what_the_input_covers_stands_beside_all_pixels(files: tuple[Path, Path]
 def test_summary_line(files: tuple[Path, Path]) -> None:
     line = report.summary_line(make_document(files))
     assert line == (
-        f"{files[1]}: 1,000 -> 25 Gaussians (2.50 %), 2.5 MB -> 700 B; its own photos 20.00 -> 24.50 dB;"
+        f"{files[1]}: 1,000 -> 25 Gaussians (2.50 %), 2.5 MB -> 700 B; a sample of its own photos 20.00 -> 24.50 dB;"
         " 1.9 s (read 0.25, segment 1.00, encode 0.50, write 0.12)"
     )
 
@@ -75,7 +75,7 @@ def test_result_table(files: tuple[Path, Path]) -> None:
     assert [line.split() for line in table[1:]] == [
         ["Gaussians", "1,000", "25", "2.50", "%"],
         ["file", "2.5", "MB", "700", "B"],
-        ["its", "own", "photos", "20.00", "dB", "24.50", "dB", "in", "4", "of", "its", "views"],
+        ["its", "own", "photos", "20.00", "dB", "24.50", "dB", "a", "sample,", "of", "4", "of", "its", "views"],
         ["time", "1.9", "s", "most", "in", "segment", "1.0,", "encode", "0.5"],
         ["next", "gsmerge", "view", "scene", "small.ply"],
     ]
@@ -88,7 +88,7 @@ def test_new_views_come_first(files: tuple[Path, Path]) -> None:
     document = make_document(files, new_views=NewViews(17.25, 21.5, 3))
     assert document["new_views"] == {"before": 17.25, "after": 21.5, "views": 3}
     line = report.summary_line(document)
-    assert line.index("new views +4.2 dB expected") < line.index("its own photos 20.00 -> 24.50 dB")
+    assert line.index("new views +4.2 dB expected") < line.index("a sample of its own photos 20.00 -> 24.50 dB")
     table = [" ".join(row.split()) for row in report.result_table(document)]
     (place,) = (i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB expected, from 3 photos"))
     assert table[place + 1].startswith("its own photos")

@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.facts.place_cameras import JUDGES, look_around
+from gsmerge.facts.place_cameras import JUDGES, place_viewpoints
 from gsmerge.facts.prepare import Prepared, prepare_alone
 from gsmerge.geometry import project
 from gsmerge.plan import stands_alone
@@ -103,7 +103,7 @@ def test_half_of_the_views_to_look_from_stand_around_the_scene() -> None:
     scales, opacities = np.full((count, 3), 0.03), np.full(count, 0.9)
     arrays = [array.astype(np.float32) for array in (means, quats, scales, opacities, sh0, np.zeros((count, 0, 3)))]
     ball = Gaussians(*arrays)
-    cameras = look_around(ball)
+    cameras = place_viewpoints(ball)
     alphas = render(ball, cameras[: len(cameras) // 2]).alphas[..., 0]
     assert max(alphas[:, [0, -1]].max(), alphas[:, :, [0, -1]].max()) < 0.1
     assert (alphas.mean((1, 2)) > 0.2).all()

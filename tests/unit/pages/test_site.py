@@ -127,7 +127,9 @@ def test_a_folder_gets_the_result_and_a_site_where_one_is_asked_for(
     assert output_file(tmp_path / output, "a.ply", site=site) == tmp_path / expected
 
 
-def test_a_page_is_known_as_ours(tmp_path: Path) -> None:
-    (tmp_path / "ours.html").write_text(contents_of(apart=False)[0])
+def test_a_page_with_a_scene_is_a_result_that_no_report_replaces(tmp_path: Path) -> None:
+    (tmp_path / "scene.html").write_text(contents_of(apart=False)[0])
     (tmp_path / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
-    assert [is_page(tmp_path / name) for name in ("ours.html", "mine.html")] == [True, False]
+    (tmp_path / "report.html").write_text('<meta name="generator" content="gsmerge 0.3.0">')
+    names = ("scene.html", "mine.html", "report.html")
+    assert [is_page(tmp_path / name) for name in names] == [False, False, True]
