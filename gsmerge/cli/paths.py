@@ -146,7 +146,7 @@ def check_replaced(outputs: Sequence[Path]) -> None:
     """Raise UsageError for an output that exists, unless it is a page or a table that gsmerge made."""
     for output in outputs:
         if _start_of(output) and not is_page(output):
-            raise UsageError(f"{output}: exists already, and gsmerge did not make it; name another output")
+            raise UsageError(f"{output}: exists already, and is no report that gsmerge made; name another output")
 
 
 def _check_place(folder: Path, output: Path, expected: str) -> None:
