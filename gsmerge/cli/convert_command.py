@@ -25,10 +25,11 @@ class PhotoOptions(Settings):
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
-                 "Files of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, .ksplat, "
-                 "meta.json, .lcc or .lcc2; several of one world are joined. The last is written, as its name says: "
-                 ".ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), lod-meta.json, a folder, or "
-                 "one named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as arrays."),
+                 "Files of Gaussians, or folders with one: .ply, .compressed.ply, .spz, .sog, .splat, .glb, "
+                 "lod-meta.json, .ksplat, meta.json, .lcc or .lcc2; several of one world are joined. The last is "
+                 "written, as its name says: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), "
+                 "lod-meta.json, a folder, or one named colmap. Or a .gsm of gsmerge extend, and a .npz for its "
+                 "Feature Gaussians as arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),
@@ -43,6 +44,9 @@ def convert(args: opt.Args) -> None:
     if output.suffix.lower() == ".npz":
         _convert_features(args, inputs, output)
         return
+    from gsmerge.scene.files import find_plys
+
+    inputs = [file for path in inputs for file in (find_plys(path) if path.is_dir() else [path])]
     writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]

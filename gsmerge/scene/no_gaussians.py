@@ -10,9 +10,11 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.read import array_names
+from gsmerge.io.cameras.npz_files import array_names, missing_of_depths
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
+from gsmerge.io.image_names import IMAGE_SUFFIXES, list_images
+from gsmerge.scene.files import IMAGE_PLACES
 
 MAX_FOLDERS = 100  # in a folder of scenes that are looked into
 _NAME = "name the .ply of the Gaussians, or the folder that it is in"
@@ -28,6 +30,7 @@ class PointsOnly:
 
 
 _TRAIN = "name a model's .ply, and this with --cameras, or train Gaussians on it"
+_PHOTOS = "photos", "a model such as Depth Anything 3 or AnySplat makes a scene of them first: alone they are none"
 # In the order of trial
 POINTS_ONLY = (
     PointsOnly(
@@ -77,8 +80,8 @@ def find_remedy(folder: Path) -> str:
     """Return what to do about a folder of folders without a scene; empty if nothing in them is known."""
     with suppress(OSError):
         inside = (path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != ".")
-        for place in (folder, *islice(inside, MAX_FOLDERS)):
-            content = _content(place)
+        places = [(place, _content(place)) for place in (folder, *islice(inside, MAX_FOLDERS))]
+        for place, content in sorted(places, key=lambda entry: entry[1] == _PHOTOS):
             if content is not None:
                 return f"{place} has {content[0]}: {content[1]}"
     return ""
@@ -97,9 +100,12 @@ def _content(folder: Path) -> tuple[str, str] | None:
     for row in POINTS_ONLY:
         file = next((path for pattern in row.files for path in sorted(folder.glob(pattern))), None)
         if file is not None:
-            return f"{file.relative_to(folder).as_posix()} of {row.title}", row.remedy
+            return f"{file.relative_to(folder).as_posix()} of {row.title}", _remedy(row, file)
     points = next((path for path in sorted(folder.glob("[!.]*.ply")) if header_content(path) == "other"), None)
-    return None if points is None else (f"points or a mesh in {points.name}", _NAME)
+    if points is not None:
+        return f"points or a mesh in {points.name}", _NAME
+    beside = any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.glob("[!.]*"))
+    return _PHOTOS if beside or any(list_images(folder / place) for place in IMAGE_PLACES) else None
 
 
 def check_scene_file(path: Path) -> None:
@@ -112,4 +118,9 @@ def check_scene_file(path: Path) -> None:
     matching = (row for row in POINTS_ONLY if any(path.match(Path(file).name) for file in row.files))
     row = next(matching, POINTS_ONLY[-1])
     problem = f"expected a file of Gaussians, found {suffix[1:]} without any, as {row.title} writes it"
-    raise SceneError(path, problem, row.remedy)
+    raise SceneError(path, problem, _remedy(row, path))
+
+
+def _remedy(row: PointsOnly, path: Path) -> str:
+    missing = " and ".join(missing_of_depths(path))
+    return f"its depth maps lack {missing}: add {missing}, and they are read" if missing else row.remedy

@@ -247,6 +247,12 @@ def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) 
     assert (document["output"]["num_gaussians"], document["output"]["format"]) == (400, ".ply")
     assert run("convert", result).code == 2
     assert run("convert", result, result, "--overwrite").code == 2
+    for name, count in (("in", 400), ("too", 800)):  # folders of a scene
+        (tmp_path / name).mkdir()
+        shutil.copy(result, tmp_path / name)
+        folders = (tmp_path / name, tmp_path / "in")[: count // 400]
+        document = json.loads(run("convert", *folders, tmp_path / f"{name}.splat", "--json", code=0).out)
+        assert document["output"]["num_gaussians"] == count
     assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
 
 

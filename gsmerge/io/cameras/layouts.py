@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from gsmerge.errors import SceneError
+from gsmerge.io.formats.ply import header_content
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 
 
@@ -78,6 +79,26 @@ LAYOUTS = (
     Layout("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip
 
+# Words of places, turns and matrices, by which a text file that nothing reads shows that it has poses
+_PLACE = r'\b(position|location|translation|transform|[xyz]|([tp]|loc|pos)[_.]?x)\b|"t":'
+_TURN = r'\b(rotation|quaternion|orientation|transform|heading|omega|yaw|(q|r|rot|quat|rotation)[_.]?[wx])\b|"r":'
+_MATRIX = r"\b(extrinsics?|c2w|w2c|cam(era)?_?(to|2)_?world|world_?(to|2)_?cam(era)?|view_?matrix|poses?)\b\W*[\d{[]"
+
+
+def starts_like_poses(path: Path) -> bool:
+    """Return whether a text file starts as one of camera poses: a table by its head, others by several views."""
+    suffix, text = path.suffix.lower(), _start(path).lower().lstrip()
+    if suffix in (".csv", ".txt"):
+        return all(re.search(words, text.partition("\n")[0]) for words in (_PLACE, _TURN))
+    several = all(len(re.findall(words, text)) > 1 for words in (_PLACE, _TURN))
+    return suffix in (".json", ".xml") and (several or re.search(_MATRIX, text) is not None)
+
+
+def check_unknown(path: Path) -> None:
+    """Raise SceneError if a file that nothing reads starts as one of camera poses."""
+    if starts_like_poses(path):
+        raise SceneError(path, "expected cameras that are read, found those of a program that is not known", _OWN)
+
 
 def check_layout(place: Path) -> None:
     """Raise SceneError with the program and its export that is read, if a file, or one below a folder, is not read."""
@@ -90,12 +111,18 @@ def find_unread(place: Path) -> Path | None:
     """Find a file of cameras that are not read: a path itself, or one below a folder; None without one."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
-    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
+    plys = (path for path in files if path.suffix == ".ply" and path.parent != place)
+    scenes = {ply.parent for ply in plys if header_content(ply) == "Gaussians"}  # whose cameras are their own
+    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
     return next((path for layout in LAYOUTS for path in others if _is_of(path, layout)), None)
 
 
 def _is_of(path: Path, layout: Layout) -> bool:
-    if layout.remedy and any(map(path.match, layout.files.split())) and path.is_file():
-        with suppress(OSError), path.open("rb") as file:
-            return re.search(layout.start, file.read(_START).decode("latin-1")) is not None
-    return False
+    named = layout.remedy and any(map(path.match, layout.files.split())) and path.is_file()
+    return bool(named) and re.search(layout.start, _start(path)) is not None
+
+
+def _start(path: Path) -> str:
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(_START).decode("latin-1")
+    return ""

@@ -121,6 +121,13 @@ def holds_poses(path: Path) -> bool:
     return {"c2w", "K"} <= names or not (names.isdisjoint(_EXTRINSICS) or names.isdisjoint(_INTRINSICS))
 
 
+def missing_of_depths(path: Path) -> list[str]:
+    """List the arrays that the depth maps of an npz lack; empty without depth maps."""
+    names = array_names(path)
+    groups = (("c2w",), ("K",), _IMAGES[1:]) if names & {"c2w", "K"} else (_EXTRINSICS, _INTRINSICS)
+    return [] if names.isdisjoint(_DEPTHS) else [group[0] for group in groups if names.isdisjoint(group)]
+
+
 def read_depths(path: Path) -> np.ndarray | None:
     """Read the depth maps ``[c,h,w]`` stored in a camera file; None without any."""
     if path.suffix != ".npz" or array_names(path).isdisjoint(_DEPTHS):

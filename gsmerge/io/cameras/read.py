@@ -24,7 +24,7 @@ from gsmerge.io.cameras.json_files import (
     read_transforms,
     read_world_mirror,
 )
-from gsmerge.io.cameras.layouts import CAMERA_PLACES, INTRINSICS, check_layout
+from gsmerge.io.cameras.layouts import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 from gsmerge.settings.extend import SUFFIX
@@ -37,7 +37,7 @@ holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.re
 _KEYFRAME, _START = "t_00", 1 << 12  # value of a file of Polycam, and bytes of it that name all its values
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 _LOG = ".log"  # text of poses
-_OTHERS = (".json", ".npz", ".xml", ".txt", _LOG)
+_OTHERS = (".json", ".npz", ".xml", ".txt", _LOG, ".csv")
 
 
 def is_colmap(folder: Path) -> bool:
@@ -74,11 +74,15 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file of :data:`_OTHERS` in a folder that holds cameras, by any name; None without one."""
+    """Find the only file of :data:`_OTHERS` in a folder that holds cameras, by any name, or one that starts like them.
+
+    None without one.
+    """
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _OTHERS and path.name not in INTRINSICS)
     files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
     camera_files = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
-    return camera_files[0] if len(camera_files) == 1 else None
+    unknown = [] if camera_files else filter(starts_like_poses, files[:_MAX_OTHERS])
+    return camera_files[0] if len(camera_files) == 1 else next(iter(unknown), None)
 
 
 def _holds_cameras(path: Path) -> bool:
@@ -125,12 +129,14 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
         if path.suffix in (".bin", ".txt") and (in_model or not _LISTS_POSES(path)):
             if not is_colmap(path.parent):
+                check_unknown(path)
                 raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
             path = path.parent
     ending = "" if path.is_dir() else path.suffix.lower().replace(_LOG, ".txt")
     source = CameraSource(path, scene, folder)
     chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
     if chosen is None:
+        check_unknown(path)
         raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
     return chosen.cameras(source)
 
@@ -205,7 +211,7 @@ CAMERA_FORMATS = (
 )  # fmt: skip
 CAMERA_ENDINGS = (*dict.fromkeys(row.ending for row in CAMERA_FORMATS if row.ending not in ("", ".ply")), _LOG)
 _UNKNOWN = {  # what was expected of a file of an ending, and a remedy
-    "": ("expected cameras as .json, .npz, .xml, .torch or a COLMAP folder, found another kind of file",),
+    "": (f"expected cameras as {', '.join(CAMERA_ENDINGS)} or a COLMAP folder, found another kind of file",),
     ".json": ("expected 'frames' (nerfstudio) or a list of cameras (INRIA), found neither",),
     ".ply": ("expected cameras inside it, found none", "name another file"),
 }

@@ -172,16 +172,15 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
     ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a page, which have cameras.
     """
     allowed = {LEVELS: levels, COLMAP: cameras, HTML: cameras}
-    chosen = next((row for row in FORMATS if row.names(path)), None)
-    if chosen is not None and (chosen.max_degree < 0 or not allowed.get(chosen, True)):
-        chosen = None
+    chosen = next((row for row in FORMATS if row.names(path) and allowed.get(row, True)), None)
     if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):
         problem = "expected a format without cameras, got a COLMAP model"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
-    if chosen is None:
+    if chosen is None or chosen.max_degree < 0:
+        read_only = "" if chosen is None else f"{chosen.ending} is read, not written: "
         endings = join_words((*OUTPUT_FORMATS, *([HTML.ending] if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
         folder = f", or a folder, or one named {FOLDER}" if cameras else ""
-        raise UsageError(f"{path}: expected a name that ends in {endings}{index}{folder}")
+        raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     chosen.require()
     return chosen

@@ -58,7 +58,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
         (("camera_poses.txt", "pcd/0_pcd.ply"), "camera_poses.txt", ("DA3-Streaming", "save_depth_conf_result")),
         (("output.glb",), "output.glb", ("depth", "Depth Anything 3")),
         (("mesh.ply",), "mesh.ply", ("points", "name")),
-        (("notes.txt",), "none", ()),
+        (("notes.txt",), "photos", ("Depth Anything 3", "AnySplat")),
     ],
 )
 def test_a_folder_without_gaussians(
@@ -94,6 +94,24 @@ def test_a_file_that_holds_no_gaussians(tmp_path: Path, tiny: Tiny, name: str, s
         write_points_glb(tmp_path / name)
     with refuses(SceneError, name, "Gaussians", *said):
         find_scene_files(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "lacks"),
+    [
+        (("depth", "c2w", "images"), "lack K:"),
+        (("depth", "K", "images"), "lack c2w:"),
+        (("depth", "c2w"), "lack K and images:"),
+        (("depths", "extrinsic"), "lack intrinsics:"),
+        (("depth", "image"), "lack extrinsics and intrinsics:"),
+    ],
+)
+def test_what_depth_maps_lack_is_named(tmp_path: Path, arrays: tuple[str, ...], lacks: str) -> None:
+    np.savez(tmp_path / "views.npz", **dict.fromkeys(arrays, np.zeros(1)))
+    for path in (tmp_path, tmp_path / "views.npz"):
+        with refuses(SceneError, path) as raised:
+            find_scene_files(path)
+        assert lacks in str(raised.value)
 
 
 @pytest.mark.parametrize("ending", [".spz", ".sog", ".splat", ".glb"])

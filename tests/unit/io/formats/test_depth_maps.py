@@ -11,7 +11,7 @@ import pytest
 from messages import refuses
 from tiny_scene import Tiny, make_tiny, write_images, write_npz, write_transforms
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import read_gaussians
 from gsmerge.io.formats.depth_maps import OPACITY, SIGMA, find_depth_maps, holds_depth_maps, read_images
 from gsmerge.io.formats.read import GaussianFile, read_parts
@@ -216,6 +216,7 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
         find_scene_files(tmp_path)
 
 
-def test_depth_maps_are_not_written() -> None:
-    with pytest.raises(Exception, match=r"expected a name that ends in"):
-        output_format("results.npz")
+@pytest.mark.parametrize("name", ["results.npz", "a.ksplat", "a.compressed.ply", "a.lcc"])
+def test_what_is_only_read_is_not_written(name: str) -> None:
+    with refuses(UsageError, name, "is read, not written", "a name that ends in"):
+        output_format(name)
