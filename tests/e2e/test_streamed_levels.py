@@ -99,7 +99,7 @@ def test_a_run_that_fails_leaves_no_folder(
 
 def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -> None:
     words = ("batch", small_scene, "--output", tmp_path, "--name", "{stem}/lod-meta.json")
-    assert_refused(run(*words), 2, "output", ".ply")
+    assert_refused(run(*words), 2, "--name", ".ply")
 
 
 @pytest.mark.parametrize("name", ["lod-meta.json", "a.html", "colmap"])
