@@ -25,11 +25,11 @@ class PhotoOptions(Settings):
 
 @opt.command(
     opt.argument("paths", list[Path], "IN... OUT",
-                 "Files of Gaussians, or folders with one: .ply, .compressed.ply, .spz, .sog, .splat, .glb, "
-                 "lod-meta.json, .ksplat, meta.json, .lcc or .lcc2; several of one world are joined. The last is "
-                 "written, as its name says: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), "
-                 "lod-meta.json, a folder, or one named colmap. Or a .gsm of gsmerge extend, and a .npz for its "
-                 "Feature Gaussians as arrays."),
+                 "Files or folders of Gaussians: .ply, .compressed.ply, .spz, .sog, .splat, .glb, lod-meta.json, "
+                 ".ksplat, meta.json, .lcc or .lcc2; several of one world are joined. The last is written, as its "
+                 "name says: .ply, .spz, .sog, .splat, .glb, .usdc, .usdz, .html (a page to send), lod-meta.json, a "
+                 "folder, or one named colmap. Or a .gsm of gsmerge extend, and a .npz for its Feature Gaussians as "
+                 "arrays."),
     opt.changed("cameras", help="Cameras in the frame of the first file, which are turned as well. Default: "
                 "the cameras inside a result or beside it; none: without."),
     opt.changed("hint", help="How the files store opacity where it is not recognised: opacity=logit or opacity=raw."),

@@ -62,16 +62,22 @@ OTHER_CONTENTS = (
 _PATTERNS = tuple(re.compile(row.start.encode("latin-1")) for row in OTHER_CONTENTS)
 
 
+def read_start(path: Path, count: int = 1 << 12) -> bytes:
+    """Read the first bytes of a file, which tell its kind; none if it cannot be read."""
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(count)
+    return b""
+
+
 def check_first_bytes(path: Path, size: int) -> None:
     """Raise SceneError for a file of ``size`` bytes that cannot be what its name says, with what it is instead.
 
     A file that cannot be read is left to its reader.
     """
-    ending, start = path.suffix.lower(), b""
+    ending = path.suffix.lower()
     if size == 0 and ending in NO_TEXT:
         raise SceneError(path, "expected content, found an empty file", _AGAIN)
-    with suppress(OSError), path.open("rb") as file:
-        start = file.read(_START)
+    start = read_start(path, _START)
     for row, pattern in zip(OTHER_CONTENTS, _PATTERNS, strict=True):
         match = pattern.match(start) if ending not in row.right and ending in (row.wrong or (ending,)) else None
         if match:

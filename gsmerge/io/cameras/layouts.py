@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from gsmerge.errors import SceneError
+from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 
@@ -25,7 +25,6 @@ class Layout(NamedTuple):
 POSE_FOLDERS = ("pose", "poses")  # with a file for each view
 # Beside poses, the first that exists; a folder has a file for each view
 INTRINSICS = ("intrinsic.txt", "intrinsics.txt", "pred_intrinsics.txt", "intrinsic/intrinsic_color.txt", "intrinsics")
-_START = 1 << 12  # bytes of a file that tell its kind
 _DEPTH, _MAX_PATHS = 3, 10_000  # of folders that are searched for it, and paths in them
 _OWN = "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
 _MODEL = f"name the COLMAP model that it was made from, or {_OWN}"
@@ -87,7 +86,7 @@ _MATRIX = r"\b(extrinsics?|c2w|w2c|cam(era)?_?(to|2)_?world|world_?(to|2)_?cam(e
 
 def starts_like_poses(path: Path) -> bool:
     """Return whether a text file starts as one of camera poses: a table by its head, others by several views."""
-    suffix, text = path.suffix.lower(), _start(path).lower().lstrip()
+    suffix, text = path.suffix.lower(), read_start(path).decode("latin-1").lower().lstrip()
     if suffix in (".csv", ".txt"):
         return all(re.search(words, text.partition("\n")[0]) for words in (_PLACE, _TURN))
     several = all(len(re.findall(words, text)) > 1 for words in (_PLACE, _TURN))
@@ -119,10 +118,4 @@ def find_unread(place: Path) -> Path | None:
 
 def _is_of(path: Path, layout: Layout) -> bool:
     named = layout.remedy and any(map(path.match, layout.files.split())) and path.is_file()
-    return bool(named) and re.search(layout.start, _start(path)) is not None
-
-
-def _start(path: Path) -> str:
-    with suppress(OSError), path.open("rb") as file:
-        return file.read(_START).decode("latin-1")
-    return ""
+    return bool(named) and re.search(layout.start, read_start(path).decode("latin-1")) is not None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from gsmerge.io.cameras.json_files import (
     read_world_mirror,
 )
 from gsmerge.io.cameras.layouts import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
+from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 from gsmerge.settings.extend import SUFFIX
@@ -34,7 +34,7 @@ _lazy = lazy_functions(__package__)
 CHUNK = ".torch"  # of re10k
 array_names, holds_poses = _lazy("npz_files.array_names"), _lazy("npz_files.holds_poses")
 holds_images, read_depths = _lazy("npz_files.holds_images"), _lazy("npz_files.read_depths")
-_KEYFRAME, _START = "t_00", 1 << 12  # value of a file of Polycam, and bytes of it that name all its values
+_KEYFRAME = "t_00"  # value of a file of Polycam, which its first bytes name
 _MAX_OTHERS = 16  # files in a folder that are looked into for cameras
 _LOG = ".log"  # text of poses
 _OTHERS = (".json", ".npz", ".xml", ".txt", _LOG, ".csv")
@@ -48,10 +48,7 @@ def is_colmap(folder: Path) -> bool:
 def is_keyframes(folder: Path) -> bool:
     """Return whether a folder holds the cameras of Polycam's keyframes, a ``.json`` each."""
     first = min(folder.glob("[!.]*.json"), default=folder)
-    if first.is_file():
-        with suppress(OSError), first.open("rb") as file:
-            return f'"{_KEYFRAME}"'.encode() in file.read(_START)
-    return False
+    return first.is_file() and f'"{_KEYFRAME}"'.encode() in read_start(first)
 
 
 def holds_model(folder: Path, suffix: str) -> bool:
@@ -74,15 +71,11 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file of :data:`_OTHERS` in a folder that holds cameras, by any name, or one that starts like them.
-
-    None without one.
-    """
+    """Find a folder's only file of :data:`_OTHERS` with cameras, or the first that starts as some if none is read."""
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _OTHERS and path.name not in INTRINSICS)
-    files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)]
-    camera_files = [path for path in files[:_MAX_OTHERS] if _holds_cameras(path)]
-    unknown = [] if camera_files else filter(starts_like_poses, files[:_MAX_OTHERS])
-    return camera_files[0] if len(camera_files) == 1 else next(iter(unknown), None)
+    files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)][:_MAX_OTHERS]
+    files = [path for path in files if _holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
+    return files[0] if len(files) == 1 else None
 
 
 def _holds_cameras(path: Path) -> bool:
