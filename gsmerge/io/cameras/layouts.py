@@ -107,11 +107,10 @@ def check_layout(place: Path) -> None:
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of cameras that are not read: a path itself, or one below a folder; None without one."""
+    """Find a file of cameras that are not read: a path itself, or one below a folder, but of no scene there."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
-    plys = (path for path in files if path.suffix == ".ply" and path.parent != place)
-    scenes = {ply.parent for ply in plys if header_content(ply) == "Gaussians"}  # whose cameras are their own
+    scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}
     others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
     return next((path for layout in LAYOUTS for path in others if _is_of(path, layout)), None)
 
