@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rgb_to_sh0
+from gsmerge.geometry import project_points, rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.io.cameras.camera_format import CameraSource
@@ -42,6 +42,9 @@ PLACES = (  # in a folder, besides the frames
 )  # fmt: skip
 SIGMA, OPACITY = 0.6, 0.7  # of a Gaussian: pixels, 0 to 1
 _GREY = 128
+_SAMPLES, _SAME = 1000, 0.05  # pixels of a view that are looked up in the next one, and relative difference of depths
+# With right poses 1.9 times as many pixels agree, or more, as with wrong ones, on each of 15 captures
+_AGREE, _MORE = 0.2, 1.5
 _PIXEL_BYTES = 11  # that are kept of a pixel until it is unpacked, at most: a float64 and three colours
 _KEPT_BYTES = 128 << 20  # of images; more are read at each use
 
@@ -122,7 +125,33 @@ def _read_views(path: Path) -> tuple[np.ndarray, CameraFile]:
     if depths is None or len(depths) != len(cameras) or cameras.focal is None:
         problem = f"expected depth maps [{len(cameras)},h,w], one for each pose, with intrinsics, found others"
         raise SceneError(path, problem, "write all of them, or name a .ply of Gaussians")
+    _check_poses(path, depths, cameras)
     return depths, cameras
+
+
+def _check_poses(path: Path, depths: np.ndarray, cameras: CameraFile) -> None:
+    """Refuse poses with which depth maps agree far less than with those of another convention."""
+    axes, given, inverted = np.diag([1.0, -1, -1, 1]), cameras.viewmats, invert(cameras.viewmats)
+    others = {"inverted": inverted, "of OpenGL's axes": matmul(axes, given), "of both": matmul(axes, inverted)}
+    most, name = max((_agreement(depths, replace(cameras, viewmats=poses)), name) for name, poses in others.items())
+    if most > max(_AGREE, _MORE * (share := _agreement(depths, cameras))):
+        problem = f"expected poses by which the depths of the next view agree, found {share:.0%} that do"
+        raise SceneError(path, f"{problem}, and {most:.0%} were the poses {name}", "write them so")
+
+
+def _agreement(depths: np.ndarray, cameras: CameraFile) -> float:
+    """Return the share of some pixels that lie at the depth of the next view."""
+    (count, height, width), poses = depths.shape, cameras.viewmats
+    some = slice(None, None, max(1, height * width // _SAMPLES))
+    views = zip(depths, np.zeros((*depths.shape, 3), np.uint8), cameras.Ks, poses, strict=True)
+    points = np.stack([_pack(*view).unpack(some).means for view in views])
+    after = (np.arange(count) + 1) % count
+    with np.errstate(all="ignore"):  # of pixels without a depth, or behind a view
+        places, ahead = project_points(points, poses[after], cameras.Ks[after])
+        inside = (ahead > 0) & (places >= 0).all(-1) & (places < (width, height)).all(-1)
+        column, row = places[inside].astype(np.int64).T
+        there = depths[after[np.nonzero(inside)[0]], row, column] / ahead[inside]
+    return float((np.abs(there - 1) < _SAME).sum() / max(inside.size, 1))
 
 
 def _pack(depth: np.ndarray, image: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> Packed:

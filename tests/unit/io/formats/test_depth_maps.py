@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import scenes
 from messages import refuses
 from tiny_scene import Tiny, make_tiny, write_images, write_npz, write_transforms
 
@@ -220,3 +222,22 @@ def test_frames_that_are_not_all_there(tmp_path: Path, tiny: Tiny) -> None:
 def test_what_is_only_read_is_not_written(name: str) -> None:
     with refuses(UsageError, name, "is read, not written", "a name that ends in"):
         output_format(name)
+
+
+@pytest.mark.parametrize("kind", ["", "inverted", "of OpenGL's axes", "of both"])
+def test_poses_of_another_convention_are_refused(tmp_path: Path, kind: str) -> None:
+    """Of a wall of two planes at a right angle, seen from an arc."""
+    w2c = scenes.arc(6, 48, 32).viewmats.astype(np.float64)
+    c2w, K = np.linalg.inv(w2c), np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
+    y, x = np.mgrid[:32, :48] + 0.5
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T
+    world = np.einsum("vij,hwj->vhwi", c2w[:, :3, :3], rays)
+    normals = c2w[:, :3, 2].mean(0) + np.array([[0.4, 0.2, 0], [-0.4, 0.3, 0.1]])
+    middle = c2w[:, :3, 3].mean(0) + 3 * c2w[:, :3, 2].mean(0)
+    depths = [((middle - c2w[:, :3, 3]) @ n)[:, None, None] / (world @ n) for n in normals]
+    axes = np.diag([1.0, -1, -1, 1])
+    stored = {"": c2w, "inverted": w2c, "of OpenGL's axes": c2w @ axes, "of both": axes @ w2c}[kind]
+    images = np.zeros((6, 32, 48, 3), np.uint8)
+    np.savez(tmp_path / "views.npz", depth=np.max(depths, 0), c2w=stored, K=np.tile(K, (6, 1, 1)), images=images)
+    with refuses(SceneError, "views.npz", f"poses {kind}") if kind else nullcontext():
+        assert len(read_gaussians(tmp_path / "views.npz").gaussians)
