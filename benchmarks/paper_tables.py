@@ -226,6 +226,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="replace the section of this page")
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "gsmerge-benchmarks")
     args = parser.parse_args()
+    folders = scene_folders(args.scenes)
     if args.lpips and not lpips_available("vgg"):
         parser.error(f"LPIPS needs weights: {INSTALL}; or give --no-lpips")
     if args.page and len(args.only) < len(SECTIONS):
@@ -233,7 +234,7 @@ def main() -> None:
     args.cache.mkdir(parents=True, exist_ok=True)
     files = {"paper": args.checkpoint}
     store = Store(args.cache / "paper_tables.jsonl")
-    bench = Bench(scene_folders(args.scenes), store, args.cache, files, args.lpips)
+    bench = Bench(folders, store, args.cache, files, args.lpips)
     for folder in bench.folders:
         for way, case in planned(args.only, bench):
             if num_views(folder) >= (case.views or 0):
