@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.place_cameras import keep_finite, place_viewpoints
-from gsmerge.facts.views import pick_views
+from gsmerge.facts.place_cameras import NO_VIEWS, add_views
+from gsmerge.facts.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
@@ -34,7 +34,7 @@ from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
 from gsmerge.raster.photos import NEAR
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.runtime.record import Progress
+from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
@@ -275,16 +275,13 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     """Place views about a scene that has none, for a path without those ``inside`` of it."""
     if len(load.scene):
         return load
-    scene = keep_finite(load.scene)
-    cameras = place_viewpoints(scene.gaussians)
-    cameras = cameras if inside else cameras[: len(cameras) // 2]
-    names = tuple(f"placed {view}" for view in range(len(cameras)))
-    scene = replace(scene, cameras=cameras, names=names)
-    views = SceneViews(cameras, NO_IMAGES, names, tuple(range(len(cameras))))
-    where = "around and inside" if inside else "around"
-    return replace(
-        load, scene=scene, views=views, notes=(*load.notes, f"no cameras: views are placed {where} the scene")
-    )
+    with record_run() as record:
+        scene = add_views(load.scene, shown=True)
+    scene = scene if inside else subset(scene, range(len(scene) // 2))
+    views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
+    notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
+    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
+    return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
 
 
 def picture_stems(names: Sequence[str]) -> list[str]:
