@@ -242,11 +242,16 @@ def show_photos(scene: PicturedScene) -> Shown:
         return Shown(photos, pictures, weights, drawn=False)
     level = max(1.0, longer / DRAWN_SIDE)
     few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)
-    drawn = photo_errors(few, blank, lambda _, image, left: (image.clip(0, 1), 1 - left))
+    drawn = photo_errors(few, blank, lambda _, image, left: (_divide(image, 1 - left), 1 - left))
     pictures, weights = map(np.stack, zip(*drawn, strict=True))
     inside = pixel_weights(scene.masks, blank.width, blank.height)
     weights = weights if inside is None else weights * (inside == 1)
     return Shown(photos_of(scene.images, scene.cameras, level).images, pictures, weights, drawn=True)
+
+
+def _divide(image: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """Return the colours of what a drawing ``[h,w,3]`` shows, whatever its ``opacity [h,w]`` is; 0 where it is none."""
+    return np.asarray((image / np.maximum(opacity, FAINT)[..., None]).clip(0, 1))
 
 
 def _mend_small(shown: Shown, changes: Sequence[PhotoChange]) -> Shown:
@@ -354,9 +359,10 @@ def is_recolored(shown: Shown) -> bool:
     counts = weights > (OPAQUE if shown.drawn else FAINT)
     if counts.sum() < MIN_PIXELS:
         return False
-    drawn = _shrink(shown.pictures, side)[counts]
-    photos = _shrink(shown.photos * shown.weights[..., None], side)[counts] / weights[counts][:, None]
-    drawn = drawn / weights[counts][:, None] if shown.drawn else drawn
+    drawn, photos = (
+        _shrink(pictures * shown.weights[..., None], side)[counts] / weights[counts][:, None]
+        for pictures in (shown.pictures, shown.photos)
+    )
     tones = np.stack([_join_quantiles(photos[:, channel], drawn[:, channel]) for channel in range(3)])
     columns = np.concatenate([photos, np.ones((len(photos), 1))], 1).astype(np.float64)
     matrix = solve(matmul(columns.T, columns) + 1e-6 * np.eye(4), matmul(columns.T, drawn.astype(np.float64)))
