@@ -268,7 +268,7 @@ class Scene:
         names: The views' names (image file names where known).
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
         large_photos: The photos with more pixels than the views, or None.
-        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere.
+        masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -331,6 +331,13 @@ class Scene:
     def is_shown(self) -> bool:
         """Whether photos, or the colours of rows that belong to pixels, show what the views see."""
         return self.aligned or self.images is not None
+
+    @property
+    def photo_views(self) -> list[int]:
+        """Views that have a photo which counts somewhere; none without photos."""
+        if self.images is None or self.masks is None:
+            return [] if self.images is None else list(range(len(self)))
+        return [view for view, mask in enumerate(self.masks) if mask.any()]
 
     @property
     def num_missing(self) -> int:

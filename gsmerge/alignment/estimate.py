@@ -12,7 +12,7 @@ from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.dropped_rows import find_dropped_grid
 from gsmerge.alignment.layouts import ESTIMATED, exact_layouts, subsample
 from gsmerge.alignment.row_grid import find_grid
-from gsmerge.alignment.score import MARGIN, base_colors, find_correspondences
+from gsmerge.alignment.score import MARGIN, find_correspondences
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.types import Cameras, Gaussians
 
@@ -37,11 +37,10 @@ def estimate_cameras(
     return _make_cameras(path, names, fits[0].cameras)
 
 
-def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> tuple[CameraFile, np.ndarray] | None:
+def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> CameraFile | None:
     """Estimate the cameras of rows that form a grid of unknown size, whole or without some pixels; None for other rows.
 
-    ``valid [n]`` bool; ``path`` is for messages. Also returns the base colours ``[v,h,w,3]`` of the pixels, 0 to 1;
-    pixels without a row have the mean of their view.
+    ``valid [n]`` bool; ``path`` is for messages.
     """
     grid = find_grid(gaussians, valid) or find_dropped_grid(gaussians.means, valid)
     if grid is None:
@@ -49,16 +48,9 @@ def estimate_from_rows(path: Path, gaussians: Gaussians, valid: np.ndarray) -> t
     layout, calibration = grid
     names = [f"view {view}" for view in range(len(calibration.cameras))]
     cameras = _make_cameras(path, names, calibration.cameras)
-    base = base_colors(gaussians)
-    pictures = np.empty((len(names), layout.height * layout.width, 3), base.dtype)
-    for view, picture in enumerate(pictures):
-        first = layout.views.index(view)
-        colors = base[layout.rows[first].reshape(-1)]
-        picture[:] = colors.mean(0)
-        picture[layout.pixels[first]] = colors
     if layout.kind == "pruned":
         cameras = replace(cameras, pixel_ids=layout.pixel_ids(len(gaussians)))
-    return cameras, pictures.reshape(len(names), layout.height, layout.width, 3)
+    return cameras
 
 
 def _make_cameras(path: Path, names: Sequence[str], cameras: Cameras) -> CameraFile:

@@ -92,6 +92,8 @@ def check_cameras(
                 seen[seen] = _are_foremost(xy[view, seen], depth[view, seen], cameras.width * cameras.height)
             x, y = xy[view, seen].astype(np.int64).T
             photo = photo_colors(images, np.full(len(x), first + view), y, x)
+            if (photo == photo[:1]).all():  # black, where a view has no photo
+                continue
             errors.append(np.abs(colors[seen] - photo).mean(1))
             shuffled_errors.append(np.abs(colors[seen] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan

@@ -87,7 +87,7 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     """Read the cameras that ``compact`` wrote into results or beside them, as the fit moved them; with notes."""
     import numpy as np
 
-    from gsmerge.facts.prepare import scene_depth
+    from gsmerge.frame import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
     from gsmerge.io.cameras.read import read_cameras
     from gsmerge.scene.files import result_cameras

@@ -24,10 +24,11 @@ from gsmerge.facts.partition import (
     partition_apart,
     partition_views,
 )
-from gsmerge.facts.prepare import Frame, Prepared, prepare, scene_frame
+from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
+from gsmerge.frame import Frame, scene_frame
 from gsmerge.pipeline import start
 from gsmerge.plan import Plan, SceneChoices, make_plan
 from gsmerge.raster import contributions, tile_view

@@ -19,7 +19,7 @@ from gsmerge.compaction.placement import (
     place,
 )
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.prepare import scene_frame
+from gsmerge.frame import scene_frame
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.json_files import viewer_cameras_path

@@ -15,8 +15,9 @@ from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.place_cameras import count_placed, placed_views
-from gsmerge.facts.prepare import canonicalise, missing_notes
+from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import SceneSize, measure_size
+from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import INDEX
 from gsmerge.measure.coverage import shares_inside

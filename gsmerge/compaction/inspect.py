@@ -15,8 +15,9 @@ from gsmerge.compaction.files import nothing_left, shows_nothing
 from gsmerge.errors import SceneError
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import canonicalise, missing_notes
+from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import unlike_captures
+from gsmerge.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.ply import is_from_gsmerge

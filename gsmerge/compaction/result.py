@@ -13,9 +13,10 @@ import numpy as np
 
 from gsmerge.compaction.new_views import SIDE, Trial
 from gsmerge.compaction.report import CompactReport, Covered
-from gsmerge.facts.prepare import Prepared, scene_depth
+from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.fit import Fitted
+from gsmerge.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.io.formats.rounding import as_written
 from gsmerge.plan import Plan

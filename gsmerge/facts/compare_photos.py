@@ -16,13 +16,13 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.photo_change import PhotoChange, change_large, look_up
-from gsmerge.facts.place_cameras import sampled
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.kernels.pictures import convolve
 from gsmerge.raster import render
+from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, row_pictures, shrink_pictures
 from gsmerge.runtime.record import adopt, choose, note, record_part
 from gsmerge.runtime.threads import parallel_map
@@ -89,8 +89,10 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     ``photos_changed`` and ``photos_left_out``.
     """
     if look != "auto":
-        return scene, tuple(range(len(scene))) if look == "photos" else ()
+        return scene, tuple(scene.photo_views) if look == "photos" else ()
     small, names = show_photos(scene), scene.names
+    given = scene.photo_views
+    absent = sorted({*range(len(scene))} - {*given})
     if is_recolored(small):
         return _keep_look(scene)
     with record_part(silent=True) as tones:
@@ -104,7 +106,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         covers, pictures = np.zeros(scene.images.shape[:3], bool), None
         odd = odd_photos(_mend_small(small, changes))
     adopt(tones)
-    covered = [view for view in range(len(scene)) if covers[view].any() and view not in odd]
+    odd = [view for view in odd if view not in absent]
+    covered = [view for view in given if covers[view].any() and view not in odd]
     changed = sorted({*covered, *(view for view, change in enumerate(changes) if change)} - {*odd})
     if changed:
         choose(photos_changed=[names[view] for view in changed])
@@ -117,10 +120,14 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         )
     if odd and not _leave_out(scene, odd):
         return scene, ()
-    covers[odd] = True
+    covers[[*odd, *absent]] = True
     if scene.masks is not None:
         covers |= ~scene.masks
-    return _change(scene, changes, covers, pictures), tuple(view for view in range(len(scene)) if view not in odd)
+    if absent and scene.masks is not None:  # what stands in for their photos counts
+        masks = scene.masks.copy()
+        masks[absent] = True
+        scene = replace(scene, masks=None if masks.all() else masks)
+    return _change(scene, changes, covers, pictures), tuple(view for view in given if view not in odd)
 
 
 def _keep_look(scene: PicturedScene) -> tuple[PicturedScene, tuple[int, ...]]:
@@ -241,7 +248,7 @@ def show_photos(scene: PicturedScene) -> Shown:
         photos, pictures = scene.images[some], sh0_to_rgb(colors[some]).clip(0, 1)
         return Shown(photos, pictures, weights, drawn=False)
     level = max(1.0, longer / DRAWN_SIDE)
-    few, blank = sampled(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)
+    few, blank = thin_out(scene.gaussians, SAMPLES), blank_photos(scene.cameras, level)
     drawn = photo_errors(few, blank, lambda _, image, left: (_divide(image, 1 - left), 1 - left))
     pictures, weights = map(np.stack, zip(*drawn, strict=True))
     inside = pixel_weights(scene.masks, blank.width, blank.height)

@@ -13,6 +13,7 @@ from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, nor
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster import contributions, prepare, render, tile_view
+from gsmerge.raster.images import thin_out
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
@@ -65,7 +66,7 @@ def add_views(scene: Scene, *, shown: bool = False) -> Scene:
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
     """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
-    centre, half = _extent(sampled(gaussians).means.astype(np.float64))
+    centre, half = _extent(thin_out(gaussians, SAMPLES).means.astype(np.float64))
     turns = 2 * np.pi * np.arange(len(inside)) / len(inside)
     ring = np.stack([sin(turns), np.full(len(turns), ABOVE), -cos(turns)], 1)  # the first where most models look from
     around = replace(inside, viewmats=_around(centre, half, FAR, normalize(ring)))
@@ -108,7 +109,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
 
     They come last. What a background shows through the renders is their ``empty``.
     """
-    means = sampled(scene.gaussians).means.astype(np.float64)
+    means = thin_out(scene.gaussians, SAMPLES).means.astype(np.float64)
     centre, half = _extent(means)
     outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR, NEAR)]
     within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
@@ -181,7 +182,7 @@ def place_cameras(
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = sampled(gaussians, SAMPLES // step)
+    sample = thin_out(gaussians, SAMPLES // step)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)[::step]
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))
@@ -192,13 +193,6 @@ def place_cameras(
 
 def _lens(size: int) -> np.ndarray:
     return np.array([[size / FIELD, 0, size / 2], [0, size / FIELD, size / 2], [0, 0, 1]])
-
-
-def sampled(gaussians: Gaussians, count: int = SAMPLES) -> Gaussians:
-    """Return every k-th Gaussian, at most ``count``, enlarged so that the total area stays the same."""
-    step = max(1, -(-len(gaussians) // count))
-    few = gaussians[::step]
-    return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)
 
 
 def _extent(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,13 +1,7 @@
-"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic.
-
-The canonical frame has its origin at the scene's middle and the median depth as its unit, so that
-float32 keeps its precision far from the world's origin and thresholds (near plane, floors) mean the
-same at every scale. The unit is a power of two: scaling there and back changes no bit.
-"""
+"""Scene -> prepared scene: facts about it, and the scene in the frame of all arithmetic."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -32,97 +26,13 @@ from gsmerge.facts.place_cameras import (
 from gsmerge.facts.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.facts.views import distinct_views, subset
-from gsmerge.geometry import camera_depths, lower_median, project
-from gsmerge.kernels.matrices import matmul
+from gsmerge.frame import Frame, canonicalise, sample_rows
 from gsmerge.raster.images import seen_weights
 from gsmerge.runtime.record import choose, note, record_part, stage
-from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look, PrepareOptions
-from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene, SceneT
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
-SAMPLES = 65536  # Gaussians that the frame is measured on
-ROWS = 65536  # Gaussians per task
 FLAT = 2 / 255  # range of the colours of a picture that shows one
-MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Canonical frame: x_canonical = (x_world - origin) / unit."""
-
-    origin: np.ndarray  # [3] float64, world units
-    unit: float  # Length of the canonical unit in world units, a power of two
-
-    def enter(self, gaussians: Gaussians) -> Gaussians:
-        """Move Gaussians from the world into the frame; means in float32."""
-        means, scales = np.empty(gaussians.means.shape, np.float32), np.empty_like(gaussians.scales)
-
-        def fill(first: int) -> None:
-            rows = slice(first, first + ROWS)
-            means[rows] = (gaussians.means[rows] - self.origin) / self.unit
-            np.divide(gaussians.scales[rows], self.unit, out=scales[rows])
-
-        parallel_map(fill, range(0, len(gaussians), ROWS))
-        return replace(gaussians, means=means, scales=scales)
-
-    def leave(self, gaussians: Gaussians) -> Gaussians:
-        """Move Gaussians from the frame into the world; means in float64."""
-        means = gaussians.means.astype(np.float64) * self.unit + self.origin
-        return replace(gaussians, means=means, scales=gaussians.scales * self.unit)
-
-    def leave_cameras(self, cameras: Cameras) -> Cameras:
-        """Move cameras from the frame into the world."""
-        viewmats = cameras.viewmats.astype(np.float64)
-        viewmats[:, :3, 3] = self.unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], self.origin)
-        return replace(cameras, viewmats=viewmats)
-
-    def enter_cameras(self, cameras: Cameras) -> Cameras:
-        """Move cameras from the world into the frame."""
-        viewmats = cameras.viewmats.astype(np.float64)
-        shift = viewmats[:, :3, 3] + matmul(viewmats[:, :3, :3], self.origin)
-        viewmats[:, :3, 3] = shift / self.unit
-        return replace(cameras, viewmats=viewmats)
-
-
-def scene_frame(scene: Scene) -> Frame:
-    """Choose the canonical frame: median mean (float64) and median depth; ValueError without Gaussians or views."""
-    if len(scene.gaussians) == 0 or len(scene) == 0:
-        raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
-    means = scene.gaussians.means[_sample_rows(scene)].astype(np.float64)
-    depth = scene_depth(scene)
-    mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)
-    return Frame(lower_median(means), math.ldexp(1.0, exponent - (mantissa < math.sqrt(0.5))))
-
-
-def scene_depth(scene: Scene) -> float:
-    """Measure the median depth of sampled Gaussians in their own views, or in all views that see them; 0 if unseen."""
-    rows = _sample_rows(scene)
-    means = scene.gaussians.means[rows].astype(np.float64)
-    if scene.aligned:
-        viewmats = scene.cameras.viewmats[rows // scene.pixels_per_view]
-        return float(lower_median(np.abs(camera_depths(means, viewmats))))
-    views = scene.cameras[:: max(1, len(scene) // MAX_VIEWS)]
-    pixels, depths = project(means, views)
-    seen = (depths > 0) & ((pixels > 0) & (pixels < (views.width, views.height))).all(-1)
-    return float(lower_median(depths[seen])) if seen.any() else 0.0
-
-
-def _sample_rows(scene: Scene) -> np.ndarray:
-    """Choose evenly spread rows among the valid ones; raise ValueError if there is none."""
-    valid = None if scene.pixel_ids is None else scene.pixel_ids >= 0
-    count = len(scene.gaussians) if valid is None else int(np.count_nonzero(valid))
-    if count == 0:
-        raise ValueError("expected at least one valid Gaussian, got none")
-    step = max(1, count // SAMPLES)
-    if valid is None or count == len(valid):
-        return np.arange(0, count, step)
-    return np.flatnonzero(valid)[::step]
-
-
-def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Frame]:
-    """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
-    frame = frame or scene_frame(scene)
-    return replace(scene, gaussians=frame.enter(scene.gaussians), cameras=frame.enter_cameras(scene.cameras)), frame
 
 
 @dataclass(frozen=True)
@@ -170,7 +80,7 @@ class Prepared:
         views = list(self.reference.score_views)
         flat = self.reference.name == RENDERS and all(np.ptp(self.scene.images[view]) < FLAT for view in views)
         one = "the views show one flat colour, so nothing says how near a result is to it"
-        return unlike_captures(self.scene.gaussians[_sample_rows(self.scene)]) or (one if flat and views else None)
+        return unlike_captures(self.scene.gaussians[sample_rows(self.scene)]) or (one if flat and views else None)
 
     @cached_property
     def scene_around(self) -> PicturedScene:

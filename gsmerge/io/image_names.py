@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePath, PurePosixPath
 
 from gsmerge.errors import SceneError
@@ -15,7 +15,9 @@ from gsmerge.types import StrPath
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
 _MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
 _NAME_FOLDER = "name the folder of the photos with --images, or with --target-images those of held-out views"
+_HIDDEN = ".@"  # with which names of hidden folders begin: .thumb, @eaDir
 ImageSource = StrPath | Sequence[StrPath]
+PixelCount = Callable[[Path], int]  # of an image file
 
 
 def match_images(source: ImageSource, names: Sequence[str]) -> list[Path]:
@@ -60,9 +62,33 @@ def _endings(path: PurePath) -> list[str]:
     return list(dict.fromkeys(str(name) for ending in endings for name in (ending, ending.with_suffix(""))))
 
 
-def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
+def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
+    """List the files whose paths have the longest ending of a name that any has."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "//", "..")]
-    matches = next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
+    return next((by_ending[ending] for ending in _endings(PurePosixPath(*parts)) if ending in by_ending), [])
+
+
+def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
+    """Propose one of ``files`` below a folder for each name, None where none has it.
+
+    Of several, one whose whole path is the name comes first, hidden folders last; then the largest by ``pixels``.
+    """
+    by_ending = _by_ending(root, files)
+
+    def rank(path: Path, name: str) -> tuple[bool, bool, int]:
+        inside = path.relative_to(root) if path.is_relative_to(root) else path
+        whole = any(ending in (str(inside), str(inside.with_suffix(""))) for ending in _endings(PurePosixPath(name)))
+        return not whole, any(part[0] in _HIDDEN for part in inside.parts), -pixels(path)
+
+    def choose(name: str) -> Path | None:
+        matches = _find_matches(by_ending, name)
+        return min(matches, key=lambda path: rank(path, name)) if len(matches) > 1 else next(iter(matches), None)
+
+    return [choose(name) for name in names]
+
+
+def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str = "--images") -> Path | None:
+    matches = _find_matches(by_ending, name)
     if len(matches) > 1:
         first, second = (os.path.relpath(path, root) for path in matches[:2])
         problem = f"expected one image named {name}, found {first} and {second}"

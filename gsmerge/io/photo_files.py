@@ -19,6 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_pixels, read_errors
 from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras
@@ -26,7 +27,8 @@ from gsmerge.types import Cameras
 _FORMATS = ("JPEG", "WEBP", "BMP", "TIFF", "PPM")  # besides PNG, whose header is read here
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257  # of TIFF: Pillow's own size follows the orientation tag
 _ORIENTATION_TAG = 274
-_TURNS = {3: 2, 6: 3, 8: 1}  # quarter turns, counterclockwise, of a tag; mirrored photos stay
+# Turn that each tag asks for: quarter turns counterclockwise, and 4 more where the photo is mirrored first
+_TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _MAX_PIXEL_BYTES, _MAX_EXTRA = 16, 16 << 20  # of any file: four floats a pixel, and profiles or thumbnails
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".ppm"})
 _HALF_OPAQUE = 127
@@ -48,6 +50,9 @@ _MAX_TAGS = 1 << 16  # that are looked at; decoders read fewer
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100  # bytes of a scene's decoded photos; 0.03 bytes a pixel are few
 _BAND = 256  # rows of a mask that are converted at once
+_PARTS = {  # of each side of a photo that is decoded
+    1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
+}  # fmt: skip
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})
 
 Size = tuple[int, int]  # width, height, pixels
@@ -118,6 +123,49 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
         problem = f"expected photos of at most {most / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
         found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
         raise SceneError(paths[0].parent, f"{problem}, {found}", "make them smaller, or leave some out")
+
+
+def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> Photos:
+    """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
+
+    If they are large, they are decoded at each use. SceneError as :func:`decode_images`.
+    """
+    files = list(dict.fromkeys(path for path in paths if path is not None))
+    sizes = {path: image_size(path) for path in files}
+    _check_together([path for path in paths if path is not None], sum(map(check_file, files)), size)
+
+    def decode(view: int) -> np.ndarray:
+        path = paths[view]
+        if path is None:
+            return np.zeros((size[1], size[0], 3), np.uint8)
+        photo = np.ascontiguousarray(turn_picture(decode_image(path, sizes[path]), turns[view]))
+        return (
+            photo
+            if photo.shape[1::-1] == size
+            else resize_to((photo.shape[1], photo.shape[0]), size).photos([photo])[0]
+        )
+
+    if _CHANNELS * size[0] * size[1] * len(paths) > _AT_ONCE:
+        return PhotoReader(len(paths), size, decode)
+    return parallel_map(decode, range(len(paths)))
+
+
+def decode_small(path: Path, side: int) -> np.ndarray:
+    """Decode a photo to ``[h,w,3]`` float32 sRGB in [0, 1], with ``side`` to twice as many pixels on its longer side.
+
+    The orientation tag is ignored, and small photos stay as they are. JPEG files are decoded at a part of their size.
+    """
+    width, height = image_size(path)
+    part = next(part for part in reversed(_PARTS) if max(width, height) >= part * side or part == 1)
+    with read_errors(path):
+        data = np.fromfile(path, np.uint8)
+    _check_scans(ReadBudget(path, len(data)), [data], (width, height))
+    photo = _decode(path, data, (width, height), part if data[:2].tobytes() == _JPEG else 1)
+    level = max(photo.shape[:2]) / (2 * side)
+    if level > 1:
+        small = round(photo.shape[1] / level), round(photo.shape[0] / level)
+        photo = cv2.resize(photo, tuple(max(1, each) for each in small), interpolation=cv2.INTER_AREA)
+    return np.multiply(photo, np.float32(1 / 255), dtype=np.float32)
 
 
 def change_photos(photos: Photos, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None) -> Photos:
@@ -284,8 +332,8 @@ def _read_header(path: Path) -> tuple[Size, float]:
     return (width, height), pixel_bytes
 
 
-def quarter_turns(path: Path) -> int:
-    """Return the number of counterclockwise quarter turns in a photo's orientation tag."""
+def orientation_turn(path: Path) -> int:
+    """Return how a photo's orientation tag turns it, 0 to 7; see :func:`gsmerge.kernels.pictures.turn_picture`."""
     with read_errors(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -386,10 +434,10 @@ def _check_scans(budget: ReadBudget, files: Sequence[np.ndarray], size: Size) ->
     budget.check_steps(num_scans * size[0] * size[1] // _PIXELS_PER_STEP, f"steps of decoding {num_scans:,} scans")
 
 
-def _decode(path: Path, data: np.ndarray, size: Size) -> np.ndarray:
-    """Decode ``[h,w,3]`` uint8 sRGB; the orientation tag is ignored, as camera solvers do."""
-    width, height = size
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+def _decode(path: Path, data: np.ndarray, size: Size, part: int = 1) -> np.ndarray:
+    """Decode ``[h,w,3]`` uint8 sRGB, or a ``part`` of each side; the orientation tag is ignored."""
+    width, height = (-(-side // part) for side in size)
+    flags = _PARTS[part] | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = _png_pixels(data) if data[: len(_PNG)].tobytes() == _PNG else data
     try:
         image = cv2.imdecode(pixels, flags) if pixels is not None and len(pixels) else None

@@ -11,6 +11,7 @@ from gsmerge.kernels.signature import STATUS, declare, f4
 
 SLOPE, SMOOTH = np.array([-1, 0, 1], np.float32), np.array([1, 2, 1], np.float32)  # Sobel's filters
 Picture = np.ndarray[Any, Any]
+TURNS = 8  # of a picture, as tags of orientation have them: four of it, and four of its mirror image
 CUBIC = -0.75  # slope parameter of the cubic convolution (Keys 1981), OpenCV's
 
 
@@ -97,6 +98,17 @@ def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
     near = ((a + 2) * away - (a + 3)) * away * away + 1
     far = ((a * away - 5 * a) * away + 8 * a) * away - 4 * a
     return first + np.arange(-1, 3)[:, None], np.where(away <= 1, near, far).astype(np.float32)
+
+
+def turn_picture(picture: Picture, turn: int) -> Picture:
+    """Mirror a picture ``[h,w,...]`` left to right for turns from 4 on, and turn it counterclockwise by quarters."""
+    return np.rot90(picture[:, ::-1] if turn >= TURNS // 2 else picture, turn % (TURNS // 2))
+
+
+def turn_back(picture: Picture, turn: int) -> Picture:
+    """Undo :func:`turn_picture`."""
+    upright = np.rot90(picture, -(turn % (TURNS // 2)))
+    return upright[:, ::-1] if turn >= TURNS // 2 else upright
 
 
 def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:

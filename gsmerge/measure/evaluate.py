@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import judged_pictures, scene_frame
+from gsmerge.facts.prepare import judged_pictures
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.facts.views import pick_views
+from gsmerge.frame import scene_frame
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shrink_views, zoom_cameras
 from gsmerge.measure.visibility import context_points, visible_pixels
@@ -149,6 +150,7 @@ class _Split:
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
     covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: those that its renders show
     reference: str  # what the pictures are: photos, or what stands in for them
+    scored: Sequence[int]  # views whose pictures are
     drawn: Gaussians | None = None  # the input, where its renders stand in
 
     def under(self, cameras: Cameras | None) -> _Split:
@@ -242,7 +244,7 @@ def evaluate(
         ResultScores(name, len(gaussians), len(gaussians) / max(len(inputs), 1), *_join(name, parts), fog.get(name, {}))
         for name, gaussians in named.items()
     ]
-    counts = {name: len(split.views.names) for name, split in splits.items()}
+    counts = {name: len(split.scored) for name, split in splits.items()}
     notes = tuple(_notes(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
 
@@ -286,10 +288,11 @@ def _splits(
     points = context_points(scene, renderer.near, sources)
 
     def split(views: Views, reference: str, masks: np.ndarray | None = None) -> _Split:
-        visible = visible_pixels(points, views.cameras, renderer.near, sources)
+        visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
-        return _Split(views, visible, None, reference)
+            scored = [view for view in scored if masks[view].any()] or scored
+        return _Split(views, visible, None, reference, scored)
 
     target = {} if targets is None else {"target": split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
@@ -329,14 +332,18 @@ def _score_split(
             if name == INPUT and covered is None:
                 covered = opaque
             nets = options.lpips if view in perceptual else ()
-            full, masked = _both(image, split.views.images[view], split.visible[view], nets)
+            full, masked = Quality(), Quality()
+            if view in split.scored:
+                full, masked = _both(image, split.views.images[view], split.visible[view], nets)
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), full, masked)
             full, masked = (replace(quality, lpips_vgg=None, lpips_alex=None) for quality in (full, masked))
             zooms = {
-                zoom: (full, masked) if zoom == 1 else _score_zoom(gaussians, mine[name], view, zoom, renderer)
+                zoom: (full, masked)
+                if zoom == 1 or view not in split.scored
+                else _score_zoom(gaussians, mine[name], view, zoom, renderer)
                 for zoom in (() if options.zoom == (1,) else options.zoom)
             }
-            if covered is not None:
+            if covered is not None and view in split.scored:
                 share, quality = _covered(image, split.views.images[view], covered)
                 score = replace(score, covered_share=share, covered=quality or full)
             scores[name].append((seconds, replace(score, zooms=zooms)))

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import Frame, scene_frame
 from gsmerge.facts.views import even_views
+from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
 from gsmerge.io.photo_files import encode_indexed, photo_array
 from gsmerge.measure.camera_path import outside_camera

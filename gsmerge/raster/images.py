@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import Lock
 from typing import Any
@@ -167,3 +168,10 @@ def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     drawn = render(scene.gaussians, scene.cameras, near=NEAR, with_depths=True)
     assert drawn.depths is not None
     return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
+
+
+def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
+    """Return every k-th Gaussian, at most ``count``, enlarged so that the total area stays the same."""
+    step = max(1, -(-len(gaussians) // count))
+    few = gaussians[::step]
+    return Gaussians(few.means, few.quats, few.scales * math.sqrt(step), few.opacities, few.sh0, few.shN)

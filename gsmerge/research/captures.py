@@ -18,7 +18,7 @@ from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views
 from gsmerge.io.cameras.read import CHUNK, read_cameras
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
-from gsmerge.scene.views import stored_photos
+from gsmerge.scene.photos import stored_photos
 from gsmerge.types import StrPath, Views
 
 INDEX = "index.json"  # of chunks: the chunk of each scene

@@ -18,8 +18,8 @@ import numpy as np
 
 from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
-from gsmerge.facts.prepare import Frame, scene_frame
 from gsmerge.facts.views import even_views, subset
+from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import move_views
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.runtime.record import Progress

@@ -7,7 +7,7 @@ It is ambient. A run begins one with :func:`record_run`; whatever works within t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -16,6 +16,7 @@ from typing import Any
 from gsmerge.runtime.memory import release_memory
 
 Progress = Callable[[str, int, int], None]
+NAMED = 4  # items that a note lists
 # stages that leave much behind that was freed in other threads
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 STAGES = (
@@ -94,6 +95,12 @@ def stage(name: str) -> Iterator[None]:
         if name in RELEASED:
             release_memory()
         add_seconds({name: time.perf_counter() - start})
+
+
+def list_some(items: Sequence[str], separator: str = ", ") -> str:
+    """List the first of some items for a note, and how many more there are."""
+    more = f" and {len(items) - NAMED} more" if len(items) > NAMED else ""
+    return separator.join(items[:NAMED]) + more
 
 
 def note(text: str) -> None:

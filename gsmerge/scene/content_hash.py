@@ -14,7 +14,7 @@ from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.json_files import DATAPARSER, FRAMES_FILE, POSE_FILE, SCALE_FILE
 from gsmerge.io.cameras.layouts import INTRINSICS
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
-from gsmerge.scene.views import images_beside
+from gsmerge.scene.photos import images_beside
 
 EXTRA_FILES = (DATAPARSER, *INTRINSICS, FRAMES_FILE, POSE_FILE, SCALE_FILE)  # read with some camera files
 

@@ -17,8 +17,9 @@ from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import closest_rotation, matmul
 from gsmerge.scene.exporters import AUTO
 from gsmerge.scene.files import IMAGE_PLACES, SceneFiles
+from gsmerge.scene.photos import stored_photos
 from gsmerge.scene.read import Loaded
-from gsmerge.scene.views import limit_photo_size, stored_photos
+from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views
 
 _MAX_ANGLE = 0.2  # degrees that a view's two poses may differ by, once one frame is moved to the other

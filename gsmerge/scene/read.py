@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment import (
+    ESTIMATED,
     MAY_BE_UNALIGNED,
     Alignment,
     AlignmentResult,
@@ -46,15 +47,31 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.scene.photos import (
+    SEEN_PLACE,
+    UNNAMED,
+    Proposal,
+    ScenePhotos,
+    assign_to_views,
+    describe_assignment,
+    describe_unused,
+    fit_to_grid,
+    name_by_photos,
+    photos_inside,
+    propose_photos,
+    read_photos,
+    refuse_photos,
+    shows_better,
+    stored_photos,
+    without_photo,
+)
 from gsmerge.scene.views import (
     check_masks,
-    choose_photos,
     cut_bars,
     find_larger_and_masks,
     limit_photo_size,
     limit_view_size,
     read_scene_cameras,
-    stored_photos,
 )
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
@@ -70,7 +87,12 @@ class SceneViews:
     cameras: Cameras
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
     names: tuple[str, ...]
-    used: tuple[int, ...]  # which of them the scene has, each once, in its order
+    of_scene: tuple[int, ...]  # which of them each view of the scene is
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        """Which of them the scene has, each once, in its order."""
+        return tuple(dict.fromkeys(self.of_scene))
 
 
 @dataclass(frozen=True)
@@ -105,6 +127,11 @@ class Loaded:
         """Return a copy without the photos of the camera file, to free their memory; the scene keeps its photos."""
         cameras = None if self.cameras is None else replace(self.cameras, images=())
         return replace(self, cameras=cameras, views=replace(self.views, images=NO_IMAGES))
+
+    def with_left_out(self, notes: Sequence[str]) -> Loaded:
+        """Return a copy with notes on what was found beside the file and is not used."""
+        left_out = "; ".join(filter(None, (self.left_out, *notes))) or None
+        return replace(self, notes=(*self.notes, *notes), left_out=left_out) if notes else self
 
     @property
     def comments(self) -> tuple[str, ...]:
@@ -243,9 +270,7 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = AUTO
     :func:`read_scene`; without ``photos`` no photos are searched.
     """
     try:
-        load = _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
-        strange = f"the photos in {files.images} are not used: they do not show"
-        return replace(load, left_out=next((text for text in load.notes if text.startswith(strange)), None))
+        return _align(ply, files, read_scene_cameras(ply, files), hints=hints, photos=photos)
     except SceneError as error:
         why = SceneError(error.path, error.problem, error.remedy)  # without what it holds in memory
     of_photos = Path(why.path).suffix.lower() in IMAGE_SUFFIXES
@@ -286,11 +311,69 @@ def _align(
     """Combine Gaussians, cameras and photos as :func:`align_scene`, and raise a SceneError if anything is unusable."""
     if camera_file is None:
         return _without_cameras(ply, files, hints)
+    proposal = propose_photos(files, camera_file) if photos else None
+    if proposal is None:
+        inside = photos_inside(files, camera_file) if photos else ()
+        return _combine(ply, files, camera_file, ScenePhotos(inside), hints)
+    load = _assign(ply, files, camera_file, proposal, hints)
+    usual = proposal.folder
+    seen = usual.parent / SEEN_PLACE
+    if usual == seen or files.images is None or not seen.is_dir() or load.scene.images is None:
+        return load
+    other_files = replace(files, images=seen)
+    with suppress(SceneError):  # photos of other views
+        proposal = propose_photos(other_files, camera_file)
+        other = None if proposal is None else _assign(ply, other_files, camera_file, proposal, hints)
+        if other is not None and other.scene.images is not None and shows_better(other.scene, load.scene):
+            text = f"photos are those of {SEEN_PLACE}: they show what the Gaussians show, those of {usual.name} less"
+            return replace(other, notes=(*other.notes, text))
+    return load
+
+
+def _assign(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
+) -> Loaded:
+    """Combine Gaussians and cameras with the photos that names propose, or with those that show the views.
+
+    Photos that cannot be read, and views that none shows, are named in a note. SceneError if no photo shows any.
+    """
+    whole, why, fit = None, None, None
+    is_grid = camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED  # of any size
+    while whole is None and why is None and not is_grid and any(photo is not None for photo in proposal.named):
+        try:
+            whole = _combine(ply, files, camera_file, read_photos(proposal, proposal.choice, camera_file), hints)
+        except SceneError as error:
+            fewer = proposal.without(error)
+            proposal, why = (proposal, error) if fewer is None else (fewer, None)
+    try:
+        bare = whole or _combine(ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)
+    except SceneError as error:
+        raise why or error from None
+    if is_grid and proposal.pool:
+        fit = fit_to_grid(bare.scene, proposal)
+    chosen = assign_to_views(bare.scene, bare.views.of_scene, proposal, read=whole is not None, fit=fit)
+    if not any(chosen):
+        if why is not None:
+            raise why
+        if "images" in files.named:
+            raise SceneError(proposal.folder, *refuse_photos(proposal, camera_file))
+        alone = _combine(ply, files, camera_file, ScenePhotos(), hints) if whole is not None else bare
+        return alone.with_left_out([describe_unused(proposal, camera_file)])
+    described, left_out = describe_assignment(proposal, chosen, camera_file)
+    if whole is None or chosen != proposal.choice:
+        camera_file = name_by_photos(camera_file, proposal, chosen, fit)
+        whole = _combine(ply, files, camera_file, read_photos(proposal, chosen, camera_file), hints)
+    return replace(whole, notes=(*whole.notes, *described)).with_left_out(left_out)
+
+
+def _combine(
+    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, photos: ScenePhotos, hints: ReadHints
+) -> Loaded:
+    """Combine Gaussians, cameras and their photos; SceneError if anything is unusable."""
     exporter = find_exporter(hints.exporter)
     default_order = camera_file.order if exporter is None else exporter.order
     order = default_order if hints.order == "auto" else hints.order
-    files, chosen = choose_photos(ply, files, camera_file) if photos else (files, [])
-    pinholes, pictures, notes = as_pinholes(camera_file, stored_photos(files, camera_file) if photos else ())
+    pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
     notes += [camera_file.focal] if camera_file.focal else []
     whole, (pictures, cut) = pictures, cut_bars(pictures, camera_file)
@@ -303,7 +386,7 @@ def _align(
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, depths=depths, frames=frames)
-    notes += [*chosen, *cut, *smaller, *result.notes]
+    notes += [*cut, *smaller, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
         cameras, images, smaller = limit_view_size(result.cameras, result.images, hints.max_side)
@@ -313,9 +396,9 @@ def _align(
     if files.masks is not None and not (size and pictures is whole):
         notes.append(f"masks are not used: {'the photos have bars' if size else 'there are no photos'}")
     if pictures is not whole:  # files with bars are not read again
-        return _make_load(ply, files, hints, result, notes)
-    large, masks, more = find_larger_and_masks(files, camera_file, pictures, size, result.transform, result.cameras)
-    return _make_load(ply, files, hints, result, [*notes, *more], large, masks)
+        return _make_load(ply, files, hints, result, notes, absent=photos.absent)
+    large, masks, more = find_larger_and_masks(files, camera_file, photos, size, result.transform, result.cameras)
+    return _make_load(ply, files, hints, result, [*notes, *more], large, masks, photos.absent)
 
 
 def _without_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
@@ -347,8 +430,12 @@ def _make_load(
     notes: Sequence[str],
     large: LargePhotos | None = None,
     masks: np.ndarray | None = None,
+    absent: Sequence[int] = (),
 ) -> Loaded:
-    """Make the scene of rows, their pixels and the views, with notes on how it was read."""
+    """Make the scene of rows, their pixels and the views, with notes on how it was read.
+
+    Cameras of ``absent`` have no photo.
+    """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
     gaussians, pixel_ids, missing, more = _place_rows(ply, result)
@@ -380,11 +467,11 @@ def _make_load(
         if layout.per_pixel == 1:
             camera_file = select_views(camera_file, views)
     return Loaded(
-        scene=scene,
+        scene=without_photo(scene, [view for view, camera in enumerate(views) if camera in absent]),
         info=ply.info,
         files=files,
         cameras=camera_file,
-        views=SceneViews(result.cameras, result.images, names, tuple(dict.fromkeys(views))),
+        views=SceneViews(result.cameras, result.images, names, tuple(views)),
         exporters=exporters,
         notes=(*files.notes, *file_notes(ply.info), *notes, *more),
         alignment=alignment,

@@ -14,8 +14,9 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Frame, prepare
+from gsmerge.facts.prepare import prepare
 from gsmerge.facts.views import concat_cameras, in_float64, resize_cameras
+from gsmerge.frame import Frame
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians
 from gsmerge.networks.checkpoint import Checkpoint

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.facts.prepare import Frame
+from gsmerge.frame import Frame
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (
     FEATURES,

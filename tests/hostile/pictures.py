@@ -141,7 +141,7 @@ def at(position: int, form: str, *values: int) -> Change:
 def _cases() -> dict[str, Case]:
     sizes = [(60_000, 60_000), (2**31 - 1, 1), (2**32 - 1, 2**32 - 1), (0, 0), (25, 16)]
     bits = png(WIDTH, HEIGHT, zlib.compress(b"\0\xaa\xaa\xaa" * HEIGHT), depth=1, color=0)
-    cases = {f"PNG that claims {w} x {h}": Case(first(with_size(w, h))) for w, h in sizes}
+    cases = {f"PNG that claims {w} x {h}": Case(first(with_size(w, h)), EITHER) for w, h in sizes}
     cases |= {
         "all PNG claim 60000 x 60000": Case(every(with_size(60_000, 60_000))),
         "8 GB of zeros": Case(lambda folder: sparse(folder / "images" / "view_000.png", 2**33)),

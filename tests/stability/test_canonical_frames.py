@@ -10,7 +10,7 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Scene
-from gsmerge.facts.prepare import scene_frame
+from gsmerge.frame import scene_frame
 from gsmerge.pooling import scene_members
 
 UTM = np.array([4e5, 5e6, 120.0])

@@ -14,9 +14,9 @@ from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.facts.compare_photos import compare_photos, odd_photos, show_photos
-from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.row_colors import ROW_COLORS
 from gsmerge.fit import FitOptions, fit_photos
+from gsmerge.frame import canonicalise
 from gsmerge.types import PicturedScene
 
 Photos = np.ndarray

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.facts.prepare import canonicalise
 from gsmerge.facts.views import concat_cameras, even_views, resize_cameras, subset
+from gsmerge.frame import canonicalise
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pooling import Members, scene_members

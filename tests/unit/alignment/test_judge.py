@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exports import Smooth, export_rows, save_export, smooth_scene, write_transforms
-from messages import refuses
+from messages import names, refuses
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.alignment import Recovery, rows_first
@@ -86,10 +86,11 @@ def test_the_order_of_names_and_that_of_the_file(tmp_path: Path, twins: Smooth) 
 
 
 def test_colours_do_not_overrule_pixels(tmp_path: Path) -> None:
-    """Photos of something else: the reading stands, and it is said that the photos do not confirm it."""
-    _, recovery = read(tmp_path, smooth_scene(48, 36), make_tiny(48, 36).images)
-    assert recovery.confirmed is False
-    assert recovery.description.endswith("the photos' colours do not confirm it")
+    """Photos of something else: the reading stands, and they are not used."""
+    loaded, recovery = read(tmp_path, smooth_scene(48, 36), make_tiny(48, 36).images)
+    assert recovery.confirmed is None
+    assert loaded.scene.images is None
+    assert names(str(loaded.left_out), "photos", "left out")
 
 
 def test_photos_that_agree_or_cannot_tell(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from gsmerge.facts.exposure import (
     share_left,
     share_unexpected,
 )
-from gsmerge.facts.prepare import canonicalise
+from gsmerge.frame import canonicalise
 from gsmerge.kernels import elementary
 
 VIEWS = range(5)

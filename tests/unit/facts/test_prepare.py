@@ -8,8 +8,9 @@ import scenes
 from messages import refuses
 
 from gsmerge import Scene
-from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
+from gsmerge.facts.prepare import prepare
 from gsmerge.facts.row_colors import ROW_COLORS
+from gsmerge.frame import canonicalise, scene_frame
 from gsmerge.geometry import project
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.types import grid_ids

@@ -139,7 +139,7 @@ def test_photos_inside_another_file(folder: Path) -> None:
 def test_a_photo_that_is_gone_when_it_is_needed(folder: Path) -> None:
     scene = gsmerge.read_scene(folder)
     (folder / "images" / "view_001.png").unlink()
-    with refuses(SceneError, "view_001.png", "No such file"):
+    with refuses(SceneError, "view_001.png", "no such file"):
         large_photos(scene, 2)
 
 

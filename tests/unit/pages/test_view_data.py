@@ -17,8 +17,8 @@ import scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
-from gsmerge.facts.prepare import scene_frame
 from gsmerge.facts.row_colors import ROW_COLORS
+from gsmerge.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.measure.camera_path import outside_camera
 from gsmerge.measure.evaluate import EvaluateOptions, near_plane

@@ -11,7 +11,6 @@ import pytest
 from messages import names, noted, refuses
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_images, write_npz, write_transforms
 
-from gsmerge.compaction.inspect import inspect
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.scene import read
@@ -148,13 +147,13 @@ def test_cameras_of_a_resized_image_are_scaled(tiny_folder: Path, tiny: Tiny) ->
     assert loaded.notes == ("intrinsics scaled from 80 x 56 to the images' 20 x 14",)
 
 
-def test_images_of_other_views_are_noted(tiny_folder: Path, tiny: Tiny) -> None:
-    swapped = replace(tiny, images=tiny.images[::-1])
-    write_images(tiny_folder / "images", swapped)
-    assert load_scene(tiny_folder).notes == ()
-    photos, depth = inspect(tiny_folder)["notes"]
-    assert names(photos, "2 of 3", "photos")
-    assert names(depth, "confirms")
+def test_images_under_the_names_of_other_views(tiny_folder: Path, tiny: Tiny) -> None:
+    write_images(tiny_folder / "images", replace(tiny, images=tiny.images[::-1]))
+    loaded = load_scene(tiny_folder)
+    assert np.array_equal((loaded.scene.images * 255).round(), tiny.images)
+    assert loaded.left_out is None
+    (note,) = loaded.notes
+    assert names(note, "by what they show", "images/a b/2.png: a b/11.png")
 
 
 # What does not fit

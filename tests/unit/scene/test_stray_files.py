@@ -91,10 +91,10 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
     write_transforms(folder / "transforms.json", SMOOTH)
     write_images(folder / "images", another())
     actual = load_scene(folder)
-    assert names(str(actual.left_out), "the photos in", folder / "images", "3 images", 4)
+    assert names(str(actual.left_out), "the photos in", folder / "images", "left out", "3 views")
     assert np.allclose(actual.scene.cameras.viewmats, SMOOTH.w2c)
     assert actual.scene.images is None
-    with refuses(SceneError, "images", "3 images", "--images none"):
+    with refuses(SceneError, "images", "3 views", "--images none"):
         load_scene(folder, images=folder / "images")
 
 
@@ -108,8 +108,11 @@ def test_a_damaged_photo(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid", cameras=True)
     (folder / "images" / SMOOTH.names[0]).write_bytes(b"\x89PNG nothing")
     actual = load_scene(folder)
-    assert names(str(actual.left_out), "the photos in", SMOOTH.names[0], ".png file")
-    assert len(actual.scene) == 3
+    assert names(str(actual.left_out), "1 of 3 views", "2.png", ".png file")
+    assert actual.scene.images is not None
+    assert actual.scene.masks is not None
+    assert actual.scene.masks.any((1, 2)).tolist() == [False, True, True]
+    assert np.array_equal((actual.scene.images[1:] * 255).round(), SMOOTH.images[1:])
 
 
 def test_a_picture_beside_a_grid_that_cannot_be_read(tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from messages import noted, refuses
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.facts.place_cameras import add_views
-from gsmerge.facts.prepare import canonicalise, prepare, scene_frame
+from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import measure_size
+from gsmerge.frame import canonicalise, scene_frame
 from gsmerge.pooling import scene_members, unaligned_members
 from gsmerge.raster.images import seen_depths
 from gsmerge.runtime.record import record_run

@@ -1,0 +1,251 @@
+"""Which photo, turned how, shows which view: names propose, what photos and Gaussians show decides.
+
+A photo that its name gives to a view stays where it is more like it than other photos are, and more than other views
+are like it, beyond the noise of wrong pairs. Elsewhere the most alike photos are compared part by part: a neighbour's
+photo shows the same things, but in other places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from gsmerge.evidence.places import SIDE, find_places
+from gsmerge.evidence.scores import MARGIN, NORMAL, SIZES, Comparer, find_contrast, fisher_z, measure_noise
+from gsmerge.evidence.shown import Shown
+from gsmerge.kernels.pictures import turn_picture
+from gsmerge.runtime.threads import parallel_map
+
+DOUBT = 2.0  # standard deviations of noise up to which two scores are one, and a photo is not like its view
+ALIKE = 4  # photos most like a view that are compared with it part by part
+FLAT = 1 / 255  # root mean square of a picture's contrast below which it shows nothing to go by: a rounding of 8 bits
+FAR = 1e6  # cost of a pair that cannot be
+AT_ONCE = 256  # photos of a film that are compared first, at equal distances; then those around the most alike
+
+
+class Assignment(NamedTuple):
+    """The photo of a view, and how it is turned; see :func:`gsmerge.kernels.pictures.turn_picture`."""
+
+    photo: int
+    turn: int
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Photos that may show the views of a scene."""
+
+    read: Callable[[int], np.ndarray]  # [h,w,3] photo as it is stored, sRGB in [0, 1], of the size of Places or larger
+    count: int
+    tags: Sequence[int]  # turn that each photo's tag of orientation asks for
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Fisher's z of some photos in all views and turns, in units of the noise of wrong pairs."""
+
+    photos: tuple[int, ...]
+    values: np.ndarray  # [v,p,8]; NaN where a photo's shape cannot be that of the views
+    correlations: np.ndarray  # [v,p,8]
+
+    def best(self) -> np.ndarray:
+        """Return the score ``[v,p]`` of each photo in its best turn."""
+        return np.nan_to_num(self.values, nan=-np.inf).max(2)
+
+    def turn(self, view: int, photo: int, tag: int) -> int:
+        """Return how a photo is turned: as stored or as its tag says, unless another turn is clearly better."""
+        scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
+        return next((turn for turn in (0, tag) if scores[turn] > scores.max() - DOUBT), int(scores.argmax()))
+
+
+class Assigner:
+    """Assigns photos to the views of a scene, and keeps what was compared.
+
+    ``show`` makes pictures of the views of a size: small ones, and larger ones where these do not decide.
+    """
+
+    def __init__(self, show: Callable[[int], Shown], candidates: Candidates) -> None:
+        small = show(SIZES[-1])
+        self.candidates, self._show = candidates, show
+        self.judged = np.array([_shows_much(*pair) for pair in zip(small.pictures, small.weights, strict=True)])
+        self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
+
+    @cached_property
+    def shown(self) -> Shown:
+        """What the views show, large enough for parts to be looked up."""
+        return self._show(SIDE)
+
+    def score(self, photos: Iterable[int]) -> _Scores:
+        """Compare photos with all views."""
+        ids = tuple(dict.fromkeys(photos))
+        new = [photo for photo in ids if photo not in self._correlations]
+        read, compare = self.candidates.read, self._comparer.correlate
+        self._correlations |= dict(zip(new, parallel_map(lambda photo: compare(read(photo)), new), strict=True))
+        correlations = np.stack([self._correlations[photo] for photo in ids], 1)
+        z = fisher_z(correlations)
+        middle, noise = measure_noise(z)
+        return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
+
+    def compare(self, view: int, assignment: Assignment) -> float | None:
+        """Compare a photo with a view part by part.
+
+        Returns how alike they are, 0 where it was taken from elsewhere, and None where parts do not tell.
+        """
+        photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
+        places = find_places(self.shown, view, np.ascontiguousarray(photo))
+        if places is None or places.verdict is None:
+            return None
+        return max(places.alike, 1e-6) if places.verdict else 0.0
+
+    def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
+        """Return the photos that names or order give to views, and whether what they show confirms each.
+
+        None where a photo is not like its view, or another is clearly more so that is not needed elsewhere. Those that
+        no other assignment makes more alike are confirmed; where names are not ``exact``, no parts may lie elsewhere
+        either. In doubt the parts tell.
+        """
+        out, sure = list[Assignment | None]([None] * len(named)), [False] * len(named)
+        given = [(view, photo) for view, photo in enumerate(named) if photo is not None]
+        if not given:
+            return out, sure
+        scores = self.score(photo for _, photo in given)
+        turns = [self._usual_turn(scores, *pair) for pair in given]
+        columns = [scores.photos.index(photo) for _, photo in given]
+        of_turn = [
+            scores.values[[view for view, _ in given], column, turn]
+            for column, turn in zip(columns, turns, strict=True)
+        ]
+        alike = np.nan_to_num(np.stack(of_turn, 1), nan=-np.inf)  # of each given view with each given photo
+        best = _match(alike)
+        for place, ((view, photo), column, turn) in enumerate(zip(given, columns, turns, strict=True)):
+            own, most = alike[place, place], alike[place, best[place]]
+            alone = len(set(columns)) == 1
+            like = own > (DOUBT if alone else 1 / NORMAL) or scores.correlations[view, column, turn] ** 2 > 0.5
+            like = like and own > most - DOUBT  # more than wrong pairs, or most of what is seen; no other clearly more
+            assignment = Assignment(photo, turn)
+            clear = own > MARGIN and own >= most
+            if clear and exact:
+                out[view], sure[view] = assignment, True
+            elif np.isfinite(own) and (like or not self.judged[view]):
+                score = self.compare(view, assignment)
+                out[view] = assignment if exact or score != 0 else None
+                sure[view] = bool(score) or (clear and score is None) or not self.judged[view]
+        return out, sure
+
+    def stand_together(self, chosen: Sequence[Assignment | None]) -> bool:
+        """Return whether chosen photos together are like their views, beyond the noise of so many wrong pairs."""
+        given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.judged[view]]
+        scores = self.score(self._correlations)
+        own = [scores.values[view, scores.photos.index(photo), turn] for view, (photo, turn) in given]
+        return not own or sum(own) > DOUBT * np.sqrt(len(own))
+
+    def _usual_turn(self, scores: _Scores, view: int, photo: int) -> int:
+        """Return 0 for a photo that shows a view as it is stored, or the turn of its tag if that is clearly better."""
+        tag = self.candidates.tags[photo]
+        stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
+        return tag if tagged > stored + DOUBT else 0
+
+    def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
+        """Find the ``photos`` that show ``views``, part by part."""
+        pairs = [(view, each) for view, likely in self.list_likely(views, photos).items() for each in likely]
+        if not pairs:
+            return {}
+        scores = self.score(self._correlations)
+
+        def compare(pair: tuple[int, Assignment]) -> float:
+            alike, (view, (photo, turn)) = self.compare(*pair), pair
+            if alike is not None:
+                return alike
+            return max(0.0, float(scores.values[view, scores.photos.index(photo), turn]) - MARGIN)
+
+        return _choose(pairs, parallel_map(compare, pairs))
+
+    def list_likely(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, list[Assignment]]:
+        """List the ``photos`` most alike to each of ``views``; of many a sample is tried first, then those around."""
+        if not views or not photos:
+            return {}
+        step, tags = -(-len(photos) // AT_ONCE), self.candidates.tags
+        places = set(range(0, len(photos), step))
+        while True:
+            scores = self.score(photos[place] for place in sorted(places))
+            best = scores.best()
+            likely = {view: np.argsort(-best[view], kind="stable")[:ALIKE] for view in views}
+            near = {photos.index(scores.photos[column]) for ids in likely.values() for column in ids}
+            around = {place + away for place in near for away in range(1 - step, step)} & set(range(len(photos)))
+            if around <= places:
+                break
+            places, step = places | around, 1
+        return {
+            view: [
+                Assignment(scores.photos[column], scores.turn(view, scores.photos[column], tags[scores.photos[column]]))
+                for column in ids
+                if np.isfinite(best[view, column])
+            ]
+            for view, ids in likely.items()
+        }
+
+
+def assign_photos(
+    show: Callable[[int], Shown],
+    candidates: Candidates,
+    named: Sequence[int | None],
+    *,
+    exact: bool,
+    stored: Candidates | None = None,
+) -> list[Assignment | None]:
+    """Assign a photo to each view; None where none shows it.
+
+    ``show`` makes pictures of the views of a size. ``named``: the photo that names or order propose for each view. If
+    they are ``exact`` names, most of them right, a view whose photo is not there has none: others have names of their
+    own. ``stored``: the photos as their files have them, where ``candidates`` are those that were brought to the views.
+    """
+    assigner = Assigner(show, candidates)
+    out, sure = assigner.confirm(named, exact=exact)
+    they_tell = 2 * sum(each is not None for each in out) > len(out) and assigner.stand_together(out)
+    left = [view for view, known in enumerate(sure) if not known and not (exact and they_tell and named[view] is None)]
+    if not left:
+        return out
+    used = {each.photo for each, known in zip(out, sure, strict=True) if each is not None and known}
+    if stored is not None:
+        assigner = Assigner(show, stored)
+    others = assigner.search(left, [photo for photo in range(candidates.count) if photo not in used])
+    for view in left:
+        out[view] = others.get(view) or (out[view] if they_tell else None)
+    return out
+
+
+def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
+    """Give each photo to one view so that all are most alike."""
+    agree = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
+    if not agree:
+        return {}
+    views = sorted({view for view, _, _ in agree})
+    photos = sorted({assignment.photo for _, assignment, _ in agree})
+    gains, chosen = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
+    for view, assignment, score in agree:
+        gains[views.index(view), photos.index(assignment.photo)] = score
+        chosen[view, assignment.photo] = assignment
+    matched = ((view, photos[column]) for view, column in zip(views, _match(gains), strict=True) if column >= 0)
+    return {view: chosen[view, photo] for view, photo in matched if (view, photo) in chosen}
+
+
+def _match(scores: np.ndarray) -> np.ndarray:
+    """Return the column of each row of ``scores [r,c]``, each once, so that the sum is largest; -1 for none."""
+    best, out = scores.argmax(1), np.full(len(scores), -1)
+    if len(set(best.tolist())) == len(best):  # which needs no search
+        return np.asarray(best)
+    from scipy.optimize import linear_sum_assignment  # which takes long to load
+
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, FAR))
+    out[rows] = columns
+    return out
+
+
+def _shows_much(picture: np.ndarray, weight: np.ndarray) -> bool:
+    """Return whether a picture ``[h,w,3]`` has structure where ``weight [h,w]`` shows anything."""
+    contrast = find_contrast(picture, weight)
+    squares = (contrast * contrast).mean(-1) * weight
+    return bool(squares.sum() > FLAT**2 * max(float(weight.sum()), 1.0))

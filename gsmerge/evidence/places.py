@@ -1,0 +1,92 @@
+"""Where the parts of a photo lie in what a view shows: in their places, or moved, as a neighbour's photo has them.
+
+Pictures of neighbouring views are alike as a whole. Parts of one are looked up around their places in the other: where
+one place stands out of all those tried, it says whether the photo was taken from there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsmerge.evidence.scores import MARGIN, NORMAL, find_contrast, fisher_z
+from gsmerge.evidence.shown import Shown
+from gsmerge.raster.photos import shrink_pictures
+
+SIDE = 256  # pixels of the longer side of both pictures
+PART, REACH = 32, 12  # pixels of the side of a part, and how far around its place it is looked up
+AROUND = 30  # pixels of the square whose mean contrast is taken from
+TAPS = 64  # of the Fourier transforms, at least PART + 2 REACH
+SAME = 1  # pixels to which a place is one: those of a correlation's peak
+
+
+@dataclass(frozen=True)
+class Places:
+    """How many parts of a photo that say where they are lie in their places, and how many elsewhere."""
+
+    here: int
+    elsewhere: int
+    alike: float  # mean of Fisher's z of all parts in their places
+
+    @property
+    def lead(self) -> float:
+        """By how many standard errors of a fair coin more parts lie here than elsewhere."""
+        return (self.here - self.elsewhere) / max(1.0, np.sqrt(self.here + self.elsewhere))
+
+    @property
+    def verdict(self) -> bool | None:
+        """Whether the photo was taken from there: what more parts say than chance would have it; None in doubt."""
+        return self.lead > 0 if abs(self.lead) > 1 else None
+
+
+def correlate_parts(shown: Shown, view: int, photo: np.ndarray) -> np.ndarray:
+    """Return Fisher's z of the correlations ``[n]`` of a photo's parts with those in the same places of a view."""
+    weight = shown.weights[view]
+    height, width = weight.shape
+    near = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    own = find_contrast(shown.pictures[view], weight, AROUND)
+    starts = [np.arange(0, side, max(1, PART * max(height, width) // SIDE)) for side in (height, width)]
+
+    def add(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(np.add.reduceat(values.sum(-1) * weight, starts[0], 0), starts[1], 1).reshape(-1)
+
+    return fisher_z(add(near * own) / np.sqrt(np.maximum(add(near * near) * add(own * own), 1e-12)))
+
+
+def find_places(shown: Shown, view: int, photo: np.ndarray) -> Places | None:
+    """Look up the parts of an upright ``photo [h,w,3]`` in a view of ``shown``, which has up to :data:`SIDE` pixels.
+
+    None if these are so few that there are no parts.
+    """
+    weight = shown.weights[view]
+    height, width = weight.shape
+    if min(height, width) < 2 * PART:
+        return None
+    near = find_contrast(shrink_pictures(photo[None], width, height)[0], None, AROUND)
+    own = find_contrast(shown.pictures[view], weight, AROUND)
+    scores = _look_up(np.pad(near, ((REACH, REACH), (REACH, REACH), (0, 0))), own, weight)
+    middle = np.median(scores, 1)
+    noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
+    peaks = np.abs(np.stack(np.divmod(scores.argmax(1), 2 * REACH + 1)) - REACH).max(0)
+    decided = scores.max(1) - middle > MARGIN * noise
+    here = int((decided & (peaks <= SAME)).sum())
+    return Places(here, int(decided.sum()) - here, float(scores[:, scores.shape[1] // 2].mean()))
+
+
+def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return Fisher's z ``[n,(2 REACH + 1)^2]`` of a picture's parts and those around them in a padded photo."""
+    rows, columns = (np.arange(0, side - PART + 1, PART) + (side % PART) // 2 for side in weight.shape)
+    corners = [(top, left) for top in rows for left in columns]
+
+    def cut(array: np.ndarray, side: int) -> np.ndarray:
+        parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
+        return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
+
+    shifts = slice(0, 2 * REACH + 1)
+    heavy, squares = picture * weight[..., None], (photo * photo).sum(-1)
+    products = np.fft.irfft2((cut(photo, PART + 2 * REACH) * cut(heavy, PART).conj()).sum(1))[:, shifts, shifts]
+    energies = np.fft.irfft2(cut(squares, PART + 2 * REACH) * cut(weight, PART).conj())[:, shifts, shifts]
+    own = np.stack([(heavy * picture).sum(-1)[t : t + PART, left : left + PART].sum() for t, left in corners])
+    sizes = np.sqrt(np.maximum(energies, 1e-9) * np.maximum(own, 1e-9)[:, None, None])
+    return fisher_z(products / sizes).reshape(len(corners), -1)

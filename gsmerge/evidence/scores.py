@@ -1,0 +1,130 @@
+"""How alike photos and pictures are, in units of the noise that wrong pairs have.
+
+Two pictures are compared by the local contrast of their colours at two sizes: exposure, white balance and soft colours
+change its correlation little. Fisher's z of the correlation has the same spread for all values, and nearly all pairs
+are wrong: the median absolute deviation of their z is the noise, in which every pair is judged.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsmerge.evidence.shown import LEAST, Shown
+from gsmerge.kernels.elementary import log
+from gsmerge.kernels.matrices import matmul
+from gsmerge.kernels.pictures import TURNS, blur, turn_back
+from gsmerge.raster.photos import shrink_pictures
+
+SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
+AROUND = 6  # part of a side that is the standard deviation of the mean that contrast is taken from
+MARGIN = 5.0  # standard deviations of noise that evidence stands above it
+NORMAL = 1.4826  # standard deviations of a normal distribution that its median absolute deviation is
+CLOSEST = 0.999  # correlation beyond which pictures are equally alike
+
+
+def fisher_z(correlations: np.ndarray) -> np.ndarray:
+    """Return the inverse hyperbolic tangent of correlations."""
+    near = correlations.clip(-CLOSEST, CLOSEST)
+    return np.asarray(0.5 * log((1 + near) / (1 - near)))
+
+
+def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: int | None = None) -> np.ndarray:
+    """Return the colours of a picture ``[h,w,3]`` less their mean around, in a square of ``side`` or of the picture's.
+
+    ``weight [h,w]``: how much pixels count; None: all alike.
+    """
+    weight = np.ones(picture.shape[:2], np.float32) if weight is None else weight
+    sums = blur(np.dstack([picture * weight[..., None], weight]), (side or max(picture.shape[:2])) / AROUND)
+    return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Filters:
+    """What the views show at one size, turned as a stored photo may be, to be multiplied with its contrast."""
+
+    size: tuple[int, int]  # width and height of the photos that they are for
+    turns: tuple[int, ...]  # of such photos
+    products: np.ndarray  # [v·t,h·w·3] weight times contrast, of length 1
+    weights: np.ndarray  # [v·t,h·w]
+
+
+class Comparer:
+    """Correlations of any number of photos, in all turns, with what the views of a scene show."""
+
+    def __init__(self, shown: Shown) -> None:
+        self.views = len(shown)
+        self._small = small = [shown.shrink(side) for side in SIZES]
+        width, height = small[0].weights.shape[2:0:-1]
+        self._portrait, self._square = height > width, height == width
+        self._empty = small[0].weights.max((1, 2)) < LEAST  # with which nothing can be compared
+
+    @cached_property
+    def _upright(self) -> list[_Filters]:
+        return [_make_filters(each, (0, 2)) for each in self._small]
+
+    @cached_property
+    def _lying(self) -> list[_Filters]:
+        return [_make_filters(each, (1, 3)) for each in self._small]
+
+    def correlate(self, photo: np.ndarray) -> np.ndarray:
+        """Return the mean correlation ``[v,8]`` over the sizes of a stored photo in each turn; NaN for impossible ones.
+
+        A photo ``[h,w,3]`` is squeezed to the views' shape; it cannot stand where they lie.
+        """
+        out = np.full((self.views, TURNS), np.nan)
+        portrait, square = photo.shape[0] > photo.shape[1], photo.shape[0] == photo.shape[1]
+        upright = self._square or square or portrait == self._portrait
+        lying = self._square or square or portrait != self._portrait
+        for filters in ([self._upright] if upright else []) + ([self._lying] if lying else []):
+            scores = np.mean([_correlate(photo, each) for each in filters], 0)
+            out[:, list(filters[0].turns)] = scores.reshape(self.views, -1)
+        out[self._empty] = np.nan
+        return out
+
+
+def _make_filters(small: Shown, quarters: Sequence[int]) -> _Filters:
+    """Turn pictures back as photos may be stored that show them, by some ``quarters`` and mirrored."""
+    turns = tuple(turn + mirrored for mirrored in (0, TURNS // 2) for turn in quarters)
+    products, weights = [], []
+    for picture, weight in zip(small.pictures, small.weights, strict=True):
+        heavy = find_contrast(picture, weight) * weight[..., None]
+        size = float(np.sqrt((heavy * heavy / np.maximum(weight, LEAST)[..., None]).sum(dtype=np.float64)))
+        heavy = heavy / max(size, 1e-9)
+        products += [turn_back(heavy, turn).reshape(-1) for turn in turns]
+        weights += [turn_back(weight, turn).reshape(-1) for turn in turns]
+    height, width = turn_back(small.weights[0], turns[0]).shape
+    return _Filters((width, height), turns, np.stack(products), np.stack(weights))
+
+
+def _correlate(photo: np.ndarray, filters: _Filters) -> np.ndarray:
+    """Correlate a photo's contrast with pictures that are turned as it is, ``[v·t]``."""
+    contrast = find_contrast(shrink_pictures(photo[None], *filters.size)[0])
+    products = matmul(filters.products, contrast.reshape(-1, 1))[:, 0]
+    squares = matmul(filters.weights, (contrast * contrast).sum(-1).reshape(-1, 1))[:, 0]
+    return np.asarray(products / np.sqrt(np.maximum(squares, 1e-12)))
+
+
+def measure_noise(z_scores: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the middle ``[v]`` of each view's scores ``[v,...]``, and the spread of all about it, without NaN."""
+    flat = z_scores.reshape(len(z_scores), -1)
+    with warnings.catch_warnings():  # of views that show nothing
+        warnings.simplefilter("ignore", RuntimeWarning)
+        middle = np.nan_to_num(np.nanmedian(flat, 1))
+        spread = np.nan_to_num(np.nanmedian(np.abs(flat - middle[:, None])))
+    return middle, max(NORMAL * float(spread), 1e-6)
+
+
+def stands_out(gains: np.ndarray) -> bool:
+    """Return whether the mean of gains ``[n]`` is above zero by more than :data:`MARGIN` of its standard errors.
+
+    Gains are those of parts that did not choose what gains: views, or parts of them.
+    """
+    gains = gains[np.isfinite(gains)]
+    if len(gains) < 2:
+        return False
+    return bool(gains.mean() > MARGIN * gains.std(ddof=1) / np.sqrt(len(gains)))

@@ -1,0 +1,133 @@
+"""What Gaussians show from cameras, as small pictures that photos can be compared with.
+
+Transparency is divided out, and what is shown weighs as much as it is opaque: faint or sparse Gaussians have the
+colours of solid ones. A photo is averaged with the same weights. So nothing is compared that one of two lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsmerge.frame import canonicalise
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.raster.images import thin_out
+from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
+from gsmerge.types import Cameras, Gaussians, Scene
+
+SAMPLES = 1 << 17  # Gaussians that are drawn
+ROWS_SIDE, DRAWN_SIDE = 192, 96  # pixels of the longer side of pictures of rows, and of drawings
+LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Small pictures of what the Gaussians show in v views."""
+
+    pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], transparency divided out; 0 where nothing is shown
+    weights: np.ndarray  # [v,h,w] opacity, in [0, 1]; 0 outside masks
+    drawn: bool  # whether they are drawings, which wrong depth displaces; else colours of each view's own rows
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def __getitem__(self, views: Sequence[int]) -> Shown:
+        """Return the pictures of some views."""
+        ids = list(views)
+        return replace(self, pictures=self.pictures[ids], weights=self.weights[ids])
+
+    def shrink(self, side: int) -> Shown:
+        """Average the pictures by their weights to at most ``side`` pixels of the longer side."""
+        width, height = fit_size(self.weights.shape[2:0:-1], side)
+        weights = shrink_pictures(self.weights, width, height)
+        return replace(self, pictures=average(self.pictures, self.weights, weights), weights=weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Photos of v views, and what the Gaussians show there."""
+
+    photos: np.ndarray  # [v,h,w,3] of the pictures' size
+    shown: Shown
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+    def shrink(self, side: int) -> Pairs:
+        """Average both by the weights of what is shown to at most ``side`` pixels of the longer side."""
+        small = self.shown.shrink(side)
+        return Pairs(average(self.photos, self.shown.weights, small.weights), small)
+
+    def with_photos(self, photos: np.ndarray) -> Pairs:
+        """Return a copy with other photos."""
+        return replace(self, photos=photos)
+
+    def __getitem__(self, views: Sequence[int]) -> Pairs:
+        """Return the pairs of some views."""
+        ids = list(views)
+        return Pairs(self.photos[ids], self.shown[ids])
+
+
+def fit_size(size: Sequence[int], side: int) -> tuple[int, int]:
+    """Return width and height in the proportion of ``size``, with at most ``side`` pixels of the longer one."""
+    level = max(1.0, max(size) / side)
+    width, height = (max(1, round(whole / level)) for whole in size)
+    return width, height
+
+
+def average(pictures: np.ndarray, weights: np.ndarray, small: np.ndarray) -> np.ndarray:
+    """Average pictures ``[v,h,w,3]`` by ``weights [v,h,w]`` to the size of these when ``small [v,H,W]``."""
+    sums = shrink_pictures((pictures * weights[..., None]).astype(np.float32), small.shape[2], small.shape[1])
+    return np.asarray(np.divide(sums, small[..., None], out=np.zeros_like(sums), where=small[..., None] > LEAST))
+
+
+def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
+    """Pair ``photos [v,h,w,3]`` with what a scene's Gaussians show in its views."""
+    shown = show_views(scene)
+    if scene.aligned:
+        return Pairs(photos[_every(scene.cameras, ROWS_SIDE)], shown)
+    level = max(1.0, max(scene.cameras.width, scene.cameras.height) / DRAWN_SIDE)
+    return Pairs(photos_of(photos, scene.cameras, level).images, shown)
+
+
+def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLES) -> Shown:
+    """Make small pictures of what a scene's Gaussians show in its views, in any frame.
+
+    Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.
+    """
+    if scene.aligned:
+        return _show_rows(scene, ROWS_SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
+    few = Scene(thin_out(scene.finite_gaussians, samples), scene.cameras, None, None, scene.names)
+    canonical, _ = canonicalise(few)
+    shown = draw_views(canonical.gaussians, canonical.cameras, side or DRAWN_SIDE)
+    inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
+    return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
+
+
+def _show_rows(scene: Scene, side: int) -> Shown:
+    """Return the colours of rows, every so many columns and lines."""
+    some = _every(scene.cameras, side)
+    grid = len(scene), scene.cameras.height, scene.cameras.width
+    weights = np.where(scene.valid, scene.gaussians.opacities.reshape(grid), 0)[some]
+    if scene.masks is not None:
+        weights = weights * scene.masks[some]
+    colors = sh0_to_rgb(scene.gaussians.sh0.reshape(*grid, 3)[some]).clip(0, 1)
+    return Shown(colors, weights.astype(np.float32), drawn=False)
+
+
+def _every(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
+    """Return slices of the pixels of pictures of rows, which begin in the middle of the first step."""
+    step = -(-max(cameras.width, cameras.height) // side)
+    pixels = slice(min(step // 2, cameras.width - 1, cameras.height - 1), None, step)
+    return slice(None), pixels, pixels
+
+
+def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> Shown:
+    """Draw canonical Gaussians, and divide their transparency out."""
+    blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
+    drawn = photo_errors(gaussians, blank, lambda _, image, left: (image, 1 - left))
+    images, opacities = map(np.stack, zip(*drawn, strict=True))
+    pictures = np.divide(images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST)
+    return Shown(pictures.clip(0, 1), opacities, drawn=True)
