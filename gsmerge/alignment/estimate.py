@@ -14,23 +14,27 @@ from gsmerge.alignment.layouts import ESTIMATED, exact_layouts, subsample
 from gsmerge.alignment.row_grid import find_grid
 from gsmerge.alignment.score import MARGIN, find_correspondences
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
+from gsmerge.io.photo_files import Size
 from gsmerge.types import Cameras, Gaussians
 
 _GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
 
 
 def estimate_cameras(
-    path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], width: int, height: int
+    path: Path, gaussians: Gaussians, valid: np.ndarray, names: Sequence[str], *sizes: Size
 ) -> CameraFile | None:
     """Estimate cameras that show each row of a full or trimmed grid in its own pixel.
 
-    ``names`` are the names of the views, all of ``width`` x ``height`` pixels; ``valid [n]`` bool; ``path`` is for
-    messages. None if no order of the rows fits at least twice as well as all other orders.
+    ``names`` are the names of the views, which have one of the ``sizes`` (width, height) in pixels; ``valid [n]`` bool;
+    ``path`` is for messages. None if no order of the rows fits at least twice as well as all other orders.
     """
-    layouts = exact_layouts(len(gaussians), len(names), width, height)
+    layouts = [each for size in dict.fromkeys(sizes) for each in exact_layouts(len(gaussians), len(names), *size)]
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
-    samples = (find_correspondences(gaussians.means, valid, subsample(layout, _GRID_SAMPLES)) for layout in possible)
-    fits = [fit for pairs in samples if (fit := calibrate(pairs, width, height)) is not None]
+    fits = []
+    for layout in possible:
+        pairs = find_correspondences(gaussians.means, valid, subsample(layout, _GRID_SAMPLES))
+        fit = calibrate(pairs, layout.width, layout.height)
+        fits += [] if fit is None else [fit]
     fits.sort(key=lambda fit: fit.worst_px)
     if not fits or (len(fits) > 1 and fits[1].worst_px < MARGIN * fits[0].worst_px):
         return None

@@ -120,7 +120,7 @@ def _intrinsics_of_rays(
             fx, fy, cx, cy = values
             x, y = (cx + grid.left) / grid.scale_x, (cy + grid.top) / grid.scale_y
             return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)
-    free = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, *size)
+    free = estimate_cameras(Path(camera_file.path), ply.gaussians, ply.valid, names, size)
     return None if free is None else free.Ks[0]
 
 

@@ -19,6 +19,7 @@ PART, REACH = 32, 12  # pixels of the side of a part, and how far around its pla
 AROUND = 30  # pixels of the square whose mean contrast is taken from
 TAPS = 64  # of the Fourier transforms, at least PART + 2 REACH
 SAME = 1  # pixels to which a place is one: those of a correlation's peak
+NEAR = 3  # pixels to which parts moved alike: what different depths leave of a motion
 
 
 @dataclass(frozen=True)
@@ -27,17 +28,19 @@ class Places:
 
     here: int
     elsewhere: int
+    together: int  # the most of those elsewhere that moved alike
     alike: float  # mean of Fisher's z of all parts in their places
 
     @property
-    def lead(self) -> float:
-        """By how many standard errors of a fair coin more parts lie here than elsewhere."""
-        return (self.here - self.elsewhere) / max(1.0, np.sqrt(self.here + self.elsewhere))
-
-    @property
     def verdict(self) -> bool | None:
-        """Whether the photo was taken from there: what more parts say than chance would have it; None in doubt."""
-        return self.lead > 0 if abs(self.lead) > 1 else None
+        """Whether the photo was taken from there; None in doubt.
+
+        It was if more parts lie here than moved alike, and it was not if more lie elsewhere, by more than the standard
+        error of a fair coin.
+        """
+        if self.here - self.together > np.sqrt(self.here + self.together):
+            return True
+        return False if self.elsewhere - self.here > np.sqrt(self.elsewhere + self.here) else None
 
 
 def correlate_parts(shown: Shown, view: int, photo: np.ndarray) -> np.ndarray:
@@ -68,10 +71,12 @@ def find_places(shown: Shown, view: int, photo: np.ndarray) -> Places | None:
     scores = _look_up(np.pad(near, ((REACH, REACH), (REACH, REACH), (0, 0))), own, weight)
     middle = np.median(scores, 1)
     noise = NORMAL * np.median(np.abs(scores - middle[:, None]), 1) + 1e-6
-    peaks = np.abs(np.stack(np.divmod(scores.argmax(1), 2 * REACH + 1)) - REACH).max(0)
     decided = scores.max(1) - middle > MARGIN * noise
-    here = int((decided & (peaks <= SAME)).sum())
-    return Places(here, int(decided.sum()) - here, float(scores[:, scores.shape[1] // 2].mean()))
+    moves = np.stack(np.divmod(scores[decided].argmax(1), 2 * REACH + 1), 1) - REACH
+    moves = moves[np.abs(moves).max(1) > SAME]
+    together = (np.abs(moves[:, None] - moves).max(2) <= NEAR).sum(1).max(initial=0)
+    alike = float(scores[:, scores.shape[1] // 2].mean())
+    return Places(int(decided.sum()) - len(moves), len(moves), int(together), alike)
 
 
 def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:

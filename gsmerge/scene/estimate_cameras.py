@@ -40,7 +40,8 @@ def estimate_cameras(ply: GaussianFile, path: Path, folder: Path | None) -> Came
     if folder is not None and paths:
         names = [photo.relative_to(folder).as_posix() for photo in paths]
         with suppress(SceneError):  # what is no image has no size
-            cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, *image_size(paths[0]))
+            size = image_size(paths[0])  # as it is stored, or turned
+            cameras = alignment.estimate_cameras(path, ply.gaussians, ply.valid, names, size, size[::-1])
     return cameras or alignment.estimate_from_rows(path, ply.gaussians, ply.valid)
 
 
@@ -58,8 +59,10 @@ class GridFit:
         return (resize_and_crop if self.crops else resize_to)(size, (width, height))
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
-        """Bring a photo ``[h,w,3]`` of any size to the pixels of the grid."""
+        """Bring a photo ``[h,w,3]`` of any size to the pixels of the grid; one that lies where this stands stays so."""
         (width, height), (x, y) = self.size, self.trim
+        if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
+            return np.rot90(self.cut(np.ascontiguousarray(np.rot90(photo))), -1)
         whole = self.transform((photo.shape[1], photo.shape[0])).photos([photo])[0]
         return np.asarray(whole[y : y + height, x : x + width])
 

@@ -208,8 +208,8 @@ def read_photos(
     for path, turn in zip(paths, turns, strict=True):
         if path is not None and camera_file.source != SHARP and not same_shape(_turned_size(path, turn), size):
             width, height = _turned_size(path, turn)
-            problem = f"expected images of one shape, found {width} x {height} here and {size[0]} x {size[1]} elsewhere"
-            raise SceneError(path, problem)
+            problem = f"expected images of one shape, found {width} x {height} and {size[0]} x {size[1]}"
+            raise SceneError(proposal.folder, problem)
     return ScenePhotos(decode_views(paths, turns, size), paths, turns, tuple(notes))
 
 
@@ -235,7 +235,10 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
     """Make candidates of the files, read small, and brought to the pixels of a grid by ``fit``."""
 
     def read(photo: int) -> np.ndarray:
-        small = decode_small(proposal.pool[photo], SIDE)
+        try:
+            small = decode_small(proposal.pool[photo], SIDE)
+        except SceneError:  # which shows nothing
+            small = np.zeros((SIDE, SIDE, 3), np.float32)
         return small if fit is None else fit.cut(small)
 
     return Candidates(read, len(proposal.pool), _Tags(proposal.pool))
