@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
@@ -18,6 +19,7 @@ from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_p
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
 
+T = TypeVar("T")
 MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
 _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
@@ -41,7 +43,14 @@ def main_file(scene: Path) -> Path:
 
 
 def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
+    """Yield the scenes of :func:`find_places`."""
+    return (scene for scene, _ in find_places(arguments, out))
+
+
+def find_places(arguments: Sequence[str], out: Path) -> Iterator[tuple[Path, Path | None]]:
     """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
+
+    With each is the folder that was named, in which it lies; None where the scene itself was named.
 
     A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
     no scene or too many folders without one, UsageError if it is the output folder.
@@ -52,9 +61,9 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
-            yield from _require_some(search.walk(path), argument, "in the folder")
+            yield from ((scene, path) for scene in _require_some(search.walk(path), argument, "in the folder"))
         elif path.suffix in (*SCENE_SUFFIXES, SUFFIX) and path.is_file():
-            yield path
+            yield path, None
         elif glob.has_magic(argument) and not path.exists():
             yield from _require_some(_matches(argument, search), argument, "that match")
         elif path.is_file():
@@ -63,7 +72,7 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
 
 
-def _require_some(scenes: Iterator[Path], argument: str, where: str) -> Iterator[Path]:
+def _require_some(scenes: Iterator[T], argument: str, where: str) -> Iterator[T]:
     """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
     if first is None:
@@ -150,13 +159,13 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
         return True
 
 
-def _matches(pattern: str, search: _Search) -> Iterator[Path]:
+def _matches(pattern: str, search: _Search) -> Iterator[tuple[Path, Path | None]]:
     for name in dict.fromkeys(sorted(_expand(pattern, search))):
         path = Path(name)
         if os.path.isdir(path):
-            yield from search.walk(path)
+            yield from ((scene, path) for scene in search.walk(path))
         elif may_hold_gaussians(path):
-            yield path
+            yield path, None
 
 
 def _expand(pattern: str, search: _Search) -> Iterator[str]:
@@ -176,7 +185,7 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
             yield from names
 
 
-def _listed(file: Path, search: _Search) -> Iterator[Path]:
+def _listed(file: Path, search: _Search) -> Iterator[tuple[Path, Path | None]]:
     """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):
@@ -193,8 +202,8 @@ def _listed(file: Path, search: _Search) -> Iterator[Path]:
             continue
         path = file.parent / os.path.expanduser(entry)
         if not os.path.isdir(path):
-            yield path
+            yield path, None
         elif os.path.realpath(path) not in search.seen:
             scenes = search.walk(path)
-            yield next(scenes, path)
-            yield from scenes
+            yield next(scenes, path), path
+            yield from ((scene, path) for scene in scenes)

@@ -11,7 +11,7 @@ from string import Formatter
 from typing import Any, Protocol
 
 from gsmerge import __version__
-from gsmerge.batch.find import find_scenes, main_file, scene_plys
+from gsmerge.batch.find import find_places, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.compaction.placement import level_output
 from gsmerge.errors import UsageError
@@ -127,6 +127,7 @@ class Job:
     num_rest: int = 0  # columns of higher harmonics, likewise
     cameras: StrPath | None = None  # None: beside the scene
     images: StrPath | None = None  # likewise
+    within: Path | None = None  # folder that was named, up to which cameras and photos are searched
 
     @property
     def output(self) -> str:
@@ -140,7 +141,7 @@ class Job:
 
     def find_files(self) -> SceneFiles:
         """Find the files of the scene; SceneError if there are none."""
-        return find_scene_files(Path(self.scene), cameras=self.cameras, images=self.images)
+        return find_scene_files(Path(self.scene), cameras=self.cameras, images=self.images, within=self.within)
 
 
 def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, results: Collection[str] = ()) -> list[Job]:
@@ -156,7 +157,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    for scene in find_scenes(arguments, out):
+    for scene, within in find_places(arguments, out):
         real = os.path.realpath(main_file(scene))
         if real in inputs or real in results:
             continue
@@ -172,7 +173,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
             owners[name] = str(scene)
         named = options.cameras, options.images
         cameras, images = (path if path == NONE else filled(path, scene) for path in named)
-        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images))
+        jobs.append(Job(str(scene), outputs, call, *estimate_counts(scene_plys(scene)), cameras, images, within))
     for name in owners:
         if os.path.realpath(out / name) in inputs:
             raise UsageError(f"{out / name}: is one of the scenes, and would be replaced; name another --output")

@@ -177,6 +177,7 @@ class Totals:
     unused: list[tuple[str, str]] = field(default_factory=list)  # scene, and its columns that are not used
     worse: list[tuple[str, str]] = field(default_factory=list)  # scene and reason, also of skipped results
     left_out: list[tuple[str, str]] = field(default_factory=list)  # scene, and the note on what beside it is left out
+    lacking: list[tuple[str, str]] = field(default_factory=list)  # scene, and which cameras or photos it has none of
     failed: list[tuple[str, str]] = field(default_factory=list)  # scene and reason
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -191,6 +192,8 @@ class Totals:
         left_out = report["input"].get("left_out") if report else record.get("left_out")
         if left_out:
             self.left_out.append((record["scene"], left_out))
+        elif report and not report["input"].get("num_photos", 1):
+            self.lacking.append((record["scene"], _describe_lack(report["input"]["num_views"])))
         if record["error"] is not None:
             self.failed.append((record["scene"], record["error"]))
         if report:
@@ -212,7 +215,13 @@ class Totals:
         lines = text_table([header, *sorted(self.rows)], columns=columns, least=(2, 7, 5, 6, 3)) if self.rows else []
         if self.counts[DONE] > len(self.rows):
             lines.append(f"... and {self.counts[DONE] - len(self.rows):,} more")
-        kinds = ((UNUSED[:-2], self.unused), ("worse", self.worse), ("note", self.left_out), (FAILED, self.failed))
+        kinds = (
+            (UNUSED[:-2], self.unused),
+            ("worse", self.worse),
+            ("note", self.left_out),
+            ("note", self.lacking),
+            (FAILED, self.failed),
+        )
         for status, reasons in kinds:
             lines += [f"{status}: {scene}: {why}" for scene, why in reasons[:MAX_LISTED]]
             lines += [f"... and {len(reasons) - MAX_LISTED:,} more {status}"] if len(reasons) > MAX_LISTED else []
@@ -225,6 +234,16 @@ class Totals:
         line += f"; {self.unmet:,} missed the target" if self.unmet else ""
         line += f"; {len(self.worse):,} worse than the input" if self.worse else ""
         return [*lines, line]
+
+
+def _describe_lack(num_views: int) -> str:
+    """Describe what a scene without photos that show it lacks."""
+    named = "in the named folder; --images names photos"
+    return (
+        f"no photos found beside it or {named}"
+        if num_views
+        else f"no cameras found beside it or {named}, --cameras cameras"
+    )
 
 
 def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:

@@ -11,8 +11,8 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes
-from gsmerge.compaction.report import CompactReport, Covered
-from gsmerge.compaction.result import CompactResult, measure_covered, measure_input, measure_result
+from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
+from gsmerge.compaction.result import CompactResult, measure_besides, measure_input, measure_on_files, measure_result
 from gsmerge.facts.partition import (
     WHOLE_GAUSSIANS,
     Block,
@@ -48,6 +48,8 @@ from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
+# of a result on a block: PSNR (dB), over the pixels that the input covers, and on files of photos that were changed
+Scores = tuple[float | None, Covered | None, PhotoFiles | None]
 FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
 SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to
 SEAM_STEPS = 100  # at least
@@ -117,7 +119,7 @@ def compact_in_blocks(
             "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
             "psnr_input_views": psnr, "fit": chosen.get("fit"),
         }
-        for part, (_, chosen), (psnr, _) in zip(parts, fitted, scores, strict=True)
+        for part, (_, chosen), (psnr, *_) in zip(parts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
     return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
@@ -142,6 +144,7 @@ class Part:
     prepared: Prepared  # its views, without the Gaussians of their pixels
     plan: Plan
     before: PhotoScore | None  # of the input on the scored views
+    on_files: float | None  # the same on the files of photos that were changed, dB
 
 
 def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame) -> Part:
@@ -150,25 +153,31 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    before = measure_input(prepared, plan)
-    share = keep.sum() / max(1, len(keep))
-    return Part(block, decoded.gaussians[keep], round(share * decoded.count), without_gaussians(prepared), plan, before)
+    scores = measure_input(prepared, plan), measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
+    count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
+    return Part(block, decoded.gaussians[keep], count, prepared, plan, *scores)
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
     """Return a prepared scene without Gaussians and with photos in a file, to free their memory."""
     moved: dict[int, np.ndarray] = {}  # photos that both scenes share are moved once
 
-    def bare(scene: SceneT) -> SceneT:
-        images = np.asarray(scene.images)  # rows with pixels always have pictures
+    def move(images: np.ndarray) -> np.ndarray:
         if id(images) not in moved:
             moved[id(images)] = make_array(images.shape, images.dtype.type, IN_FILE)
             moved[id(images)][:] = images
             free_pages([moved[id(images)]])
-        none = scene.gaussians[np.zeros(0, int)]
-        return replace(scene, gaussians=none, images=moved[id(images)], pixel_ids=None, missing=None)
+        return moved[id(images)]
 
-    return replace(prepared, scene=bare(prepared.scene), input_scene=bare(prepared.input_scene))
+    def bare(scene: SceneT) -> SceneT:
+        images = move(np.asarray(scene.images))  # rows with pixels always have pictures
+        return replace(scene, gaussians=scene.gaussians[np.zeros(0, int)], images=images, pixel_ids=None, missing=None)
+
+    reference = prepared.reference
+    if reference.photo_files is not None:
+        reference = replace(reference, photo_files=move(reference.photo_files))
+    scene, input_scene = bare(prepared.scene), bare(prepared.input_scene)
+    return replace(prepared, reference=reference, scene=scene, input_scene=input_scene)
 
 
 def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
@@ -198,11 +207,14 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
     return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
-def score_part(part: Part, gaussians: Gaussians, _: int) -> tuple[float | None, Covered | None]:
-    """Measure the PSNR (dB) of the whole result on a block's scored photos, and on the pixels covered by the input."""
+def score_part(part: Part, gaussians: Gaussians, _: int) -> Scores:
+    """Measure the PSNR (dB) of the whole result on a block's scored photos.
+
+    Also on the pixels that the input covers, and on photos as their files have them.
+    """
     measured = measure_result(gaussians, part.prepared, part.plan)
     psnr = None if measured is None else measured.psnr
-    return psnr, measure_covered(part.before, gaussians, part.prepared, part.plan)
+    return psnr, *measure_besides(part.before, part.on_files, gaussians, part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
@@ -328,11 +340,7 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def join_reports(
-    scene: Scene,
-    gaussians: Gaussians,
-    parts: Sequence[Part],
-    scores: Sequence[tuple[float | None, Covered | None]],
-    options: CompactOptions,
+    scene: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[Scores], options: CompactOptions
 ) -> CompactReport:
     """Report the whole scene: mean PSNR of the blocks weighted by views, sums of seconds, all notes."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
@@ -341,10 +349,12 @@ def join_reports(
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
-    scored = sum(len(part.plan.scored_views) for part, (psnr, _) in zip(parts, scores, strict=True) if psnr is not None)
+    scored = sum(
+        len(part.plan.scored_views) for part, (psnr, *_) in zip(parts, scores, strict=True) if psnr is not None
+    )
     before = mean([None if part.before is None else part.before.psnr for part in parts])
-    after = mean([psnr for psnr, _ in scores])
-    covered = _join_covered(parts, scores, sizes)
+    after = mean([psnr for psnr, *_ in scores])
+    covered, photo_files = _join_besides(parts, scores, sizes)
     reference = None if before is None else parts[0].prepared.reference.name
     compared = (covered.before, covered.after) if covered else (before, after)
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
@@ -355,20 +365,31 @@ def join_reports(
         psnr_after=after, covered=covered, choices=run.choices | {"scored_views": scored},
         notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
         peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
+        photo_files=photo_files,
     )  # fmt: skip
 
 
-def _join_covered(
-    parts: Sequence[Part], scores: Sequence[tuple[float | None, Covered | None]], sizes: Sequence[int]
-) -> Covered | None:
-    """Average over blocks the scores of covered pixels; a fully covered block counts with all its pixels."""
-    if all(covered is None for _, covered in scores):
-        return None
-    each = [
-        covered or Covered(1.0, part.before.psnr, psnr)
-        for part, (psnr, covered) in zip(parts, scores, strict=True)
+def _join_besides(
+    parts: Sequence[Part], scores: Sequence[Scores], sizes: Sequence[int]
+) -> tuple[Covered | None, PhotoFiles | None]:
+    """Average over blocks the scores of covered pixels, and on files of photos; a block without has its others.
+
+    None in place of those that no block has, or that some block lacks altogether.
+    """
+    whole = [
+        (part.before.psnr, psnr)
+        for part, (psnr, *_) in zip(parts, scores, strict=True)
         if part.before is not None and psnr is not None
     ]
-    if len(each) < len(sizes):
-        return None
-    return Covered(*np.average([astuple(covered) for covered in each], axis=0, weights=sizes).tolist())
+    if len(whole) < len(sizes):
+        return None, None
+
+    def mean(rows: Sequence[tuple[float, ...]]) -> list[float]:
+        return np.average(rows, axis=0, weights=sizes).tolist()
+
+    covered = [each or Covered(1.0, *pair) for (_, each, _), pair in zip(scores, whole, strict=True)]
+    files = [each or PhotoFiles(*pair) for (*_, each), pair in zip(scores, whole, strict=True)]
+    return (
+        Covered(*mean([astuple(each) for each in covered])) if any(each for _, each, _ in scores) else None,
+        PhotoFiles(*mean([astuple(each) for each in files])) if any(each for *_, each in scores) else None,
+    )

@@ -31,6 +31,19 @@ class Covered:
 
 
 @dataclass(frozen=True)
+class PhotoFiles:
+    """PSNR on the photos as their files have them, where a run changed their colours or what covers them.
+
+    Args:
+        before: Mean PSNR (dB) of the input views rendered from the input.
+        after: The same from the result.
+    """
+
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
 class CompactReport:
     """Report of a run.
 
@@ -58,6 +71,7 @@ class CompactReport:
             where it is not measured.
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
+        photo_files: PSNR on the photos as their files have them, where the run changed some; None where it did not.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -79,6 +93,7 @@ class CompactReport:
     covered: Covered | None = None
     psnr_reference: str | None = None
     new_views: NewViews | None = None
+    photo_files: PhotoFiles | None = None
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
@@ -95,6 +110,8 @@ class CompactReport:
             facts += [("PSNR of new views, expected", f"{new.before:.1f} -> {new.after:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
+        if files := self.photo_files:
+            facts += [("on photos as they are", f"{files.before:.2f} -> {files.after:.2f} dB")]
         if judged := self.choices.get("fidelity"):
             facts += [("PSNR", f"{judged['psnr']:.1f} dB {_judged_by(judged)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -129,6 +146,7 @@ def report_document(
         ``views`` that a short fit left out; null with fewer than four photos, or where it was not asked for.
         ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
+        ``psnr_photo_files``: ``before``, ``after`` on the photos as their files have them, where the run changed some.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or that the
         result is below 30 dB from the input where there are no photos; or null.
     """
@@ -148,6 +166,7 @@ def report_document(
                 **_file_facts(path, level, at),
                 "psnr_input_views": level.psnr_after,
                 "psnr_covered": level.covered and asdict(level.covered),
+                "psnr_photo_files": level.photo_files and asdict(level.photo_files),
                 "seconds": round(sum(level.seconds.values()), 4),
                 "choices": level.choices,
                 "notes": level.notes,
@@ -164,6 +183,7 @@ def report_document(
         "psnr_input_views": {"before": numbers["psnr_before"], "after": numbers["psnr_after"]},
         "psnr_reference": numbers["psnr_reference"],
         "psnr_covered": numbers["covered"],
+        "psnr_photo_files": numbers["photo_files"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
         "unmet": numbers["unmet"],
@@ -196,6 +216,10 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % that the input covers"
         rows += [("", f"{covered['before']:.2f} dB", f"{covered['after']:.2f} dB", share)]
+    if files := document.get("psnr_photo_files"):
+        rows += [
+            ("", f"{files['before']:.2f} dB", f"{files['after']:.2f} dB", "on its photos as their files have them")
+        ]
     judged = document["choices"].get("fidelity")
     if judged:
         rows += [("PSNR", "", f"{judged['psnr']:.1f} dB", _judged_by(judged))]
@@ -257,6 +281,8 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
+    if files := document.get("psnr_photo_files"):
+        quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"

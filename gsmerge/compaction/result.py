@@ -12,7 +12,7 @@ from weakref import ReferenceType
 import numpy as np
 
 from gsmerge.compaction.new_views import SIDE, Trial
-from gsmerge.compaction.report import CompactReport, Covered
+from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.fit import Fitted
@@ -226,6 +226,26 @@ def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: P
     return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
 
 
+def measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
+    """Score Gaussians of the world on photos as their files have them; None where none of these was changed."""
+    if prepared.reference.photo_files is None:
+        return None
+    views = replace(prepared.result_views(), images=prepared.reference.photo_files)
+    return _score_photos("score", gaussians, views, prepared, plan, None).psnr
+
+
+def measure_besides(
+    before: PhotoScore | None, on_files: float | None, gaussians: Gaussians, prepared: Prepared, plan: Plan
+) -> tuple[Covered | None, PhotoFiles | None]:
+    """Score a result over the pixels that the input covers, and on photos as their files have them.
+
+    ``before`` and ``on_files`` are the input's scores; None in place of each that says nothing more.
+    """
+    covered = measure_covered(before, gaussians, prepared, plan)
+    after = None if on_files is None else measure_on_files(_written(gaussians, plan), prepared, plan)
+    return covered, None if on_files is None or after is None else PhotoFiles(on_files, after)
+
+
 def make_result(
     best: Candidate,
     levels: Sequence[Candidate],
@@ -243,24 +263,31 @@ def make_result(
     run, seconds = current_record(), search["seconds"]
     input_score = measure_input(prepared, plan) if plan.before is None else plan.before
     before = None if input_score is None else input_score.psnr
+    on_files = measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
     rendered = prepared.reference.name == RENDERS
     comparable = prepared.reference.of_views and not plan.clean.hides
     pictures = OWN_PHOTOS if prepared.reference.name == PHOTOS else prepared.reference.name
-    covered = [
-        measure_covered(input_score, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
+    measured = [
+        measure_besides(
+            input_score, on_files, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan
+        )
         for candidate in (best, *levels)
     ]
 
-    def report(candidate: Candidate, covered: Covered | None, seconds: Mapping[str, float], name: str) -> CompactReport:
+    def report(
+        candidate: Candidate, besides: tuple[Covered | None, PhotoFiles | None], seconds: Mapping[str, float], name: str
+    ) -> CompactReport:
+        covered, photo_files = besides
         counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
         shown = None if rendered else candidate.psnr
         made = CompactReport(
             *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
             covered=covered, psnr_reference=None if before is None else prepared.reference.name,
+            photo_files=photo_files,
         )  # fmt: skip
         if prepared.doubt is not None:
             choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
-            made = replace(made, psnr_before=None, psnr_after=None, covered=None, choices=choices)
+            made = replace(made, psnr_before=None, psnr_after=None, covered=None, photo_files=None, choices=choices)
             return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared, pictures) if comparable else None
@@ -272,7 +299,7 @@ def make_result(
     seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
-    main = report(best, covered[0], seconds, "the result")
+    main = report(best, measured[0], seconds, "the result")
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
     new_views = None
     if trial is not None and before is not None and main.psnr_after is not None:
@@ -287,7 +314,7 @@ def make_result(
     coarser = tuple(
         CompactResult(
             candidate.gaussians,
-            report(candidate, covered[i], candidate.record.seconds, f"level {i}"),
+            report(candidate, measured[i], candidate.record.seconds, f"level {i}"),
             candidate.cameras,
         )
         for i, candidate in enumerate(levels, 1)

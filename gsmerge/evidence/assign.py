@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsmerge.evidence.places import SIDE, find_places
-from gsmerge.evidence.scores import MARGIN, NORMAL, SIZES, Comparer, find_contrast, fisher_z, measure_noise
+from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, find_contrast, fisher_z, measure_noise
 from gsmerge.evidence.shown import Shown
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
@@ -86,7 +86,7 @@ class Assigner:
         self._correlations |= dict(zip(new, parallel_map(lambda photo: compare(read(photo)), new), strict=True))
         correlations = np.stack([self._correlations[photo] for photo in ids], 1)
         z = fisher_z(correlations)
-        middle, noise = measure_noise(z)
+        middle, noise = measure_noise(z, self._comparer.least_noise)
         return _Scores(ids, (z - middle[:, None, None]) / noise, correlations)
 
     def compare(self, view: int, assignment: Assignment) -> float | None:
@@ -103,9 +103,9 @@ class Assigner:
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Return the photos that names or order give to views, and whether what they show confirms each.
 
-        None where a photo is not like its view, or another is clearly more so that is not needed elsewhere. Those that
-        no other assignment makes more alike are confirmed; where names are not ``exact``, no parts may lie elsewhere
-        either. In doubt the parts tell.
+        None where a photo is not like its view, where another is clearly more so that is not needed elsewhere, or where
+        its parts lie elsewhere. Those that no other assignment makes more alike are confirmed if names are ``exact``;
+        otherwise, and in doubt, the parts tell.
         """
         out, sure = list[Assignment | None]([None] * len(named)), [False] * len(named)
         given = [(view, photo) for view, photo in enumerate(named) if photo is not None]
@@ -119,20 +119,23 @@ class Assigner:
             for column, turn in zip(columns, turns, strict=True)
         ]
         alike = np.nan_to_num(np.stack(of_turn, 1), nan=-np.inf)  # of each given view with each given photo
-        best = _match(alike)
+        best, own = _match(alike), np.diag(alike)[self.judged[[view for view, _ in given]]]
+        # half-way from wrong pairs to right ones, if all together are these
+        together = own.sum() > DOUBT * np.sqrt(len(own))
+        least = min(DOUBT, float(np.median(own)) / 2) if together else DOUBT
         for place, ((view, photo), column, turn) in enumerate(zip(given, columns, turns, strict=True)):
-            own, most = alike[place, place], alike[place, best[place]]
-            alone = len(set(columns)) == 1
-            like = own > (DOUBT if alone else 1 / NORMAL) or scores.correlations[view, column, turn] ** 2 > 0.5
-            like = like and own > most - DOUBT  # more than wrong pairs, or most of what is seen; no other clearly more
+            score, most = alike[place, place], alike[place, best[place]]
+            # more than wrong pairs, or most of what is seen; and no other clearly more
+            like = score > least or scores.correlations[view, column, turn] ** 2 > 0.5
+            like = like and score > most - DOUBT
             assignment = Assignment(photo, turn)
-            clear = own > MARGIN and own >= most
+            clear = score > MARGIN and score >= most
             if clear and exact:
                 out[view], sure[view] = assignment, True
-            elif np.isfinite(own) and (like or not self.judged[view]):
-                score = self.compare(view, assignment)
-                out[view] = assignment if exact or score != 0 else None
-                sure[view] = bool(score) or (clear and score is None) or not self.judged[view]
+            elif np.isfinite(score) and (like or not self.judged[view]):
+                parts = self.compare(view, assignment)
+                out[view] = assignment if parts != 0 else None
+                sure[view] = bool(parts) or (clear and parts is None) or not self.judged[view]
         return out, sure
 
     def stand_together(self, chosen: Sequence[Assignment | None]) -> bool:

@@ -61,6 +61,7 @@ class Comparer:
         self._small = small = [shown.shrink(side) for side in SIZES]
         width, height = small[0].weights.shape[2:0:-1]
         self._portrait, self._square = height > width, height == width
+        self.least_noise = 1 / np.sqrt(width * height)  # of Fisher's z of so many independent pixels
         self._empty = small[0].weights.max((1, 2)) < LEAST  # with which nothing can be compared
 
     @cached_property
@@ -109,22 +110,37 @@ def _correlate(photo: np.ndarray, filters: _Filters) -> np.ndarray:
     return np.asarray(products / np.sqrt(np.maximum(squares, 1e-12)))
 
 
-def measure_noise(z_scores: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the middle ``[v]`` of each view's scores ``[v,...]``, and the spread of all about it, without NaN."""
+def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float]:
+    """Return the middle ``[v]`` of each view's scores ``[v,...]``, and the spread of all about it, without NaN.
+
+    The spread is at ``least`` that of pixels which have nothing to do with each other.
+    """
     flat = z_scores.reshape(len(z_scores), -1)
     with warnings.catch_warnings():  # of views that show nothing
         warnings.simplefilter("ignore", RuntimeWarning)
         middle = np.nan_to_num(np.nanmedian(flat, 1))
         spread = np.nan_to_num(np.nanmedian(np.abs(flat - middle[:, None])))
-    return middle, max(NORMAL * float(spread), 1e-6)
+    return middle, max(NORMAL * float(spread), least)
+
+
+def signed_ranks(gains: np.ndarray) -> float:
+    """Return how far the signed ranks of gains ``[n]`` sum above zero, in standard deviations (Wilcoxon 1945).
+
+    Few large gains count no more than that many, so their distribution does not matter. Gains of 0 and NaN are left
+    out; 0 without others.
+    """
+    gains = gains[np.isfinite(gains) & (gains != 0)]
+    count = len(gains)
+    if count == 0:
+        return 0.0
+    ranks = np.empty(count)
+    ranks[np.argsort(np.abs(gains), kind="stable")] = np.arange(1, count + 1)
+    return float((np.sign(gains) * ranks).sum() / np.sqrt(count * (count + 1) * (2 * count + 1) / 6))
 
 
 def stands_out(gains: np.ndarray) -> bool:
-    """Return whether the mean of gains ``[n]`` is above zero by more than :data:`MARGIN` of its standard errors.
+    """Return whether gains ``[n]`` are above zero by more than :data:`MARGIN` standard deviations of their noise.
 
     Gains are those of parts that did not choose what gains: views, or parts of them.
     """
-    gains = gains[np.isfinite(gains)]
-    if len(gains) < 2:
-        return False
-    return bool(gains.mean() > MARGIN * gains.std(ddof=1) / np.sqrt(len(gains)))
+    return signed_ranks(gains) > MARGIN

@@ -18,7 +18,7 @@ from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_w
 from gsmerge.types import Cameras, Gaussians, Scene
 
 SAMPLES = 1 << 17  # Gaussians that are drawn
-ROWS_SIDE, DRAWN_SIDE = 192, 96  # pixels of the longer side of pictures of rows, and of drawings
+SIDE = 96  # pixels of the longer side of pictures that photos are compared with
 LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
 
 
@@ -87,8 +87,8 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     """Pair ``photos [v,h,w,3]`` with what a scene's Gaussians show in its views."""
     shown = show_views(scene)
     if scene.aligned:
-        return Pairs(photos[_every(scene.cameras, ROWS_SIDE)], shown)
-    level = max(1.0, max(scene.cameras.width, scene.cameras.height) / DRAWN_SIDE)
+        return Pairs(photos[_every(scene.cameras, SIDE)], shown)
+    level = max(1.0, max(scene.cameras.width, scene.cameras.height) / SIDE)
     return Pairs(photos_of(photos, scene.cameras, level).images, shown)
 
 
@@ -98,10 +98,10 @@ def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLES) ->
     Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.
     """
     if scene.aligned:
-        return _show_rows(scene, ROWS_SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
+        return _show_rows(scene, SIDE) if side is None else _show_rows(scene, 2 * side).shrink(side)
     few = Scene(thin_out(scene.finite_gaussians, samples), scene.cameras, None, None, scene.names)
     canonical, _ = canonicalise(few)
-    shown = draw_views(canonical.gaussians, canonical.cameras, side or DRAWN_SIDE)
+    shown = draw_views(canonical.gaussians, canonical.cameras, side or SIDE)
     inside = pixel_weights(scene.masks, *shown.weights.shape[2:0:-1])
     return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
 

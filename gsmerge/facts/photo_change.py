@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from gsmerge.evidence.colors import map_tones
 from gsmerge.types import LargePhotos
 
 CLIPPED = 0.985  # level from which on a pixel does not say how bright it is
@@ -31,7 +32,7 @@ class PhotoChange:
         if self.reversed:
             photo = photo[..., ::-1]
         if self.tones is not None:
-            photo = look_up(self.tones, photo)
+            photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:
             cover, colors = self.cover, self.colors
             if cover.shape != photo.shape[:2]:
@@ -44,14 +45,6 @@ def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Enlarge a picture in [0, 1] as whole numbers, which OpenCV resizes alike on every processor."""
     levels = np.rint(255 * picture.astype(np.float32).clip(0, 1)).astype(np.uint8)
     return np.asarray(cv2.resize(levels, shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255))
-
-
-def look_up(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
-    places = photo.astype(np.float32) * np.float32(255)
-    first = np.clip(places.astype(np.int64), 0, 254)
-    part, channel = places - first, np.arange(3)
-    return np.asarray(tones[channel, first] * (1 - part) + tones[channel, first + 1] * part)
 
 
 def change_large(large: LargePhotos, changes: Sequence[PhotoChange]) -> LargePhotos:

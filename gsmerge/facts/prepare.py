@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -43,6 +43,8 @@ class Reference:
     fit_views: tuple[int, ...]  # Views whose pictures a fit may use
     score_views: tuple[int, ...]  # Views whose pictures say how good a result is
     placed: bool = False  # Whether these are views that the scene lacks, for judging alone
+    # [v,h,w,3] photos of the input scene as their files have them, where the run changed some
+    photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @property
     def of_views(self) -> bool:
@@ -132,6 +134,8 @@ def prepare(
     scene, frame = canonicalise(add_views(scene), frame)
     finish = _prepare_pixels if scene.aligned else _prepare_others
     prepared = finish(given, scene, frame, tuple(repeated), options)
+    files = _photos_before(given, prepared)
+    prepared = replace(prepared, reference=replace(prepared.reference, photo_files=files))
     agreement = confirm_depths(prepared.scene)
     if agreement is not None:
         choose(agreement=agreement.to_dict())
@@ -139,6 +143,17 @@ def prepare(
             note(agreement.doubt)
         prepared = replace(prepared, agreement=agreement)
     return _without_holes(prepared, options) if fill and prepared.reference.of_views else prepared
+
+
+def _photos_before(given: Scene, prepared: Prepared) -> np.ndarray | None:
+    """Return the photos of a given scene if those that results are scored by were changed; else None."""
+    photos, scored = prepared.scene.images, prepared.reference.score_views
+    if given.images is None or prepared.reference.name != PHOTOS or photos is given.images:
+        return None
+    pairs = (
+        (before, photos[view]) for before, view in zip(given.images, prepared.repeated, strict=True) if view in scored
+    )
+    return given.images if any(not np.array_equal(*pair) for pair in pairs) else None
 
 
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:
@@ -223,13 +238,14 @@ def judged_pictures(scene: Scene) -> tuple[Scene, bool]:
     has_colors = _lacks_photos(scene) or (scene.aligned and len(scene) > 0 and bool(scene.valid.any()))
     if len(scene) == 0 or len(scene.gaussians) == 0 or not (has_colors or scene.images is not None):
         return scene, False
-    with record_part(silent=True):
+    with record_part(silent=True) as record:
         canonical = canonicalise(scene)[0]
         if scene.images is not None:
             compared, views = compare_photos(PicturedScene.of(canonical, scene.images, scene.masks))
             if views or not has_colors:
-                compared = equalise_exposure(compared, views, "auto") if canonical.aligned else compared
-                return scene, not views or compared.images is not scene.images
+                if canonical.aligned:
+                    equalise_exposure(compared, views, "auto")
+                return scene, not views or bool(record.choices)
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks), False
 

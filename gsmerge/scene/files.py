@@ -136,19 +136,26 @@ class SceneFiles:
 
 
 def find_scene_files(
-    path: StrPath, *, cameras: StrPath | None = None, images: StrPath | None = None, masks: StrPath | None = None
+    path: StrPath,
+    *,
+    cameras: StrPath | None = None,
+    images: StrPath | None = None,
+    masks: StrPath | None = None,
+    within: StrPath | None = None,
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names, or "none", are not searched.
+
+    ``within``: a folder, up to which the folders above the path are searched, too; a path to a folder is one.
 
     Cameras inside the ``.ply``, or belonging to depth maps, take precedence over others beside it, and those of a
     result, ``NAME.cameras.json``, over all others.
 
     The search goes through the given folder, that of the ``.ply`` and of what it links to, the folder above it for
-    ``gs_ply/``, ``ply/`` and ``gaussians/``, and two above it for ``point_cloud/iteration_n/``. In each the places of
-    ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If no place has
-    cameras, the only file of any name that holds cameras is taken, or one of a program whose cameras are not read, to
-    say so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the model saw
-    those. A result of gsmerge is taken if a folder has nothing else.
+    ``gs_ply/``, ``ply/`` and ``gaussians/``, two above it for ``point_cloud/iteration_n/``, and those between. In each
+    the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in their order. If
+    no place has cameras, the only file of any name that holds cameras is taken, or one of a program whose cameras are
+    not read, to say so. Images inside the cameras' ``.npz`` or ``.torch`` take precedence over a folder, because the
+    model saw those. A result of gsmerge is taken if a folder has nothing else.
 
     Raises:
         SceneError: If there is no ``.ply``, several to choose from, or a named file does not exist. Several are one
@@ -179,6 +186,8 @@ def find_scene_files(
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
         above = [folder.parent.parent]
     target = Path(os.path.realpath(ply)).parent  # of a link
+    top = within or (path if path.is_dir() else None)
+    above += [] if top is None else _list_between(folder, Path(os.path.realpath(top)))
     roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
     if cameras is None:
         places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
@@ -194,15 +203,21 @@ def find_scene_files(
         image_path = camera_path if has_images else None
     if image_path is None and images is None:
         folders = [root / place for root in roots for place in IMAGE_PLACES]
-        if folder.name == SCENES_PLACE:
-            folders = [place / ply.stem for place in folders] + folders
-        image_path = next((f for f in folders if f.is_dir() and list_images(f)), None)
+        of_scene = [
+            place / name for place in folders for name in (ply.stem, folder.name)
+        ]  # beside other scenes' photos
+        image_path = next((f for f in of_scene + folders if f.is_dir() and list_images(f)), None)
     if masks is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies, named=named)
+
+
+def _list_between(folder: Path, top: Path) -> list[Path]:
+    """List the folders above a folder up to ``top``, the nearest first."""
+    return [each for each in folder.parents if each.is_relative_to(top)] if folder.is_relative_to(top) else []
 
 
 def scene_title(ply: Path) -> str:

@@ -28,6 +28,7 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natu
 from gsmerge.io.photo_files import (
     Photos,
     Size,
+    decode_image,
     decode_images,
     decode_small,
     decode_views,
@@ -39,6 +40,7 @@ from gsmerge.kernels.pictures import turn_picture
 from gsmerge.raster.photos import row_pictures
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.record import list_some
+from gsmerge.runtime.threads import parallel_map
 from gsmerge.scene.estimate_cameras import GridFit, choose_fit, list_fits
 from gsmerge.scene.files import SceneFiles
 from gsmerge.types import Scene
@@ -88,15 +90,18 @@ class Proposal:
         """The files as they are proposed, as they are stored."""
         return [None if photo is None else Assignment(photo, 0) for photo in self.named]
 
-    def without(self, error: SceneError) -> Proposal | None:
-        """Return a copy without the file that cannot be read; None where the error is about no file of the pool."""
-        broken = next((number for number, path in enumerate(self.pool) if str(path) == error.path), None)
-        if broken is None or self.named.count(None) + self.named.count(broken) == len(self.named):
+    def without_broken(self) -> Proposal | None:
+        """Return a copy without the proposed files that cannot be decoded; None where all can be, or none."""
+        used = sorted({photo for photo in self.named if photo is not None})
+        faults = parallel_map(lambda photo: _find_fault(self.pool[photo], decode=True), used)
+        broken = {photo: fault for photo, fault in zip(used, faults, strict=True) if fault is not None}
+        if len(broken) in (0, len(used)):
             return None
-        pool = self.pool[:broken] + self.pool[broken + 1 :]
-        named = [None if photo in (None, broken) else photo - (photo > broken) for photo in self.named]
-        lacking = (*self.lacking, f"{self.pool[broken].name}: {error.problem}")
-        return replace(self, pool=pool, named=tuple(named), lacking=lacking)
+        lacking = (*self.lacking, *(f"{self.pool[photo].name}: {fault}" for photo, fault in broken.items()))
+        keep = [photo for photo in range(len(self.pool)) if photo not in broken]
+        places = {photo: place for place, photo in enumerate(keep)}
+        named = tuple(None if photo is None else places.get(photo) for photo in self.named)
+        return replace(self, pool=tuple(self.pool[photo] for photo in keep), named=named, lacking=lacking)
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
@@ -143,10 +148,12 @@ def _count_pixels(path: Path) -> int:
     return width * height
 
 
-def _find_fault(path: Path) -> str | None:
-    """Return why an image file cannot be read, by its header; None for a sound one."""
+def _find_fault(path: Path, *, decode: bool = False) -> str | None:
+    """Return why an image file cannot be read, by its header, or decoded; None for a sound one."""
     try:
-        image_size(path)
+        size = image_size(path)
+        if decode:
+            decode_image(path, size)
     except SceneError as error:
         return error.problem
     return None
@@ -327,14 +334,15 @@ def describe_assignment(
     turned = [_inside(proposal.pool[each.photo], proposal) for each in chosen if each is not None and each.turn]
     if turned:
         notes.append(f"{len(turned)} of {count} photos are turned as their views show them: {list_some(turned)}")
-    pairs = [
+    moved = [
         f"{camera_file.names[view]}: {_inside(proposal.pool[each.photo], proposal)}"
         for view, each in enumerate(chosen)
         if each is not None and each.photo != proposal.named[view]
     ]
-    if pairs:
-        what = "names" if proposal.exact else "their order"
-        notes.append(f"photos are matched with views by what they show, not by {what}: {list_some(pairs)}")
+    if moved and proposal.exact:
+        notes.append(f"photos are matched with views by what they show, not by names: {list_some(moved)}")
+    elif moved:
+        notes.append("photos are matched with views by what they show, not by their order")
     without = [view for view, each in enumerate(chosen) if each is None]
     if not without:
         return notes, []

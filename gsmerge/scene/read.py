@@ -143,6 +143,7 @@ class Loaded:
         """Facts about the input for a report."""
         cameras, recovery, info = self.scene.cameras, self.recovery, self.info
         facts: dict[str, Any] = {"num_views": len(cameras), "height": cameras.height, "width": cameras.width}
+        facts |= {"num_photos": len(self.scene.photo_views)}
         facts |= {"exporters": [entry.name for entry in self.exporters], "rows": recovery and recovery.description}
         facts |= {"moved_cameras": list(self.moves), "bytes": info.file_bytes}
         if self.files.parts:
@@ -343,7 +344,7 @@ def _assign(
         try:
             whole = _combine(ply, files, camera_file, read_photos(proposal, proposal.choice, camera_file), hints)
         except SceneError as error:
-            fewer = proposal.without(error)
+            fewer = proposal.without_broken() if error.path in map(str, proposal.pool) else None
             proposal, why = (proposal, error) if fewer is None else (fewer, None)
     try:
         bare = whole or _combine(ply, files, replace(camera_file, lenses=()), ScenePhotos(), hints)

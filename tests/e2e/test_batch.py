@@ -21,6 +21,12 @@ from gsmerge.cli.batch_command import Totals
 
 from .conftest import Outcome, Run, listing
 
+REPORT: dict[str, Any] = {
+    "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
+    "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None, "new_views": None,
+    "choices": {}, "notes": ["of no weight"],
+}  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def rooms(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -118,12 +124,7 @@ def test_a_dry_run_tells_what_is_left_and_writes_nothing(rooms: Path, out: Path,
 
 
 def test_the_table_at_the_end_has_the_first_results() -> None:
-    totals = Totals(1000)
-    report = {
-        "input": {"num_gaussians": 100}, "output": {"num_gaussians": 4}, "ratio": 0.04, "total_seconds": 1.5,
-        "psnr_input_views": {"before": 20.0, "after": None}, "unmet": None, "worse": None, "new_views": None,
-        "choices": {}, "notes": ["of no weight"],
-    }  # fmt: skip
+    totals, report = Totals(1000), REPORT
     for number in range(300):
         totals.add(record("done", f"{number}", f"{number}.ply", report=report))
         totals.add(record("failed", f"{number}", f"{number}.ply", error="no"))
@@ -144,6 +145,27 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     alone = Totals(1)
     alone.add(record("done", "y", "y.ply", report={**report, "choices": {"fidelity": {"psnr": 32.8}}}))
     assert alone.lines()[1].split()[-4:] == ["the", "input", "32.80", "1.5"]
+
+
+def test_what_a_scene_lacks_is_said(rooms: Path, tmp_path: Path, run: Run) -> None:
+    """Photos in the named folder are tried for each scene, and used where they show it."""
+    top = Path(shutil.copytree(rooms, tmp_path / "rooms"))
+    shutil.rmtree(top / "bad")
+    shutil.rmtree(top / "room1/images")
+    (top / "room0/images").rename(top / "images")
+
+    def notes(*options: object) -> list[str]:
+        outcome = run("batch", *options, *FAST, code=0)
+        return [line.removeprefix("note: ") for line in outcome.out.splitlines() if line.startswith("note: ")]
+
+    (other,) = notes(top, "--output", tmp_path / "out")
+    assert names(other, f"{top / 'room1'}: the photos in {top / 'images'} are left out")
+    one = top / "room1"
+    lacking = f"{one}: no photos found beside it or in the named folder; --images names photos"
+    assert notes(one, "--output", tmp_path / "out1") == [lacking]
+    bare, totals = {"num_gaussians": 8, "num_views": 0, "num_photos": 0}, Totals(1)
+    totals.add(record("done", "x", "x.ply", report=REPORT | {"input": bare}))
+    assert names("\n".join(totals.lines()), "note: x: no cameras found")
 
 
 def test_a_missed_target_ends_with_4_and_keeps_the_result(rooms: Path, tmp_path: Path, run: Run) -> None:

@@ -55,6 +55,12 @@ def extended(*batches: str) -> Callable[[Path], None]:
     return make
 
 
+def with_one_photo(folder: Path) -> None:
+    """Of several photos those that can be read are used."""
+    for path in sorted((folder / "images").iterdir())[1:]:
+        path.unlink()
+
+
 @dataclass(frozen=True)
 class Kind:
     """Files of a kind in a scene's folder, one of which is changed, and the command that reads them."""
@@ -71,7 +77,7 @@ KINDS = {
     "rows": Kind("scene.ply", many=FEWER),
     "parts": Kind("view_*.ply", places.in_parts(lambda path: None), many=FEWER),
     "transforms": Kind("transforms.json", named=("--cameras", "transforms.json")),
-    "photos": Kind("images/*.png", named=("--images", "images")),
+    "photos": Kind("images/*.png", with_one_photo, named=("--images", "images")),
     "views.npz": Kind("views.npz", of_views("views.npz"), named=("--cameras", "views.npz")),
     "results.npz": Kind("results.npz", of_views("results.npz"), named=("--cameras", "results.npz")),
     "COLMAP, binary": Kind("sparse/*.bin", colmap("bin"), named=("--cameras", "sparse"), many=FEWER),

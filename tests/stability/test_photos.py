@@ -128,7 +128,7 @@ def test_some_photos_in_another_order_of_channels(room: Scene, odd: list[int], a
         mended = prepare(scene).scene.images
     np.testing.assert_array_equal(mended, three.images)
     assert record.choices["photos_changed"] == [room.names[view] for view in odd]
-    assert noted(record.notes, "red", "blue", room.names[1])
+    assert noted(record.notes, "red", "blue", *(room.names[view] for view in odd))
 
 
 @sweep("aligned", [True, False])

@@ -43,6 +43,23 @@ def test_depth_anything_s_folders(tmp_path: Path, tiny: Tiny) -> None:
     assert actual.images == actual.cameras
 
 
+def test_cameras_and_photos_above_the_scene_up_to_the_named_folder(tmp_path: Path, tiny: Tiny) -> None:
+    top, run = tmp_path / "captures", tmp_path / "captures/room/run 1"
+    run.mkdir(parents=True)
+    write_ply(run / "scene.ply", tiny.gaussians)
+    write_transforms(tmp_path / "transforms.json", tiny)
+    write_images(tmp_path / "images", tiny)
+    for files in (find_scene_files(top), find_scene_files(run / "scene.ply", within=top)):
+        assert (files.cameras, files.images) == (None, None)  # they lie above what was named
+    write_transforms(top / "room/transforms.json", tiny)
+    write_images(top / "images", tiny)
+    for files in (find_scene_files(top), find_scene_files(run / "scene.ply", within=top)):
+        assert (files.cameras, files.images) == (top / "room/transforms.json", top / "images")
+    assert find_scene_files(run / "scene.ply").images is None
+    write_images(top / "images/run 1", tiny)
+    assert find_scene_files(top).images == top / "images/run 1"  # beside the photos of other scenes
+
+
 def test_a_trained_model_s_folders(tmp_path: Path, tiny: Tiny) -> None:
     make(tmp_path, "point_cloud/iteration_7000/point_cloud.ply", "point_cloud/iteration_30000/point_cloud.ply")
     make(tmp_path, "input.ply", "cameras.json")

@@ -84,7 +84,8 @@ def test_an_automatic_budget_is_the_share_that_the_depths_bear(wall: Scene) -> N
 
 
 def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(wall: Scene) -> None:
-    for scene in (scenes.take_views(wall, [0]), unaligned_scenes.without_order(wall)):
+    room = scenes.make_scene(scenes.room(), scenes.arc(4, 48, 36))
+    for scene in (scenes.take_views(wall, [0]), unaligned_scenes.without_order(room)):
         with record_run() as log:
             assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
         assert "compared" in log.notes[0]
