@@ -7,6 +7,7 @@ Gaussians of its own pixels show, whatever their depths are, their colours count
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -25,7 +26,7 @@ from gsmerge.evidence.colors import (
     plain_blocks,
     tone_blocks,
 )
-from gsmerge.evidence.scores import signed_ranks, stands_out
+from gsmerge.evidence.scores import MARGIN, signed_ranks
 from gsmerge.evidence.shown import Pairs, pair_photos, show_views
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
@@ -82,15 +83,24 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
 
 
 def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
-    """Find in which photos ``[v]`` of some views red and blue change places, whatever their tones are."""
+    """Find in which photos ``[v]`` of some views red and blue change places, whatever their tones are.
+
+    Colours as they are and after tone curves have a say each: a change of tone hides in the ones, and curves of covered
+    photos fit either order.
+    """
     swapped, wrong = pairs.with_photos(np.ascontiguousarray(pairs.photos[..., ::-1])), np.zeros(len(pairs), bool)
-    stored, before, after = cut_blocks(pairs), cut_blocks(pairs), cut_blocks(swapped)
-    some = [[view] for view in views if is_visible(stored.errors([view]))]
+    changes = [(cut_blocks(pairs), cut_blocks(swapped))]
+    some = [[view] for view in views if is_visible(changes[0][0].errors([view]))]
     if some:  # else their order is right
-        before, after = tone_blocks(pairs, some), tone_blocks(swapped, some)
-    gains = [before.errors([view]) - after.errors([view]) for view in views]
-    if any(map(stands_out, [np.concatenate(gains), *gains])):
-        wrong[[view for view, gain in zip(views, gains, strict=True) if signed_ranks(gain) > 0]] = True
+        changes += [(tone_blocks(pairs, some), tone_blocks(swapped, some))]
+
+    def score(ids: Sequence[int]) -> float:
+        scores = [signed_ranks(before.errors(ids) - after.errors(ids)) for before, after in changes]
+        return sum(scores) / math.sqrt(len(scores))  # Stouffer's sum, in standard deviations
+
+    scores = {view: score([view]) for view in views}
+    if max(score(views), *scores.values()) > MARGIN:
+        wrong[[view for view in views if scores[view] > 0]] = True
     return wrong
 
 
