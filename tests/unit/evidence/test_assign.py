@@ -1,0 +1,115 @@
+"""Photos find their views by what they show, whatever their names, turns and companions are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from panoramas import cut_views, show, shrunk, take_photos
+
+from gsmerge.evidence.assign import AT_ONCE, Assigner, Assignment, Candidates, assign_photos
+from gsmerge.evidence.places import SIDE, find_places
+from gsmerge.kernels.pictures import turn_back
+
+VIEWS = 6
+Named = Sequence[int | None]
+
+
+@pytest.fixture(scope="module")
+def views() -> np.ndarray:
+    return cut_views(VIEWS)
+
+
+@pytest.fixture(scope="module")
+def photos(views: np.ndarray) -> list[np.ndarray]:
+    return list(take_photos(views))
+
+
+def assign(
+    views: np.ndarray, pool: Sequence[np.ndarray], named: Named, *, exact: bool, tags: Sequence[int] | None = None
+) -> list[Assignment | None]:
+    candidates = Candidates(lambda photo: pool[photo], len(pool), tags or [0] * len(pool))
+    return assign_photos(lambda side: show(views, side), candidates, named, exact=exact)
+
+
+def others(count: int, seed: int = 9) -> list[np.ndarray]:
+    """Photos of another place."""
+    return list(take_photos(cut_views(count, seed)))
+
+
+def test_right_names_stay(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    assert assign(views, photos, range(VIEWS), exact=True) == [Assignment(view, 0) for view in range(VIEWS)]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_order_is_no_evidence(views: np.ndarray, photos: list[np.ndarray], exact: bool) -> None:
+    order = [3, 5, 0, 2, 4, 1]  # place of the photo in the pool of each view
+    pool = [photos[order.index(place)] for place in range(VIEWS)]
+    expected = [Assignment(place, 0) for place in order]
+    assert assign(views, pool, range(VIEWS), exact=exact) == expected
+    among = [*pool, *others(5)]
+    assert assign(views, among, [None] * VIEWS, exact=False) == expected
+
+
+def test_turned_photos_stand_as_they_show_the_view(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    turns = [0, 1, 2, 3, 6, 7]
+    pool = [np.ascontiguousarray(turn_back(photo, turn)) for photo, turn in zip(photos, turns, strict=True)]
+    assert assign(views, pool, range(VIEWS), exact=True) == [Assignment(*pair) for pair in enumerate(turns)]
+    tags = [0, 1, 2, 3, 0, 0]  # which viewers apply
+    assert assign(views, pool, range(VIEWS), exact=True, tags=tags) == [Assignment(*pair) for pair in enumerate(turns)]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_neighbour_stands_for_no_missing_photo(views: np.ndarray, photos: list[np.ndarray], exact: bool) -> None:
+    pool = [photo for view, photo in enumerate(photos) if view != 2]
+    named: list[int | None] = [0, 1, None, 2, 3, 4]
+    expected = [None if place is None else Assignment(place, 0) for place in named]
+    assert assign(views, pool, named, exact=exact) == expected
+    neighbour: list[int | None] = [0, 1, 1, 2, 3, 4]
+    assert assign(views, pool, neighbour, exact=exact)[2] is None
+
+
+def test_photos_of_another_place_show_nothing(views: np.ndarray) -> None:
+    for named in (list(range(VIEWS)), [None] * VIEWS):
+        assert assign(views, others(VIEWS), named, exact=True) == [None] * VIEWS
+
+
+def test_one_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    noise = np.random.default_rng(3).random(photos[0].shape, np.float32)
+    pool = [*photos[:3], noise, *photos[4:]]
+    assert [view for view, each in enumerate(assign(views, pool, range(VIEWS), exact=True)) if each is None] == [3]
+
+
+def test_some_frames_of_a_film(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    """Of many frames a sample is compared; the film dwells on each view."""
+    film = [shrunk(photos[frame * VIEWS // (2 * AT_ONCE)][None], 64)[0] for frame in range(2 * AT_ONCE)]
+    chosen = assign(views[[1, 4]], film, [None, None], exact=False)
+    assert [each and each.photo * VIEWS // (2 * AT_ONCE) for each in chosen] == [1, 4]
+
+
+def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    shown = show(views, SIDE)
+    own = find_places(shown, 2, photos[2])
+    assert own is not None
+    assert own.verdict is True
+    beside = np.roll(photos[2], 8, 1)
+    moved = find_places(shown, 2, beside)
+    assert moved is not None
+    assert moved.verdict is False
+    assert moved.together > moved.here
+    assert find_places(show(views, 32), 2, photos[2]) is None  # too small for parts
+
+
+def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:
+    reads: list[int] = []
+
+    def read(photo: int) -> np.ndarray:
+        reads.append(photo)
+        return photos[photo]
+
+    assigner = Assigner(lambda side: show(views, side), Candidates(read, VIEWS, [0] * VIEWS))
+    first = assigner.score([0, 2])
+    again = assigner.score([2, 0, 0])
+    assert sorted(reads) == [0, 2]
+    np.testing.assert_array_equal(first.values[:, ::-1], again.values)
