@@ -92,13 +92,13 @@ class Assigner:
     def compare(self, view: int, assignment: Assignment) -> float | None:
         """Compare a photo with a view part by part.
 
-        Returns how alike they are, 0 where it was taken from elsewhere, and None where parts do not tell.
+        Returns how alike they are, from 1 on, 0 where it was taken from elsewhere, and None where parts do not tell.
         """
         photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
         places = find_places(self.shown, view, np.ascontiguousarray(photo))
         if places is None or places.verdict is None:
             return None
-        return max(places.alike, 1e-6) if places.verdict else 0.0
+        return 1 + max(places.alike, 0.0) if places.verdict else 0.0
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Return the photos that names or order give to views, and whether what they show confirms each.
@@ -162,7 +162,8 @@ class Assigner:
             alike, (view, (photo, turn)) = self.compare(*pair), pair
             if alike is not None:
                 return alike
-            return max(0.0, float(scores.values[view, scores.photos.index(photo), turn]) - MARGIN)
+            score = float(scores.values[view, scores.photos.index(photo), turn])
+            return 1 - MARGIN / score if score > MARGIN else 0.0  # less than what parts say
 
         return _choose(pairs, parallel_map(compare, pairs))
 

@@ -1,0 +1,165 @@
+"""Photos as they lie beside scenes: each view has the one that shows it, or none, whatever the files are called."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from messages import names
+from PIL import Image
+
+from gsmerge.scene.read import Loaded, load_scene
+
+VIEWS = 4
+TAGS = {0: 1, 2: 3, 3: 6, 1: 8}  # of orientation, by the quarters that viewers turn a picture counterclockwise
+
+
+@pytest.fixture(scope="module")
+def made(make_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene of which each row has its pixel. Read only."""
+    folder: Path = make_scene(tmp_path_factory.mktemp("photos") / "room", num_views=VIEWS, width=192, height=144)
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "room"))
+
+
+@pytest.fixture(scope="module")
+def truth(made: Path) -> np.ndarray:
+    """The photos of all views ``[v,h,w,3]``."""
+    return np.stack([read(path) for path in photos_in(made)])
+
+
+def read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image[..., ::-1].astype(np.float32) / 255
+
+
+def photos_in(folder: Path) -> list[Path]:
+    return sorted((folder / "images").iterdir())
+
+
+def right_ones(loaded: Loaded, truth: np.ndarray) -> list[bool]:
+    """Whether each view has its photo."""
+    assert loaded.scene.images is not None
+    return [bool(np.abs(a - b).mean() < 0.02) for a, b in zip(loaded.scene.images, truth, strict=True)]
+
+
+def absent(loaded: Loaded) -> list[int]:
+    return sorted({*range(VIEWS)} - {*loaded.scene.photo_views})
+
+
+def name_frames(folder: Path, rename: Callable[[int, str], str]) -> None:
+    """Change the names of photos in the cameras' file."""
+    path = folder / "transforms.json"
+    data = json.loads(path.read_text())
+    for view, frame in enumerate(data["frames"]):
+        frame["file_path"] = rename(view, frame["file_path"])
+    path.write_text(json.dumps(data))
+
+
+def test_right_names_are_used_without_a_word(folder: Path, truth: np.ndarray) -> None:
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert not any("photo" in text for text in loaded.notes)
+
+
+@pytest.mark.parametrize("tagged", [True, False])
+def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: bool) -> None:
+    """As a phone writes them, with a tag that says how to hold them, or without."""
+    for path, quarters in zip(photos_in(folder), (3, 0, 1, 2), strict=True):
+        exif = Image.Exif()
+        if tagged:
+            exif[0x0112] = TAGS[quarters]
+        lying = np.rot90((read(path) * 255).round().astype(np.uint8), -quarters)
+        Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert any(names(text, "3 of 4 photos are turned as their views show them") for text in loaded.notes)
+
+
+def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
+    """A program has turned the pixels, and kept the tag."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for path in photos_in(folder):
+        Image.open(path).convert("RGB").save(path, exif=exif)
+    assert right_ones(load_scene(folder), truth) == [True] * VIEWS
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def dangle(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("nowhere.png")
+
+
+@pytest.mark.parametrize("spoil", [os.unlink, lambda path: path.write_bytes(b""), cut, dangle])
+def test_one_photo_that_is_not_there(folder: Path, truth: np.ndarray, spoil: Callable[[Path], object]) -> None:
+    path = photos_in(folder)[1]
+    spoil(path)
+    loaded = load_scene(folder)
+    assert absent(loaded) == [1]
+    assert [right for view, right in enumerate(right_ones(loaded, truth)) if view != 1] == [True] * 3
+    assert loaded.left_out is not None
+    assert names(loaded.left_out, "photos of 1 of 4 views are left out", path.name)
+
+
+def test_names_that_were_given_to_other_photos(folder: Path, truth: np.ndarray) -> None:
+    """As where a film's frames were numbered anew."""
+    paths = photos_in(folder)
+    contents = [path.read_bytes() for path in paths]
+    for view, path in enumerate(paths):
+        path.write_bytes(contents[(view + 1) % VIEWS])
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert any("matched with views by what they show" in text for text in loaded.notes)
+
+
+def test_numbers_of_which_names_say_nothing(folder: Path, truth: np.ndarray) -> None:
+    """Files 8 to 11, newest first, for cameras that name others."""
+    for view, path in enumerate(photos_in(folder)):
+        path.rename(path.with_name(f"{11 - view}.png"))
+    name_frames(folder, lambda view, _: f"images/frame_{view}.png")
+    assert right_ones(load_scene(folder), truth) == [True] * VIEWS
+
+
+def test_thumbnails_stand_for_no_photo(folder: Path, truth: np.ndarray) -> None:
+    """Nor do hidden copies, nor smaller ones below."""
+    for place in (".thumbs", "thumbs", "images_2"):
+        (folder / "images" / place).mkdir()
+    for path in [path for path in photos_in(folder) if path.is_file()]:
+        small = cv2.resize(cv2.imread(str(path)), (32, 24))
+        for place in (".thumbs", "thumbs", "images_2"):
+            cv2.imwrite(str(path.parent / place / path.name), small)
+    name_frames(folder, lambda _, name: Path(name).name)
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert absent(loaded) == []
+
+
+def test_photos_among_others_of_the_place(folder: Path, made: Path, truth: np.ndarray, make_scene: Any) -> None:
+    """Some frames of a film, with names that no camera has."""
+    other = make_scene(folder.parent / "other", num_views=12, width=192, height=144)
+    for number, path in enumerate(photos_in(other)):
+        shutil.copy(path, folder / "images" / f"IMG_{number:03}.png")
+    for number, view in enumerate((2, 0, 3, 1)):
+        path = folder / "images" / photos_in(made)[view].name
+        path.rename(path.with_name(f"A{number}.png"))
+    name_frames(folder, lambda view, _: f"{view}.png")
+    loaded = load_scene(folder)
+    assert loaded.scene.images is not None
+    away = [float(np.abs(a - b).mean()) for a, b in zip(loaded.scene.images, truth, strict=True)]
+    assert max(away) < 0.03  # those at the ends are in both
