@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import SCENE_SUFFIXES
@@ -19,7 +18,7 @@ from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_p
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
 
-T = TypeVar("T")
+Place = tuple[Path, Path | None]  # a scene, and the folder that was named; None where it was the scene itself
 MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
 _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
@@ -47,10 +46,8 @@ def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
     return (scene for scene, _ in find_places(arguments, out))
 
 
-def find_places(arguments: Sequence[str], out: Path) -> Iterator[tuple[Path, Path | None]]:
+def find_places(arguments: Sequence[str], out: Path) -> Iterator[Place]:
     """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
-
-    With each is the folder that was named, in which it lies; None where the scene itself was named.
 
     A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
     no scene or too many folders without one, UsageError if it is the output folder.
@@ -61,7 +58,7 @@ def find_places(arguments: Sequence[str], out: Path) -> Iterator[tuple[Path, Pat
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(f"{out}: expected another folder for the results than that of the scenes; name one")
-            yield from ((scene, path) for scene in _require_some(search.walk(path), argument, "in the folder"))
+            yield from _require_some(search.walk(path), argument, "in the folder")
         elif path.suffix in (*SCENE_SUFFIXES, SUFFIX) and path.is_file():
             yield path, None
         elif glob.has_magic(argument) and not path.exists():
@@ -72,7 +69,7 @@ def find_places(arguments: Sequence[str], out: Path) -> Iterator[tuple[Path, Pat
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
 
 
-def _require_some(scenes: Iterator[T], argument: str, where: str) -> Iterator[T]:
+def _require_some(scenes: Iterator[Place], argument: str, where: str) -> Iterator[Place]:
     """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
     if first is None:
@@ -97,7 +94,7 @@ class _Search:
     seen: set[str] = field(default_factory=set)  # real paths
     num_empty: int = 0  # folders since the last scene
 
-    def walk(self, folder: Path) -> Iterator[Path]:
+    def walk(self, folder: Path) -> Iterator[Place]:
         """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
         for inside, names, folders in self.folders(folder):
             if names is None:
@@ -108,7 +105,7 @@ class _Search:
             else:
                 scenes = other_plys(inside) if any(name.endswith(SCENE_SUFFIXES) for name in names) else []
             self.num_empty = 0 if scenes else self.num_empty
-            yield from scenes
+            yield from ((scene, folder) for scene in scenes)
 
     def folders(self, first: Path) -> Iterator[tuple[Path, list[str] | None, list[str]]]:
         """Yield a folder and those below it, with the names in each, and a list of its folders' names.
@@ -159,11 +156,11 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
         return True
 
 
-def _matches(pattern: str, search: _Search) -> Iterator[tuple[Path, Path | None]]:
+def _matches(pattern: str, search: _Search) -> Iterator[Place]:
     for name in dict.fromkeys(sorted(_expand(pattern, search))):
         path = Path(name)
         if os.path.isdir(path):
-            yield from ((scene, path) for scene in search.walk(path))
+            yield from search.walk(path)
         elif may_hold_gaussians(path):
             yield path, None
 
@@ -185,7 +182,7 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
             yield from names
 
 
-def _listed(file: Path, search: _Search) -> Iterator[tuple[Path, Path | None]]:
+def _listed(file: Path, search: _Search) -> Iterator[Place]:
     """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):
@@ -205,5 +202,5 @@ def _listed(file: Path, search: _Search) -> Iterator[tuple[Path, Path | None]]:
             yield path, None
         elif os.path.realpath(path) not in search.seen:
             scenes = search.walk(path)
-            yield next(scenes, path), path
-            yield from ((scene, path) for scene in scenes)
+            yield next(scenes, (path, path))
+            yield from scenes

@@ -121,8 +121,7 @@ class Assigner:
         alike = np.nan_to_num(np.stack(of_turn, 1), nan=-np.inf)  # of each given view with each given photo
         best, own = _match(alike), np.diag(alike)[self.judged[[view for view, _ in given]]]
         # half-way from wrong pairs to right ones, if all together are these
-        together = own.sum() > DOUBT * np.sqrt(len(own))
-        least = min(DOUBT, float(np.median(own)) / 2) if together else DOUBT
+        least = min(DOUBT, float(np.median(own)) / 2) if _exceed_noise(own) else DOUBT
         for place, ((view, photo), column, turn) in enumerate(zip(given, columns, turns, strict=True)):
             score, most = alike[place, place], alike[place, best[place]]
             # more than wrong pairs, or most of what is seen; and no other clearly more
@@ -143,7 +142,7 @@ class Assigner:
         given = [(view, each) for view, each in enumerate(chosen) if each is not None and self.judged[view]]
         scores = self.score(self._correlations)
         own = [scores.values[view, scores.photos.index(photo), turn] for view, (photo, turn) in given]
-        return not own or sum(own) > DOUBT * np.sqrt(len(own))
+        return not own or _exceed_noise(np.array(own))
 
     def _usual_turn(self, scores: _Scores, view: int, photo: int) -> int:
         """Return 0 for a photo that shows a view as it is stored, or the turn of its tag if that is clearly better."""
@@ -219,6 +218,11 @@ def assign_photos(
     for view in left:
         out[view] = others.get(view) or (out[view] if they_tell else None)
     return out
+
+
+def _exceed_noise(scores: np.ndarray) -> bool:
+    """Return whether scores ``[n]`` together are above those of so many wrong pairs."""
+    return bool(scores.sum() > DOUBT * np.sqrt(len(scores)))
 
 
 def _choose(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:

@@ -203,9 +203,8 @@ def find_scene_files(
         image_path = camera_path if has_images else None
     if image_path is None and images is None:
         folders = [root / place for root in roots for place in IMAGE_PLACES]
-        of_scene = [
-            place / name for place in folders for name in (ply.stem, folder.name)
-        ]  # beside other scenes' photos
+        # of several scenes each may have a folder of its own
+        of_scene = [place / name for place in folders for name in (ply.stem, folder.name)]
         image_path = next((f for f in of_scene + folders if f.is_dir() and list_images(f)), None)
     if masks is None:
         beside = [] if image_path is None else [image_path.parent]

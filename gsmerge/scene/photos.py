@@ -92,16 +92,9 @@ class Proposal:
 
     def without_broken(self) -> Proposal | None:
         """Return a copy without the proposed files that cannot be decoded; None where all can be, or none."""
-        used = sorted({photo for photo in self.named if photo is not None})
-        faults = parallel_map(lambda photo: _find_fault(self.pool[photo], decode=True), used)
-        broken = {photo: fault for photo, fault in zip(used, faults, strict=True) if fault is not None}
-        if len(broken) in (0, len(used)):
-            return None
-        lacking = (*self.lacking, *(f"{self.pool[photo].name}: {fault}" for photo, fault in broken.items()))
-        keep = [photo for photo in range(len(self.pool)) if photo not in broken]
-        places = {photo: place for place, photo in enumerate(keep)}
-        named = tuple(None if photo is None else places.get(photo) for photo in self.named)
-        return replace(self, pool=tuple(self.pool[photo] for photo in keep), named=named, lacking=lacking)
+        named = [None if photo is None else self.pool[photo] for photo in self.named]
+        sound = _keep_sound(replace(self, named=()), named, decode=True)
+        return None if len(sound.pool) == len(self.pool) or not any(sound.choice) else sound
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
@@ -131,12 +124,19 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
     if not pool:
         return None
     lacking = [f"{name}: no such file" for name, path in zip(names, named, strict=True) if exact and path is None]
-    broken = {path: problem for path in dict.fromkeys(named) if path is not None and (problem := _find_fault(path))}
-    lacking += [f"{path.name}: {problem}" for path, problem in broken.items()]
-    pool = [path for path in pool if path not in broken]
+    return _keep_sound(Proposal(folder, tuple(pool), (), exact, tuple(lacking)), named)
+
+
+def _keep_sound(proposal: Proposal, named: Sequence[Path | None], *, decode: bool = False) -> Proposal:
+    """Return a proposal of the ``named`` files without those that cannot be read, by their headers or decoded."""
+    paths = list(dict.fromkeys(path for path in named if path is not None))
+    faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
+    broken = {path: fault for path, fault in zip(paths, faults, strict=True) if fault is not None}
+    lacking = (*proposal.lacking, *(f"{path.name}: {fault}" for path, fault in broken.items()))
+    pool = tuple(path for path in proposal.pool if path not in broken)
     ids = {path: number for number, path in enumerate(pool)}
     places = tuple(None if path is None else ids.get(path) for path in named)
-    return Proposal(folder, tuple(pool), places, exact, tuple(lacking))
+    return replace(proposal, pool=pool, named=places, lacking=lacking)
 
 
 def _count_pixels(path: Path) -> int:

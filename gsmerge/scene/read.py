@@ -18,27 +18,23 @@ from gsmerge.alignment import (
     MAY_BE_UNALIGNED,
     Alignment,
     AlignmentResult,
-    Layout,
     Recovery,
     align,
     check_alignment,
-    choose_rotations,
     read_rotations,
 )
 from gsmerge.errors import SceneError
-from gsmerge.geometry import Similarity, move_views, rgb_to_sh0
+from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.json_files import read_dataparser
-from gsmerge.io.cameras.read import holds_images, read_depths
+from gsmerge.io.cameras.read import read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
-from gsmerge.io.formats.table import DEPTHS, input_format
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
     AUTO,
-    TURNED,
     Exporter,
     ReadHints,
     choose_exporters,
@@ -65,6 +61,7 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
+from gsmerge.scene.rows import color_from_photos, place_rows, set_rotations, use_depths
 from gsmerge.scene.views import (
     check_masks,
     cut_bars,
@@ -74,9 +71,8 @@ from gsmerge.scene.views import (
     read_scene_cameras,
 )
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import Cameras, Gaussians, LargePhotos, Scene, StrPath, grid_ids
+from gsmerge.types import Cameras, LargePhotos, Scene, StrPath
 
-_PART = 1 << 20  # numbers that are compared at once
 NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
@@ -439,11 +435,11 @@ def _make_load(
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
-    gaussians, pixel_ids, missing, more = _place_rows(ply, result)
+    gaussians, pixel_ids, missing, more = place_rows(ply, result)
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images
-    gaussians = _color_from_photos(gaussians, images, files)
+    gaussians = color_from_photos(gaussians, images, files)
     large = None if large is None else large[views]
     masks = None if masks is None else masks[views]
     masks, described = check_masks(masks, files)
@@ -458,8 +454,8 @@ def _make_load(
         more += [] if camera_file is None or files.is_state else [_unaligned_note(hints)]
     else:
         assert camera_file is not None, "pixels are those of cameras"
-        scene, note = _use_depths(scene, camera_file, layout, frame.scale)
-        scene, turned = _with_rotations(scene, hints, exporters, frame)
+        scene, note = use_depths(scene, camera_file, layout, frame.scale)
+        scene, turned = set_rotations(scene, hints, exporters, frame)
         more += [*note, *turned]
         if result.given is not None:
             scene = move_views(scene, result.given[views])
@@ -488,97 +484,6 @@ def _unaligned_note(hints: ReadHints) -> str:
     if hints.exporter == "auto":
         return note
     return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
-
-
-def _color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFiles) -> Gaussians:
-    """Give Gaussians of depth maps without images the colours of the photos.
-
-    Other Gaussians stay unchanged. SceneError without photos.
-    """
-    if input_format(files.ply) is not DEPTHS or holds_images(files.ply):
-        return gaussians
-    if images.size != 3 * len(gaussians):
-        problem = "expected images with the depth maps, found none, and no photos of their views"
-        raise SceneError(files.ply, problem, "name their folder with --images")
-    return replace(gaussians, sh0=rgb_to_sh0(images.reshape(-1, 1, 3)))
-
-
-def _use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: float) -> tuple[Scene, list[str]]:
-    """Start from depth maps beside the file where they are better, or where the exporter dropped pixels; with notes.
-
-    ``unit``: that of the cameras' file in the scene's.
-    """
-    depths = read_depths(Path(camera_file.path)) if layout.per_pixel == 1 else None
-    if depths is None or depths.shape[1:] != scene.valid.shape[1:] or len(depths) <= max(layout.views):
-        return scene, []
-    depths = depths[list(layout.views)]
-    from gsmerge.alignment import choose_depths, fill_from_depths
-
-    scene, moved = choose_depths(scene, depths, unit)
-    notes = [f"{moved:,} Gaussians start at the depth maps, which other views confirm more often"] * (moved > 0)
-    if scene.images is None or scene.missing is None or layout.kind != "box+depth":
-        return scene, notes
-    full = fill_from_depths(scene, depths, scene.images)
-    count = int(full.valid.sum()) - int(scene.valid.sum())
-    filled = f"{count:,} pixels that the exporter dropped are put back from the depth maps"
-    return full, [*notes, *[filled] * (count > 0)]
-
-
-def _place_rows(
-    ply: GaussianFile, result: AlignmentResult
-) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
-    """Sort rows by the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.
-
-    Pixels without a row get a fully transparent Gaussian. Rows without pixels are kept if they are finite and not
-    padding.
-    """
-    if result.pixel_ids is None:
-        from gsmerge.alignment import find_padding
-
-        gaussians = ply.gaussians
-        keep = ply.valid & ~find_padding(gaussians)
-        count = int(ply.valid.sum()) - int(keep.sum())
-        notes = [f"{count:,} Gaussians that only fill the file up are left out"] if count else []
-        return ply.gaussians[keep], None, None, notes
-    grid = len(result.views), result.cameras.height, result.cameras.width
-    size, ids = int(np.prod(grid)), result.pixel_ids
-    if len(ids) == size and _counts_up(ids):
-        return ply.gaussians, grid_ids(ply.valid), None, []
-    source = np.full(size, -1, np.int64)
-    rows = np.flatnonzero(ids >= 0)
-    source[ids[rows]] = rows
-    missing = source < 0
-    if not missing.any():
-        return ply.gaussians[source], grid_ids(ply.valid[source]), None, []
-    before = np.maximum.accumulate(np.where(missing, np.argmin(missing), np.arange(size)))
-    out = ply.gaussians[source[before]]
-    valid = ply.valid[source[before]] & ~missing
-    for values in (out.opacities, out.sh0, out.shN):
-        values[missing] = 0
-    out.quats[missing] = (1, 0, 0, 0)
-    return out, grid_ids(valid), missing.reshape(grid), []
-
-
-def _counts_up(ids: np.ndarray) -> bool:
-    """Return whether numbers are 0, 1, 2, ...; compared in parts, as there may be hundreds of millions."""
-    starts = range(0, len(ids), _PART)
-    parts = ((first, ids[first : first + _PART]) for first in starts)
-    return all(np.array_equal(part, np.arange(first, first + len(part), dtype=ids.dtype)) for first, part in parts)
-
-
-def _with_rotations(
-    scene: Scene, hints: ReadHints, exporters: Sequence[Exporter], frame: Similarity
-) -> tuple[Scene, list[str]]:
-    """Read rotations by the hint, as the given exporter stores them, or as fits the surface; with a note."""
-    turn = frame.rotation if frame.kind in TURNED else None
-    if hints.quats != "auto":
-        return read_rotations(scene, hints.quats, turn), []
-    if hints.exporter != "auto":
-        return read_rotations(scene, exporters[0].quats, turn), []
-    if any(not exporter.check_rotations for exporter in exporters):
-        return scene, []
-    choice, note = choose_rotations(scene, turn)
-    return read_rotations(scene, choice, turn), [note] if note else []
 
 
 def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

@@ -13,7 +13,7 @@ from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.scene import read
+from gsmerge.scene import rows
 from gsmerge.scene.files import find_scene_files, scene_title
 from gsmerge.scene.read import load_scene, read_scene
 from gsmerge.scene.views import stored_photos
@@ -192,13 +192,13 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
 
 
 def test_rows_in_order_are_known_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(read, "_PART", 4)
+    monkeypatch.setattr(rows, "_PART", 4)
     ids = np.arange(11, dtype=np.int32)
-    assert read._counts_up(ids)
+    assert rows._counts_up(ids)
     for wrong in (0, 4, 10):
         changed = ids.copy()
         changed[wrong] += 1
-        assert not read._counts_up(changed)
+        assert not rows._counts_up(changed)
 
 
 @pytest.mark.parametrize(
