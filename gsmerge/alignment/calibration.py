@@ -23,7 +23,7 @@ from gsmerge.alignment.resection import (
     refine_poses,
     start_pose,
 )
-from gsmerge.alignment.score import Correspondences, pixel_limit
+from gsmerge.alignment.score import Correspondences, is_as_near, pixel_limit
 from gsmerge.io.cameras.camera_file import make_pinhole
 from gsmerge.io.photo_files import Size
 from gsmerge.kernels.elementary import log
@@ -34,7 +34,6 @@ _FOCALS = (1.2, 4.8)  # of the longer side, with which the search for a focal le
 _FREE = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
 _ROUNDS = 2  # each time without the points that lie far from their pixels
 _FAR, _FAR_PX = 3.0, 1.0  # times the median, and pixels, from which a point is far
-_AS_NEAR, _AS_NEAR_PX = 1.15, 0.01  # of the distance under any projective cameras: a model leaves nothing to explain
 _SMALLEST_PX = 1e-3  # distances are compared as if none were smaller: means have 24 bits
 _MAX_UNCERTAINTY = 0.05  # of the focal length: points that are nearly a plane in front of the camera
 
@@ -119,7 +118,7 @@ def _models(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Si
             simple += [model] if free == ONE_FOCAL else []
             start = start if free == ONE_FOCAL else model
             yield model
-        if model.worst_px <= max(_AS_NEAR * bound, bound + _AS_NEAR_PX):
+        if is_as_near(model.worst_px, bound):  # nothing is left to explain
             return
     model = min(simple, key=lambda model: model.worst_px)
     for free in _FREE if len(points) > 1 else ():

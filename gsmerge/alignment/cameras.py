@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.alignment.frames import solve_pose
-from gsmerge.alignment.score import Correspondences, check_pairs, photo_colors, pixel_errors, pixel_limit
+from gsmerge.alignment.score import Correspondences, check_pairs, is_as_near, photo_colors, pixel_errors, pixel_limit
 from gsmerge.errors import SceneError
 from gsmerge.geometry import camera_depths, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
@@ -33,7 +33,6 @@ _SAME = 1e-6  # of the cameras' distances: no difference
 
 MAX_PX, MAX_SHARE = 12.0, 0.05  # pixels, and share of a small image's side, that cameras may be off
 NEAR_PX = 0.5  # cameras that are nearer stay where they are
-AS_GOOD, AS_GOOD_PX = 1.3, 0.25  # times and pixels more than moved cameras leave, up to which other intrinsics fit
 SAME_FOCAL = 0.01  # by which focal lengths of other intrinsics may differ, relative, where they count as the same
 CLEAR = 0.96  # of the difference of colours between photos that other poses leave: better
 _LINE_ROUNDS = 4  # of reweighted least squares
@@ -192,7 +191,7 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
     Ks[:, :2, 2] += shifts
     other = replace(cameras, Ks=Ks)
     check = check_pairs(pairs, other)
-    return other if check.ok and check.worst_px <= max(AS_GOOD * moved_px, moved_px + AS_GOOD_PX) else None
+    return other if check.ok and is_as_near(check.worst_px, moved_px) else None
 
 
 def _check_assumed(cameras: Cameras, other: Cameras, before_px: float, source: str) -> None:

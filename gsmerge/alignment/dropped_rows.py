@@ -16,7 +16,7 @@ import numpy as np
 from gsmerge.alignment.calibration import Calibration, calibrate
 from gsmerge.alignment.layouts import Layout, dropped_layout, subsample
 from gsmerge.alignment.resection import projective_camera
-from gsmerge.alignment.score import find_correspondences
+from gsmerge.alignment.score import find_correspondences, is_as_near
 from gsmerge.kernels.elementary import arccos, cos, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
@@ -25,7 +25,7 @@ _MIN_SIDE, _MAX_WIDTH = 16, 2048  # pixels of a line
 _LOOKED_AT = 1500  # rows whose nearest neighbour is searched among those that follow
 _ALIKE, _LENGTHS = 0.02, 2  # share of them that have it as far, and such distances that are tried
 _SIMILAR, _SLACK = 0.3, 0.08  # share that have it about as far, and by how much that may differ
-_SEEDS, _TRIED, _AS_NEAR = 12, 200, 1.15  # series of lines: looked at first, solved; times their least distance: good
+_SEEDS, _TRIED = 12, 200  # series of lines: looked at first, and solved
 _AGAIN = 3  # rounds of placing all rows of a view that lack pixels here and there
 _MARGIN = 0.2  # of the length of lines that lack pixels: columns that those of a seed may lack on both sides
 _ROUGH, _ROUNDS = 0.03, 12  # of a line: median error of rows that are spread evenly over it; rounds from there
@@ -142,13 +142,13 @@ def _find_views(points: np.ndarray, length: int, slack: int) -> list[_View]:
     nearest = min((seed.px for seed in first if seed is not None), default=None)
     if nearest is None:
         return []
-    far, views = _AS_NEAR * nearest, list[_View]()
+    views = list[_View]()
     free = np.ones(len(points), bool)
     for i, starts in enumerate(series):
         if not free[starts[0] : starts[-1]].all():
             continue
         seed = first[i] if i < len(first) else _solve_lines(points, starts)
-        if seed is not None and seed.px <= far:
+        if seed is not None and is_as_near(seed.px, nearest):
             margin = int(_MARGIN * length) if slack else 0  # of columns that the seed may lack
             width = int(seed.x.max()) + 1 + 2 * margin
             view = _grow(points, free, _shift(seed, margin), width)

@@ -12,7 +12,7 @@ from gsmerge.alignment.calibration import calibrate
 from gsmerge.alignment.dropped_rows import find_dropped_grid
 from gsmerge.alignment.layouts import ESTIMATED, exact_layouts, subsample
 from gsmerge.alignment.row_grid import find_grid
-from gsmerge.alignment.score import MARGIN, find_correspondences
+from gsmerge.alignment.score import find_correspondences, is_clearly_nearer
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.io.photo_files import Size
 from gsmerge.types import Cameras, Gaussians
@@ -36,7 +36,7 @@ def estimate_cameras(
         fit = calibrate(pairs, layout.width, layout.height)
         fits += [] if fit is None else [fit]
     fits.sort(key=lambda fit: fit.worst_px)
-    if not fits or (len(fits) > 1 and fits[1].worst_px < MARGIN * fits[0].worst_px):
+    if not fits or (len(fits) > 1 and not is_clearly_nearer(fits[0].worst_px, fits[1].worst_px)):
         return None
     return _make_cameras(path, names, fits[0].cameras)
 

@@ -21,7 +21,7 @@ from gsmerge.alignment.estimate import estimate_cameras
 from gsmerge.alignment.grids import shown_sizes
 from gsmerge.alignment.layouts import exact_layouts, subsample, view_orders
 from gsmerge.alignment.row_grid import find_layouts
-from gsmerge.alignment.score import MARGIN, Correspondences, find_correspondences, pixel_limit
+from gsmerge.alignment.score import Correspondences, find_correspondences, is_clearly_nearer, pixel_limit
 from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
@@ -116,7 +116,7 @@ def _intrinsics_of_rays(
         if not fits or fits[0][0] > pixel_limit(grid.width, grid.height):
             continue
         px, values, best = fits[0]
-        if all(other >= MARGIN * px for other, _, number in fits if number != best):
+        if all(is_clearly_nearer(px, other) for other, _, number in fits if number != best):
             fx, fy, cx, cy = values
             x, y = (cx + grid.left) / grid.scale_x, (cy + grid.top) / grid.scale_y
             return make_pinhole(fx / grid.scale_x, fy / grid.scale_y, x, y)

@@ -12,12 +12,13 @@ from gsmerge.alignment.cameras import describe_convention
 from gsmerge.alignment.grids import Grid
 from gsmerge.alignment.layouts import Layout, subsample
 from gsmerge.alignment.score import (
-    MARGIN,
-    SMALLEST_PX,
+    AS_NEAR_PX,
     AlignmentInput,
     Reading,
     beats_shuffled,
     color_error,
+    is_as_near,
+    is_clearly_nearer,
     score_shuffled,
 )
 from gsmerge.errors import SceneError
@@ -25,7 +26,6 @@ from gsmerge.errors import SceneError
 COLOR_MARGIN = 1.5  # by which the colours must beat the next reading's and shuffled ones, where pixels do not decide
 _RANDOM_SHARE = 0.9  # of the colours' distance from shuffled pixels: as good as random
 _MIN_SHUFFLED_COLOR = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
-_SAME, _SAME_PX = 1.15, 0.02  # two fits of one layout between which only the photos' colours can decide
 _WRONG_SIZE_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 
 
@@ -81,7 +81,7 @@ def judge(
     """
     effort = min((fit.reading.effort for fit in fits), default=0)
     first, *_ = ranked = sorted((fit for fit in fits if fit.reading.effort == effort), key=lambda fit: fit.px)
-    near = [fit for fit in ranked if fit.px < MARGIN * max(first.px, SMALLEST_PX)]
+    near = [fit for fit in ranked if not is_clearly_nearer(first.px, fit.px)]
     conventions = list(dict.fromkeys(fit.grid.camera_file.convention for fit in near))
     if len(conventions) > 1:
         both = " and as ".join(map(describe_convention, conventions[:2]))
@@ -93,7 +93,7 @@ def judge(
     order = sorted(range(len(near)), key=lambda i: (colors[i], i))
     others = [i for i in order if _differs(near[i].reading.layout, near[order[0]].reading.layout)]
     if not others:  # of photos that were resized in several ways
-        same = [i for i in order if near[i].px <= max(_SAME * first.px, first.px + _SAME_PX)]
+        same = [i for i in order if is_as_near(near[i].px, first.px)]
         return _accept(refine(near[same[0]]), read)
     best, other = refine(near[order[0]]), near[others[0]].reading
     inputs = read(best.grid)
@@ -102,7 +102,7 @@ def judge(
     decided = next_color > _MIN_SHUFFLED_COLOR and next_color >= COLOR_MARGIN * color  # not without photos: NaN
     if not (decided and beats_shuffled(best.reading, shuffled_px)):
         return None
-    margin = shuffled_px / max(best.px, SMALLEST_PX)
+    margin = shuffled_px / max(best.px, AS_NEAR_PX)
     return best, Recovery(best.reading, margin, other, next_color / max(color, 1e-3), True)
 
 
@@ -115,7 +115,7 @@ def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> tuple[Fit, Reco
     confirmed = None  # where colours hardly vary, or there are no photos
     if shuffled_color > _MIN_SHUFFLED_COLOR:
         confirmed = color_error(inputs, fit.reading.layout) <= _RANDOM_SHARE * shuffled_color
-    return fit, Recovery(fit.reading, shuffled_px / max(fit.px, SMALLEST_PX), confirmed=confirmed)
+    return fit, Recovery(fit.reading, shuffled_px / max(fit.px, AS_NEAR_PX), confirmed=confirmed)
 
 
 def _differs(layout: Layout, other: Layout) -> bool:

@@ -21,12 +21,14 @@ from gsmerge.alignment.judge import Fit
 from gsmerge.alignment.layouts import Layout, every_nth, some_views, subsample, view_orders
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
+    AS_NEAR_PX,
     QUICK_SAMPLES,
     SAMPLES,
-    SMALLEST_PX,
     AlignmentInput,
     Correspondences,
     Reading,
+    is_as_near,
+    is_clearly_nearer,
     pixel_limit,
     sample_layout,
     score_layout,
@@ -37,8 +39,6 @@ from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.photo_files import NO_IMAGES, Photos, Size, as_floats, photo_size
 from gsmerge.types import Cameras
 
-_SIMPLER, _SIMPLER_PX = 1.15, 0.02  # a simpler frame wins unless it is worse than this factor and these pixels
-_AS_GOOD, _AS_GOOD_PX = 1.5, 0.05  # one similarity for all cameras, compared with a pose for each
 # pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
 _SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
 _SHOWN_SAMPLES = 200  # Gaussians of a view that it is judged by
@@ -98,7 +98,7 @@ class Source:
 def match_views(source: Source, places: Sequence[Place]) -> list[Fit]:
     """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
     errors = [_projective_error(source, *place) for place in places]
-    far = _AS_SHOWN * max(min(errors, default=0.0), SMALLEST_PX)
+    far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)
     shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
     fits = [fit for place in shown for fit in _fit_views(source, *place)]
     usual, convention = source.camera_file.viewmats, source.camera_file.convention
@@ -184,23 +184,18 @@ def read_views(
     frames = chain(
         ((0, frame) for frame in usual_frames(cameras, inputs.scale)), solved_frames(pairs, cameras, own, inputs.scale)
     )
-    as_good = max(_AS_GOOD * bound.median_px, bound.median_px + _AS_GOOD_PX)
     readings: list[Reading] = []
     for effort, frame in frames:
         reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
         if effort == 2 and readings:
             break
-        if reading.ok and _is_near(reading.worst_px, bound.worst_px):
+        if reading.ok and is_as_near(reading.worst_px, bound.worst_px):
             return reading
-        if reading.ok and (effort == 0 or inputs.scale is not None or reading.median_px <= as_good):
+        is_solved = effort > 0 and inputs.scale is None
+        if reading.ok and not (is_solved and is_clearly_nearer(bound.median_px, reading.median_px)):
             readings.append(reading)  # otherwise cameras are wrong
     lowest = min((reading.worst_px for reading in readings), default=math.inf)
-    return next((reading for reading in readings if _is_near(reading.worst_px, lowest)), replace(bound, ok=False))
-
-
-def _is_near(px: float, lowest: float) -> bool:
-    """Return whether a simpler frame is near enough to the nearest one."""
-    return px <= max(_SIMPLER * lowest, lowest + _SIMPLER_PX)
+    return next((reading for reading in readings if is_as_near(reading.worst_px, lowest)), replace(bound, ok=False))
 
 
 def refine(source: Source, fit: Fit) -> Fit:

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.alignment.calibration import Calibration, calibrate
 from gsmerge.alignment.layouts import PER_PIXEL, Layout, full_layouts, some_views
 from gsmerge.alignment.resection import MIN_POINTS, projective_error
-from gsmerge.alignment.score import find_correspondences, pixel_limit
+from gsmerge.alignment.score import find_correspondences, is_as_near, pixel_limit
 from gsmerge.types import Gaussians
 
 _MIN_SIDE = 16  # pixels of a grid
@@ -29,7 +29,6 @@ _PERIODS = 6  # that are tried
 _SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 200, 60, 10_000  # Gaussians of a view to look at, to solve from, of all views
 _PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # in the file, of views that are looked at
 _RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the plastic number's inverse
-_SAME, _SAME_PX = 1.3, 0.05  # times as far, and pixels farther: as near
 
 _Size = tuple[int, int, int]  # rows from pixel to pixel, pixels of a line, lines of a view
 
@@ -42,7 +41,7 @@ def find_grid(gaussians: Gaussians, valid: np.ndarray) -> tuple[Layout, Calibrat
     rounds = (_calibrate_layouts(gaussians.means, valid, layouts) for layouts in _shown_layouts(gaussians, valid))
     fits = next(filter(None, rounds), [])
     nearest = min((calibration.worst_px for _, calibration in fits), default=0.0)
-    near = [fit for fit in fits if fit[1].worst_px <= max(_SAME * nearest, nearest + _SAME_PX)]
+    near = [fit for fit in fits if is_as_near(fit[1].worst_px, nearest)]
     return min(near, key=lambda fit: len(set(fit[0].views)), default=None)
 
 

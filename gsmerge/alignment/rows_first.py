@@ -45,7 +45,7 @@ from gsmerge.alignment.layouts import (
     view_orders,
 )
 from gsmerge.alignment.match import Place, Source, match_views, refine
-from gsmerge.alignment.score import SHUFFLED_MARGIN, SMALLEST_PX, score_layout
+from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -147,7 +147,7 @@ def _read_in_order(source: Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery
         elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_enough(source):
             layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
             best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
-            far = SHUFFLED_MARGIN * max(best.worst_px, SMALLEST_PX)
+            far = SHUFFLED_MARGIN * max(best.worst_px, AS_NEAR_PX)
             if source.scale is None and best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others):
                 fits.append(Fit(grid, best))
     fits = [fit for fit in fits if fit.reading.ok]

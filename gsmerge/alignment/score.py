@@ -15,7 +15,9 @@ from gsmerge.types import Cameras, Gaussians
 
 MARGIN = 2.0  # by which the best reading must beat the next one
 SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
-SMALLEST_PX = 1e-3  # distances are compared as if none were smaller, pixels
+# Medians of some 400 pixels differ by chance: 1.15 is three standard errors of their ratio, each 0.72 / sqrt(n) of a
+# median distance in a plane. The pixels are those by which files round cameras.
+AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
@@ -93,6 +95,16 @@ class Reading:
         return ", ".join(part for part in (self.layout.description, self.frame.description) if part)
 
 
+def is_as_near(px: float, least: float) -> bool:
+    """Return whether a median distance, pixels, is larger than the least one by no more than chance and rounding."""
+    return px <= max(AS_NEAR * least, least + AS_NEAR_PX)
+
+
+def is_clearly_nearer(px: float, other_px: float) -> bool:
+    """Return whether a median distance, pixels, stands out against that of another explanation."""
+    return other_px >= MARGIN * max(px, AS_NEAR_PX)
+
+
 def pixel_limit(width: int, height: int) -> float:
     """Return the largest median distance, pixels, at which Gaussians still count as belonging to their pixels."""
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
@@ -126,7 +138,7 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
 
 def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
     """Return whether a reading is near enough to its pixels, and far nearer than to shuffled pixels."""
-    return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, SMALLEST_PX)
+    return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, AS_NEAR_PX)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
