@@ -33,7 +33,9 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
-NOTHING, SPARSE = 0.5, 0.25  # the same below which it shows nothing, and below which there is nothing around it
+# share of the usual opacity of a view, which is low where rows are thin, below which a pixel shows nothing, and below
+# which there is nothing around it
+NOTHING, SPARSE = 0.5, 0.25
 LARGE, PART, RIM = 1 / 12, 0.12, 2  # of the longer side: squares in large parts that stay empty; their share
 # of the picture, at least; pixels beside them that do not
 GAP = 1 / 53  # of the longer side: beside large empty parts only narrower gaps in what is covered are filled
@@ -81,8 +83,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         depths, left = blend_depths(tiled)
         covered = left <= 1 - EMPTY
         if not everywhere:
-            sparse = blur(left, gap / 4) > 1 - SPARSE  # single Gaussians at the edges of what was cut out
-            empty[view] = large_parts((left > 1 - NOTHING) & sparse)
+            opacity = 1 - left
+            usual = (opacity * opacity).sum() / max(float(opacity.sum()), 1e-6)  # mean where there is something to see
+            sparse = blur(opacity, gap / 4) < SPARSE * usual  # single Gaussians at the edges of what was cut out
+            empty[view] = large_parts((opacity < NOTHING * usual) & sparse)
         holes[view] = free[view] & ~covered & ~empty[view]
         if empty[view].any():  # the edges of what was cut out are no holes
             around = np.ones((gap, gap), np.uint8)

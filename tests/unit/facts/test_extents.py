@@ -64,6 +64,14 @@ def test_a_part_without_rows_stays_empty(room: Scene) -> None:
     assert "4 of 4 views" in notes[0]
 
 
+def test_thin_rows_are_not_taken_for_empty_parts(room: Scene) -> None:
+    """Rows of which a ray meets a sixth show the whole room; without those of the top they show all but the top."""
+    for scene, count in ((room, 0), (without_top(room), 1)):
+        faint = replace(scene.gaussians, opacities=0.02 * scene.gaussians.opacities)[np.flatnonzero(scene.valid)]
+        _, _, notes = compared(replace(scene, gaussians=faint, pixel_ids=None, missing=None))
+        assert len(notes) == count
+
+
 def test_photos_fill_it_where_it_is_asked_for(room: Scene) -> None:
     _, after, notes = compared(without_top(room), extent="photos")
     assert after[:, :THIRD].mean() > 0.9
