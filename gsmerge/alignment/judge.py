@@ -13,6 +13,8 @@ from gsmerge.alignment.grids import Grid
 from gsmerge.alignment.layouts import Layout, subsample
 from gsmerge.alignment.score import (
     AS_NEAR_PX,
+    RANDOM_SHARE,
+    SAME_COLORS,
     AlignmentInput,
     Reading,
     beats_shuffled,
@@ -24,8 +26,6 @@ from gsmerge.alignment.score import (
 from gsmerge.errors import SceneError
 
 COLOR_MARGIN = 1.5  # by which the colours must beat the next reading's and shuffled ones, where pixels do not decide
-_RANDOM_SHARE = 0.9  # of the colours' distance from shuffled pixels: as good as random
-_MIN_SHUFFLED_COLOR = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
 _WRONG_SIZE_PX = 0.3  # median distance that a grid of a wrong size does not reach at any scale
 
 
@@ -99,7 +99,7 @@ def judge(
     inputs = read(best.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, best.reading)
     color, next_color = colors[order[0]], min(colors[others[0]], shuffled_color)
-    decided = next_color > _MIN_SHUFFLED_COLOR and next_color >= COLOR_MARGIN * color  # not without photos: NaN
+    decided = next_color > SAME_COLORS and next_color >= COLOR_MARGIN * color  # not without photos: NaN
     if not (decided and beats_shuffled(best.reading, shuffled_px)):
         return None
     margin = shuffled_px / max(best.px, AS_NEAR_PX)
@@ -113,8 +113,8 @@ def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> tuple[Fit, Reco
     if not beats_shuffled(fit.reading, shuffled_px):
         return None
     confirmed = None  # where colours hardly vary, or there are no photos
-    if shuffled_color > _MIN_SHUFFLED_COLOR:
-        confirmed = color_error(inputs, fit.reading.layout) <= _RANDOM_SHARE * shuffled_color
+    if shuffled_color > SAME_COLORS:
+        confirmed = color_error(inputs, fit.reading.layout) <= RANDOM_SHARE * shuffled_color
     return fit, Recovery(fit.reading, shuffled_px / max(fit.px, AS_NEAR_PX), confirmed=confirmed)
 
 

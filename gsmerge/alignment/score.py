@@ -18,6 +18,8 @@ SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
 # Medians of some 400 pixels differ by chance: 1.15 is three standard errors of their ratio, each 0.72 / sqrt(n) of a
 # median distance in a plane. The pixels are those by which files round cameras.
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
+RANDOM_SHARE = 0.85  # of the colours' distance from shuffled pixels: as good as random
+SAME_COLORS = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
 QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond

@@ -9,24 +9,20 @@ import numpy as np
 
 from gsmerge.alignment.cameras import Poses, describe_reading, other_conventions
 from gsmerge.alignment.frames import usual_frames
-from gsmerge.alignment.score import MARGIN, AlignmentInput, photo_colors
+from gsmerge.alignment.score import MARGIN, RANDOM_SHARE, SAME_COLORS, AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity, lower_median, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, with_convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.types import Cameras, Gaussians
 
-_SEEN_AS_MUCH = 0.98  # of the score of what the cameras see: no difference
+_FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame; of as good ones those stay as they are
+_PEAK_GAIN = 1.05  # times that of a scale two steps of the search beside it, for a scale that colours chose
 _SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
 _FEW_SAMPLES, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
 _MIN_SEEN = 0.5  # share of them that some camera sees
-_MAX_COLOR_RATIO = 0.85  # of their colours' distance from the photos, over that from random pixels
-_MAX_FRONT_RATIO = 0.5  # the same of the foremost ones alone, in a frame that colours chose
+_MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, of the foremost ones alone in a frame that colours chose
 _FRONT, _PER_CELL = 1.05, 3  # times the depth of the nearest one of its cell; Gaussians of a cell
-_SAME_COLORS = 0.01  # mean distance of the colours from random pixels below which photos say nothing
-_FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame
-# a scale stands out whose score is so many times that of a scale which is this factor off
-_PEAK, _PEAK_GAIN = 1.15, 1.05
 _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
 _SCALE_SAMPLES = 2000  # Gaussians that they are tried on
 # next, nearer and nearer: reach (natural logarithm), steps, Gaussians
@@ -97,9 +93,9 @@ def check_cameras(
             errors.append(np.abs(colors[seen] - photo).mean(1))
             shuffled_errors.append(np.abs(colors[seen] - rng.permutation(photo)).mean(1))
     share, ratio = float(visible.sum()) / max(1, len(rows)), np.nan
-    if errors and (other := float(np.concatenate(shuffled_errors).mean())) > _SAME_COLORS:
+    if errors and (other := float(np.concatenate(shuffled_errors).mean())) > SAME_COLORS:
         ratio = float(np.concatenate(errors).mean()) / other
-    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > _MAX_COLOR_RATIO)
+    return CameraCheck(share, ratio, share >= _MIN_SEEN and not ratio > RANDOM_SHARE)
 
 
 def _are_foremost(xy: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
@@ -134,7 +130,7 @@ def choose_poses(
     scores = [check.score for check in (usual, *(check for _, check in ranked[1:2])) if check.ok]
     if best.score >= MARGIN * max(scores, default=0.0):
         return poses, best, None
-    as_good = usual.ok and best.score >= _SEEN_AS_MUCH * usual.score
+    as_good = usual.ok and _FRAME_GAIN * best.score >= usual.score
     note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
     return None, usual, note if as_good else None
 
@@ -237,7 +233,8 @@ def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: i
 
 def _stands_out(inputs: AlignmentInput, frame: Similarity) -> bool:
     """Return whether a frame scores clearly higher than the same frame at nearby scales."""
-    beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / _PEAK, _PEAK))
+    away = float(_SCALES[2] / _SCALES[0])
+    beside = (_score_frame(inputs, _scaled(frame, factor)) for factor in (1 / away, away))
     return _score_frame(inputs, frame) > _PEAK_GAIN * max(beside)
 
 
