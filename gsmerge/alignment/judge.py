@@ -30,30 +30,6 @@ _WRONG_SIZE_PX = 0.3  # median distance that a grid of a wrong size does not rea
 
 
 @dataclass(frozen=True)
-class Recovery:
-    """The reading of the rows that was taken, and how clearly it is the right one."""
-
-    best: Reading
-    # how many times nearer the Gaussians are to their pixels than to shuffled pixels
-    margin: float
-    other: Reading | None = None  # another one that fits the pixels as well, against which the photos' colours decided
-    color_margin: float | None = None  # how many times farther its colours are from the photos
-    # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
-    confirmed: bool | None = None
-
-    @property
-    def description(self) -> str:
-        """Description of the reading and its margin in words."""
-        text = f"{self.best.description}: median {self.best.median_px:.2f} px from the pixels, "
-        if self.other is None or self.color_margin is None:
-            text += f"{min(self.margin, 9999):.0f} times nearer than shuffled pixels"
-        else:
-            text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
-            text += f" reading ({self.other.description}), which fits the pixels as well"
-        return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
-
-
-@dataclass(frozen=True)
 class Fit:
     """A reading of the rows in a grid of some size."""
 
@@ -63,7 +39,7 @@ class Fit:
     @property
     def px(self) -> float:
         """Median distance of the Gaussians from their pixels in the worst view, pixels."""
-        return self.reading.worst_px
+        return self.reading.alignment.worst_px
 
     @property
     def is_doubtful(self) -> bool:
@@ -71,9 +47,36 @@ class Fit:
         return self.reading.layout.kind == "trim" and self.reading.frame.scale != 1 and self.px > _WRONG_SIZE_PX
 
 
-def judge(
-    fits: Sequence[Fit], read: Callable[[Grid], AlignmentInput], refine: Callable[[Fit], Fit]
-) -> tuple[Fit, Recovery] | None:
+@dataclass(frozen=True)
+class Recovery:
+    """The reading of the rows that was taken, and how clearly it is the right one."""
+
+    fit: Fit
+    # how many times nearer the Gaussians are to their pixels than to shuffled pixels
+    margin: float
+    other: Reading | None = None  # another one that fits the pixels as well, against which the photos' colours decided
+    color_margin: float | None = None  # how many times farther its colours are from the photos
+    # whether the photos' colours agree with the reading; None where there are no photos, or none that could decide
+    confirmed: bool | None = None
+
+    @property
+    def best(self) -> Reading:
+        """The reading of the rows."""
+        return self.fit.reading
+
+    @property
+    def description(self) -> str:
+        """Description of the reading and its margin in words."""
+        text = f"{self.best.description}: median {self.best.alignment.middle_px:.2f} px from the pixels, "
+        if self.other is None or self.color_margin is None:
+            text += f"{min(self.margin, 9999):.0f} times nearer than shuffled pixels"
+        else:
+            text += f"and the photos' colours {min(self.color_margin, 9999):.1f} times nearer than under the next"
+            text += f" reading ({self.other.description}), which fits the pixels as well"
+        return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
+
+
+def judge(fits: Sequence[Fit], read: Callable[[Grid], AlignmentInput], refine: Callable[[Fit], Fit]) -> Recovery | None:
     """Take the fit that is the nearest to its pixels, or the one of similar fits whose photos have the right colours.
 
     ``read`` reads the photos of a grid, and ``refine`` scores a fit on more Gaussians. Frames that need less solving
@@ -103,10 +106,10 @@ def judge(
     if not (decided and beats_shuffled(best.reading, shuffled_px)):
         return None
     margin = shuffled_px / max(best.px, AS_NEAR_PX)
-    return best, Recovery(best.reading, margin, other, next_color / max(color, 1e-3), True)
+    return Recovery(best, margin, other, next_color / max(color, 1e-3), True)
 
 
-def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> tuple[Fit, Recovery] | None:
+def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> Recovery | None:
     """Accept a fit that has no others if its pixels beat shuffled ones; None if they do not."""
     inputs = read(fit.grid)
     shuffled_px, shuffled_color = score_shuffled(inputs, fit.reading)
@@ -115,7 +118,7 @@ def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> tuple[Fit, Reco
     confirmed = None  # where colours hardly vary, or there are no photos
     if shuffled_color > SAME_COLORS:
         confirmed = color_error(inputs, fit.reading.layout) <= RANDOM_SHARE * shuffled_color
-    return fit, Recovery(fit.reading, shuffled_px / max(fit.px, AS_NEAR_PX), confirmed=confirmed)
+    return Recovery(fit, shuffled_px / max(fit.px, AS_NEAR_PX), confirmed=confirmed)
 
 
 def _differs(layout: Layout, other: Layout) -> bool:

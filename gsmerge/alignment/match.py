@@ -153,7 +153,7 @@ def _fit_views(source: Source, grid: Grid, layout: Layout) -> list[Fit]:
         other = fit(nearest)
         same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
         fits += [other] if other.reading.frame.kind in same_axes else []
-    return [each for each in fits if each.reading.ok]
+    return [each for each in fits if each.reading.alignment.ok]
 
 
 def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
@@ -179,7 +179,8 @@ def read_views(
     for view, pose in own.items():
         viewmats[view] = pose
     bound = score_layout(replace(inputs, cameras=replace(cameras, viewmats=viewmats)), layout, IDENTITY, pairs)
-    if not bound.ok and set(own) >= set(layout.views):
+    least = bound.alignment
+    if not least.ok and set(own) >= set(layout.views):
         return bound  # nothing is nearer than poses of their own
     frames = chain(
         ((0, frame) for frame in usual_frames(cameras, inputs.scale)), solved_frames(pairs, cameras, own, inputs.scale)
@@ -187,15 +188,17 @@ def read_views(
     readings: list[Reading] = []
     for effort, frame in frames:
         reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
+        fit = reading.alignment
         if effort == 2 and readings:
             break
-        if reading.ok and is_as_near(reading.worst_px, bound.worst_px):
+        if fit.ok and is_as_near(fit.worst_px, least.worst_px):
             return reading
         is_solved = effort > 0 and inputs.scale is None
-        if reading.ok and not (is_solved and is_clearly_nearer(bound.median_px, reading.median_px)):
+        if fit.ok and not (is_solved and is_clearly_nearer(least.middle_px, fit.middle_px)):
             readings.append(reading)  # otherwise cameras are wrong
-    lowest = min((reading.worst_px for reading in readings), default=math.inf)
-    return next((reading for reading in readings if is_as_near(reading.worst_px, lowest)), replace(bound, ok=False))
+    lowest = min((reading.alignment.worst_px for reading in readings), default=math.inf)
+    near = (reading for reading in readings if is_as_near(reading.alignment.worst_px, lowest))
+    return next(near, replace(bound, alignment=replace(least, ok=False)))
 
 
 def refine(source: Source, fit: Fit) -> Fit:

@@ -126,14 +126,14 @@ def align(
         problem = error
     found = _read_in_order(source, grids) or _find_pixels(source, grids)
     if found is not None:
-        return _make_result(source, *found)
+        return _make_result(source, found)
     cropped = None if problem is None else _cropped_grid(source, grids)
     if problem is not None and cropped is None:
         raise problem
     return _choose_cameras(source, cropped or grids[0], frames)
 
 
-def _read_in_order(source: Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+def _read_in_order(source: Source, grids: Sequence[Grid]) -> Recovery | None:
     """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
 
     Or read them by the pixels that they showed when their cameras were estimated.
@@ -147,10 +147,11 @@ def _read_in_order(source: Source, grids: Sequence[Grid]) -> tuple[Fit, Recovery
         elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_enough(source):
             layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
             best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
-            far = SHUFFLED_MARGIN * max(best.worst_px, AS_NEAR_PX)
-            if source.scale is None and best.worst_px <= _PLAIN_PX and all(other.worst_px >= far for other in others):
+            worst = best.alignment.worst_px
+            far = SHUFFLED_MARGIN * max(worst, AS_NEAR_PX)
+            if source.scale is None and worst <= _PLAIN_PX and all(o.alignment.worst_px >= far for o in others):
                 fits.append(Fit(grid, best))
-    fits = [fit for fit in fits if fit.reading.ok]
+    fits = [fit for fit in fits if fit.reading.alignment.ok]
     return judge(fits, source.inputs, lambda fit: fit) if fits else None
 
 
@@ -163,7 +164,7 @@ def _has_enough(source: Source) -> bool:
 # Rows show their grid
 
 
-def _find_pixels(source: Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] | None:
+def _find_pixels(source: Source, named: Sequence[Grid]) -> Recovery | None:
     """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
 
     ``named``: the grids of sizes that files name.
@@ -176,8 +177,8 @@ def _find_pixels(source: Source, named: Sequence[Grid]) -> tuple[Fit, Recovery] 
         other = judge(fits, source.inputs, partial(refine, source)) if fits else None
         if other is None and turn == 0 and named:
             other = _move_cameras(source, named[0])
-        found = min(filter(None, (found, other)), key=lambda each: each[0].px, default=None)
-        if found is not None and not found[0].is_doubtful:
+        found = min(filter(None, (found, other)), key=lambda each: each.fit.px, default=None)
+        if found is not None and not found.fit.is_doubtful:
             return found
     return found
 
@@ -286,7 +287,7 @@ def _moved_layouts(source: Source, grid: Grid, layout: Layout, own: Cameras) -> 
 # Cameras that are off
 
 
-def _move_cameras(source: Source, grid: Grid) -> tuple[Fit, Recovery] | None:
+def _move_cameras(source: Source, grid: Grid) -> Recovery | None:
     """Fit rows of every pixel by slightly moved cameras; None if that does not fit.
 
     Also None if the colours of the photos disagree: views in the wrong order look the same.
@@ -296,8 +297,8 @@ def _move_cameras(source: Source, grid: Grid) -> tuple[Fit, Recovery] | None:
     inputs = source.inputs(grid)
     layouts = [each for layout in _layouts(source, grid) for each in layout.with_views_in(source.orders(grid))]
     readings = [score_layout(inputs, layout, IDENTITY) for layout in layouts]
-    best = min(readings, key=lambda reading: reading.worst_px, default=None)
-    if best is None or not NEAR_PX < best.worst_px <= max_pixels(*grid.size):
+    best = min(readings, key=lambda reading: reading.alignment.worst_px, default=None)
+    if best is None or not NEAR_PX < best.alignment.worst_px <= max_pixels(*grid.size):
         return None
     pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
     path = str(source.camera_file.path)
@@ -307,8 +308,8 @@ def _move_cameras(source: Source, grid: Grid) -> tuple[Fit, Recovery] | None:
     given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
     grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
     fit = Fit(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
-    found = judge([fit], source.inputs, lambda each: each) if fit.reading.ok else None
-    return None if found is None or found[1].confirmed is False else found
+    found = judge([fit], source.inputs, lambda each: each) if fit.reading.alignment.ok else None
+    return None if found is None or found.confirmed is False else found
 
 
 # Rows without pixels, and results
@@ -362,7 +363,7 @@ def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> Alignmen
     for ((_, layout),) in _follow_cameras(source, [moved]):
         found = judge([Fit(grid, score_layout(inputs, layout, frame))], source.inputs, lambda fit: fit)
         if found is not None:
-            return _make_result(source, *found)
+            return _make_result(source, found)
     return AlignmentResult(
         None,
         moved.cameras,
@@ -374,9 +375,10 @@ def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> Alignmen
     )
 
 
-def _make_result(source: Source, fit: Fit, recovery: Recovery) -> AlignmentResult:
+def _make_result(source: Source, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
-    inputs, grid, best = source.inputs(fit.grid), fit.grid, recovery.best
+    grid, best = recovery.fit.grid, recovery.best
+    inputs = source.inputs(grid)
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
     frame, layout, count = best.frame, best.layout, len(grid.cameras)
     notes, usual = [*grid.notes], source.camera_file

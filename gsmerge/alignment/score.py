@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.alignment.layouts import Layout, plain_layout, subsample
-from gsmerge.geometry import Similarity, median, sh0_to_rgb
+from gsmerge.geometry import Similarity, lower_median, median, sh0_to_rgb
 from gsmerge.kernels import reproject
 from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians
@@ -81,14 +81,35 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout) -
 
 
 @dataclass(frozen=True)
+class Alignment:
+    """How near Gaussians project to their pixels, in each view, or in each part of the rows."""
+
+    # median distance from the pixel centre, pixels; inf where most are behind the camera, NaN where a view has no
+    # finite Gaussian
+    median_px: tuple[float, ...]
+    share_in_front: float  # share of all checked Gaussians with positive depth in their own view
+    share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
+    limit_px: float  # largest median that counts as aligned
+    ok: bool  # whether every view's median is below the limit and most Gaussians are in front
+
+    @property
+    def middle_px(self) -> float:
+        """Median of the views' median distances, pixels."""
+        return float(lower_median(np.array([m for m in self.median_px if not math.isnan(m)] or [math.inf])))
+
+    @property
+    def worst_px(self) -> float:
+        """Largest of the views' median distances, pixels."""
+        return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
+
+
+@dataclass(frozen=True)
 class Reading:
     """One assumption about which pixel each row belongs to, and how well it fits."""
 
     layout: Layout  # which row belongs to which pixel
     frame: Similarity  # from the frame of the cameras to that of the Gaussians
-    median_px: float  # median distance of the projected Gaussians from their pixels; inf where most are behind
-    worst_px: float  # the same of the worst view
-    ok: bool  # whether it is near enough to be true
+    alignment: Alignment  # how near the Gaussians of each part project to their pixels
     effort: int = 0  # 0: the frame is a usual one; 1: its scale or shift was solved for; 2: its rotation as well
 
     @property
@@ -123,11 +144,7 @@ def score_layout(
     """Score how well a layout fits in a frame, on a sample of its rows or on the given ``pairs``."""
     if pairs is None:
         pairs = inputs.pairs(sample_layout(layout))
-    errors = pixel_errors(pairs, frame.move(inputs.cameras))
-    medians = [median(part) for part in pairs.split(errors, len(layout.views)) if len(part)]
-    middle, worst = median(errors) if len(errors) else math.inf, max(medians, default=math.inf)
-    ok = bool(medians) and worst < pixel_limit(layout.width, layout.height) and bool(np.isfinite(errors).mean() > 0.5)
-    return Reading(layout, frame, middle, worst, ok)
+    return Reading(layout, frame, check_pairs(pairs, frame.move(inputs.cameras), len(layout.views)))
 
 
 def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]:
@@ -140,7 +157,7 @@ def score_shuffled(inputs: AlignmentInput, best: Reading) -> tuple[float, float]
 
 def beats_shuffled(reading: Reading, shuffled_px: float) -> bool:
     """Return whether a reading is near enough to its pixels, and far nearer than to shuffled pixels."""
-    return reading.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.worst_px, AS_NEAR_PX)
+    return reading.alignment.ok and shuffled_px >= SHUFFLED_MARGIN * max(reading.alignment.worst_px, AS_NEAR_PX)
 
 
 def color_error(inputs: AlignmentInput, layout: Layout) -> float:
@@ -170,24 +187,6 @@ def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.nda
     return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """Distances between the pixels of each view and the projections of their Gaussians."""
-
-    # median distance from the pixel centre per view, pixels; inf where most are behind the camera, NaN where a view has
-    # no finite Gaussian
-    median_px: tuple[float, ...]
-    share_in_front: float  # share of all checked Gaussians with positive depth in their own view
-    share_within_1px: float  # share of all checked Gaussians at most one pixel from their pixel's centre
-    limit_px: float  # largest median that counts as aligned
-    ok: bool  # whether every view's median is below the limit and most Gaussians are in front
-
-    @property
-    def worst_px(self) -> float:
-        """Largest of the views' median distances, pixels."""
-        return max((m for m in self.median_px if not math.isnan(m)), default=math.nan)
-
-
 def check_alignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> Alignment:
     """Measure how far a sample of Gaussians in every view projects from their own pixels.
 
@@ -207,13 +206,13 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
     return find_correspondences(gaussians.means, valid.reshape(-1), subsample(layout, MAX_CHECKED))
 
 
-def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
-    """Measure a sample with other cameras, as :func:`check_alignment` does."""
+def check_pairs(pairs: Correspondences, cameras: Cameras, num_parts: int | None = None) -> Alignment:
+    """Measure how near a sample projects to its pixels, in each of ``num_parts`` parts of the rows; None: each view."""
     limit = pixel_limit(cameras.width, cameras.height)
     errors = pixel_errors(pairs, cameras)
     medians = tuple(
         float(np.quantile(part, 0.5, method="lower")) if len(part) else math.nan
-        for part in pairs.split(errors, len(cameras))
+        for part in pairs.split(errors, len(cameras) if num_parts is None else num_parts)
     )
     count = max(1, len(errors))
     in_front, near = float(np.isfinite(errors).sum()) / count, float((errors <= 1).sum()) / count
