@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsmerge.evidence.places import SIDE, find_places
-from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, find_contrast, fisher_z, measure_noise
+from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
 from gsmerge.evidence.shown import Shown
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
@@ -70,8 +70,8 @@ class Assigner:
     def __init__(self, show: Callable[[int], Shown], candidates: Candidates) -> None:
         small = show(SIZES[-1])
         self.candidates, self._show = candidates, show
-        self.judged = np.array([_shows_much(*pair) for pair in zip(small.pictures, small.weights, strict=True)])
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
+        self.judged = self._comparer.measure_contrast() > FLAT
 
     @cached_property
     def shown(self) -> Shown:
@@ -250,10 +250,3 @@ def _match(scores: np.ndarray) -> np.ndarray:
     rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, FAR))
     out[rows] = columns
     return out
-
-
-def _shows_much(picture: np.ndarray, weight: np.ndarray) -> bool:
-    """Return whether a picture ``[h,w,3]`` has structure where ``weight [h,w]`` shows anything."""
-    contrast = find_contrast(picture, weight)
-    squares = (contrast * contrast).mean(-1) * weight
-    return bool(squares.sum() > FLAT**2 * max(float(weight.sum()), 1.0))

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmerge.evidence.shown import LEAST, Shown
+from gsmerge.evidence.shown import LEAST, Shown, fit_size
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import TURNS, blur, turn_back
@@ -22,6 +22,7 @@ from gsmerge.raster.photos import shrink_pictures
 
 SIZES = (24, 64)  # pixels of the longer side at which pictures are compared
 AROUND = 6  # part of a side that is the standard deviation of the mean that contrast is taken from
+REACH = 2  # standard deviations of it that the mean reaches to each side
 MARGIN = 5.0  # standard deviations of noise that evidence stands above it
 NORMAL = 1.4826  # standard deviations of a normal distribution that its median absolute deviation is
 CLOSEST = 0.999  # correlation beyond which pictures are equally alike
@@ -39,7 +40,8 @@ def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: i
     ``weight [h,w]``: how much pixels count; None: all alike.
     """
     weight = np.ones(picture.shape[:2], np.float32) if weight is None else weight
-    sums = blur(np.dstack([picture * weight[..., None], weight]), (side or max(picture.shape[:2])) / AROUND)
+    sigma = (side or max(picture.shape[:2])) / AROUND
+    sums = blur(np.dstack([picture * weight[..., None], weight]), sigma, round(REACH * 2 * sigma) | 1)
     return np.asarray(picture - sums[..., :3] / np.maximum(sums[..., 3:], np.float32(LEAST)))
 
 
@@ -51,6 +53,7 @@ class _Filters:
     turns: tuple[int, ...]  # of such photos
     products: np.ndarray  # [v·t,h·w·3] weight times contrast, of length 1
     weights: np.ndarray  # [v·t,h·w]
+    lengths: np.ndarray  # [v] of the products before
 
 
 class Comparer:
@@ -72,6 +75,11 @@ class Comparer:
     def _lying(self) -> list[_Filters]:
         return [_make_filters(each, (1, 3)) for each in self._small]
 
+    def measure_contrast(self) -> np.ndarray:
+        """Return the root mean square contrast ``[v]`` of what each view shows, where it shows anything."""
+        weight = self._small[-1].weights.sum((1, 2), dtype=np.float64)
+        return np.asarray(self._upright[-1].lengths / np.sqrt(3 * np.maximum(weight, 1.0)))
+
     def correlate(self, photo: np.ndarray) -> np.ndarray:
         """Return the mean correlation ``[v,8]`` over the sizes of a stored photo in each turn; NaN for impossible ones.
 
@@ -81,8 +89,9 @@ class Comparer:
         portrait, square = photo.shape[0] > photo.shape[1], photo.shape[0] == photo.shape[1]
         upright = self._square or square or portrait == self._portrait
         lying = self._square or square or portrait != self._portrait
+        small = shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SIZES[-1]))[0]
         for filters in ([self._upright] if upright else []) + ([self._lying] if lying else []):
-            scores = np.mean([_correlate(photo, each) for each in filters], 0)
+            scores = np.mean([_correlate(small, each) for each in filters], 0)
             out[:, list(filters[0].turns)] = scores.reshape(self.views, -1)
         out[self._empty] = np.nan
         return out
@@ -91,15 +100,16 @@ class Comparer:
 def _make_filters(small: Shown, quarters: Sequence[int]) -> _Filters:
     """Turn pictures back as photos may be stored that show them, by some ``quarters`` and mirrored."""
     turns = tuple(turn + mirrored for mirrored in (0, TURNS // 2) for turn in quarters)
-    products, weights = [], []
+    products, weights, lengths = [], [], []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
         heavy = find_contrast(picture, weight) * weight[..., None]
         size = float(np.sqrt((heavy * heavy / np.maximum(weight, LEAST)[..., None]).sum(dtype=np.float64)))
         heavy = heavy / max(size, 1e-9)
+        lengths.append(size)
         products += [turn_back(heavy, turn).reshape(-1) for turn in turns]
         weights += [turn_back(weight, turn).reshape(-1) for turn in turns]
     height, width = turn_back(small.weights[0], turns[0]).shape
-    return _Filters((width, height), turns, np.stack(products), np.stack(weights))
+    return _Filters((width, height), turns, np.stack(products), np.stack(weights), np.array(lengths))
 
 
 def _correlate(photo: np.ndarray, filters: _Filters) -> np.ndarray:

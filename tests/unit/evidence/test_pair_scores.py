@@ -17,19 +17,19 @@ from gsmerge.evidence.scores import (
     signed_ranks,
     stands_out,
 )
-from gsmerge.evidence.shown import Shown, average
+from gsmerge.evidence.shown import Shown, average, fit_size
 from gsmerge.kernels.pictures import TURNS, turn_back, turn_picture
 from gsmerge.raster.photos import shrink_pictures
 
 
 def correlate_slowly(shown: Shown, view: int, upright: np.ndarray) -> float:
     """Weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
-    out = []
+    out, most = [], fit_size(upright.shape[1::-1], SIZES[-1])
     for side in SIZES:
         small = shown.shrink(side)
         picture, weight = small.pictures[view], small.weights[view]
         height, width = weight.shape
-        near = find_contrast(shrink_pictures(upright[None], width, height)[0])
+        near = find_contrast(shrink_pictures(shrink_pictures(upright[None], *most), width, height)[0])
         own = find_contrast(picture, weight)
         sums = np.zeros(3)
         for y in range(height):
