@@ -60,6 +60,10 @@ class Pairs:
         small = self.shown.shrink(side)
         return Pairs(average(self.photos, self.shown.weights, small.weights), small)
 
+    def exchange(self) -> Pairs:
+        """Return pairs in which photos and pictures stand for each other."""
+        return Pairs(self.shown.pictures, replace(self.shown, pictures=self.photos))
+
     def with_photos(self, photos: np.ndarray) -> Pairs:
         """Return a copy with other photos."""
         return replace(self, photos=photos)

@@ -147,21 +147,28 @@ def find_shown(scene: PicturedScene, views: Sequence[int], photos: Sequence[np.n
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], photos: Sequence[np.ndarray]) -> bool:
-    """Return whether a linear map of colours explains the Gaussians by their photos where tones do not.
+    """Return whether a linear map of colours explains the Gaussians by their photos, or these by them: tones do not.
 
-    Photos of another scene are explained no better than by one colour, or do not show their views even so.
+    Grey photos show no colours, but follow from them. Photos of another scene are explained no better than by one
+    colour, or do not show their views even so.
     """
     part = pairs[views]
-    stored = cut_blocks(part)
+    if _is_mapped(part):
+        blocks = cut_blocks(part)
+        solid = blocks.solid
+        matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
+        return bool(find_shown(scene, views, [map_colors(matrix, photo).clip(0, 1) for photo in photos]))
+    return _is_mapped(part.exchange()) and bool(find_shown(scene, views, photos))
+
+
+def _is_mapped(pairs: Pairs) -> bool:
+    """Return whether a linear map of the photos' colours comes nearer to the pictures than tones and one colour."""
+    stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned, mapped = tone_blocks(part, _group(part, range(len(views)))), map_blocks(stored)
+    toned, mapped = tone_blocks(pairs, _group(pairs, range(len(pairs)))), map_blocks(stored)
     others = toned, plain_blocks(stored)
-    if not (is_visible(toned.errors()) and all(explains(other.errors(), mapped.errors()) for other in others)):
-        return False
-    solid = stored.solid
-    matrix = fit_map(stored.photos[solid], stored.pictures[solid], np.ones(solid.sum()))
-    return bool(find_shown(scene, views, [map_colors(matrix, photo).clip(0, 1) for photo in photos]))
+    return is_visible(toned.errors()) and all(explains(other.errors(), mapped.errors()) for other in others)
 
 
 def _leave_out(scene: PicturedScene, odd: Sequence[int], given: Sequence[int]) -> bool:

@@ -104,7 +104,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
 def _add_holes(scene: PicturedScene, holes: np.ndarray, parts: Mapping[int, Gaussians]) -> PicturedScene:
     """Add the Gaussians ``parts`` of each view's ``holes [v,h,w]`` to a scene, with a note."""
     added = Gaussians.concat([parts[view] for view in sorted(parts)])
-    note(f"{len(added):,} pixels that no Gaussian covers are filled with the colours of their pictures")
+    note(f"{len(added):,} pixels that Gaussians hardly cover, or not at all, get the colours of their pictures")
     if not scene.aligned:
         return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]))
     holes[[view for view in range(len(scene)) if view not in parts]] = False

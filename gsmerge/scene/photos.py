@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ from gsmerge.types import Scene
 _READ_IMAGES = LazyFunction("gsmerge.io.formats.depth_maps", "read_images")
 _MODEL_FOLDERS = ("0", "sparse", "colmap")  # of COLMAP, in a scene's folder; a model may also lie in that itself
 UNNAMED = "view 0"  # name of the first camera where a format, or rows alone, have no names
+_REDUCED = "images_*"  # folders of smaller copies, as programs name them by how many times smaller they are
 SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw; into "images" it squeezes tall photos
 
 
@@ -83,7 +85,7 @@ class Proposal:
     pool: tuple[Path, ...]
     named: tuple[int | None, ...]  # of each camera: a file of the pool, None where names propose none
     exact: bool  # whether names, and not their order, propose them
-    lacking: tuple[str, ...] = ()  # why a camera has no file, for people
+    faults: tuple[str | None, ...] = ()  # of each camera: which file cannot be read, and why; None for none
 
     @property
     def choice(self) -> list[Assignment | None]:
@@ -116,6 +118,9 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         named = [find_image(folder, name) for name in names]
         pool = list(dict.fromkeys(path for path in named if path is not None))
         nameless = all(name.removeprefix("view ").isdecimal() for name in names)
+        if not pool:
+            pool, named = _find_reduced(folder, names)
+            named = named or [None] * len(names)
         if not pool and nameless:
             folder, pool = files.ply.parent, images_beside(files.ply)  # AnySplat writes its Gaussians among the photos
     exact = any(named) and camera_file.source != ESTIMATED
@@ -123,8 +128,35 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
         named = list(pool)
     if not pool:
         return None
-    lacking = [f"{name}: no such file" for name, path in zip(names, named, strict=True) if exact and path is None]
-    return _keep_sound(Proposal(folder, tuple(pool), (), exact, tuple(lacking)), named)
+    faults = tuple(
+        _describe_missing(folder, name) if exact and path is None else None
+        for name, path in zip(names, named, strict=True)
+    )
+    return _keep_sound(Proposal(folder, tuple(pool), (), exact, faults), named)
+
+
+def _find_reduced(folder: Path, names: Sequence[str]) -> tuple[list[Path], list[Path | None]]:
+    """Find photos in the folders of smaller copies, ``images_2`` and so on: those of the first that has any."""
+    reduced = [place for place in folder.glob(_REDUCED) if place.name.rpartition("_")[2].isdecimal() and place.is_dir()]
+    for place in sorted(reduced, key=lambda place: natural_key(place.name)):
+        pool = list_images(place)
+        named = propose_images(place, pool, names, _count_pixels)
+        if any(named):
+            return pool, named
+    return [], []
+
+
+def _describe_missing(folder: Path, name: str) -> str:
+    """Say that a file does not exist, and which one of its name is in no format that is read."""
+    inner, others = PurePath(name), set[str]()
+    for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
+        with suppress(OSError, ValueError):
+            others |= {each for each in os.listdir(place) if PurePath(each).stem == inner.stem}
+    others = {each for each in others if PurePath(each).suffix.lower() not in IMAGE_SUFFIXES}
+    shown = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner
+    if not others:
+        return f"{shown}: no such file"
+    return f"{shown}: no such file, and {min(others)} is in no format that is read; convert it to .jpg or .png"
 
 
 def _keep_sound(proposal: Proposal, named: Sequence[Path | None], *, decode: bool = False) -> Proposal:
@@ -132,11 +164,14 @@ def _keep_sound(proposal: Proposal, named: Sequence[Path | None], *, decode: boo
     paths = list(dict.fromkeys(path for path in named if path is not None))
     faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
     broken = {path: fault for path, fault in zip(paths, faults, strict=True) if fault is not None}
-    lacking = (*proposal.lacking, *(f"{path.name}: {fault}" for path, fault in broken.items()))
+    of_cameras = tuple(
+        f"{_inside(path, proposal)}: {broken[path]}" if path in broken and path is not None else before
+        for path, before in zip(named, proposal.faults or [None] * len(named), strict=True)
+    )
     pool = tuple(path for path in proposal.pool if path not in broken)
     ids = {path: number for number, path in enumerate(pool)}
     places = tuple(None if path is None else ids.get(path) for path in named)
-    return replace(proposal, pool=pool, named=places, lacking=lacking)
+    return replace(proposal, pool=pool, named=places, faults=of_cameras)
 
 
 def _count_pixels(path: Path) -> int:
@@ -179,7 +214,7 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
         if files.images is None:
             return ()
         view = proposal.named.index(None)
-        reason = next(iter(proposal.lacking), f"{camera_file.names[view]}: no such file")
+        reason = proposal.faults[view] or f"{camera_file.names[view]}: no such file"
         raise SceneError(proposal.folder, f"expected a photo for each of {len(camera_file)} cameras, found {reason}")
     return decode_images([proposal.pool[photo] for photo in proposal.named if photo is not None])
 
@@ -331,28 +366,51 @@ def describe_assignment(
 ) -> tuple[list[str], list[str]]:
     """Describe how photos were assigned otherwise than their names propose: notes, and those on what is not used."""
     count, notes = len(chosen), list[str]()
-    turned = [_inside(proposal.pool[each.photo], proposal) for each in chosen if each is not None and each.turn]
+    tags = _Tags(proposal.pool)
+    turned = [
+        _inside(proposal.pool[each.photo], proposal)
+        for each in chosen
+        if each is not None and each.turn != tags[each.photo]
+    ]
     if turned:
-        notes.append(f"{len(turned)} of {count} photos are turned as their views show them: {list_some(turned)}")
+        what = "lie otherwise in their views than their files say: they were turned"
+        notes.append(f"{len(turned)} of {count} photos {what}: {list_some(turned)}")
     moved = [
         f"{camera_file.names[view]}: {_inside(proposal.pool[each.photo], proposal)}"
         for view, each in enumerate(chosen)
         if each is not None and each.photo != proposal.named[view]
     ]
-    if moved and proposal.exact:
-        notes.append(f"photos are matched with views by what they show, not by names: {list_some(moved)}")
-    elif moved:
-        notes.append("photos are matched with views by what they show, not by their order")
+    if moved:
+        names = "names" if proposal.exact else "their order"
+        notes.append(f"photos are matched with views by what they show, not by {names}: {list_some(moved)}")
+    notes += _describe_spare(proposal, chosen)
     without = [view for view, each in enumerate(chosen) if each is None]
     if not without:
         return notes, []
-    strange = [
-        f"{_inside(proposal.pool[photo], proposal)}: shows something else"
-        for view in without
-        if (photo := proposal.named[view]) is not None
-    ]
-    reasons = [*proposal.lacking, *strange] or [f"{camera_file.names[view]}: none shows it" for view in without]
+    reasons = [_explain(proposal, view, camera_file.names[view]) for view in without]
     return notes, [f"photos of {len(without)} of {count} views are left out: {list_some(reasons, '; ')}"]
+
+
+def _explain(proposal: Proposal, view: int, name: str) -> str:
+    """Say why a camera has no photo."""
+    fault = proposal.faults[view]
+    if fault is not None:
+        return fault
+    photo = proposal.named[view]
+    if photo is None:
+        return f"{name}: none shows it"
+    return f"{_inside(proposal.pool[photo], proposal)}: shows something else"
+
+
+def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> list[str]:
+    """Note photos beside those that are used that have no camera, where most have one."""
+    used = [proposal.pool[each.photo] for each in chosen if each is not None]
+    folders, stems = {path.parent for path in used}, {path.stem for path in used}
+    spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
+    if not proposal.exact or not 0 < len(spare) < len(used):
+        return []
+    which = list_some([_inside(path, proposal) for path in spare])
+    return [f"{len(spare)} of {len(spare) + len(used)} photos have no camera and are not used: {which}"]
 
 
 def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
@@ -365,7 +423,8 @@ def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
 def refuse_photos(proposal: Proposal, camera_file: CameraFile) -> tuple[str, str]:
     """Say that none of the photos shows any view, and what to do."""
     what = f"photos of the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
-    reasons = f" ({list_some(proposal.lacking, '; ')})" if proposal.lacking else ""
+    faults = [fault for fault in proposal.faults if fault is not None]
+    reasons = f" ({list_some(faults, '; ')})" if faults else ""
     return f"expected {what}, found none that shows any of them{reasons}", "name the folder of the photos with --images"
 
 

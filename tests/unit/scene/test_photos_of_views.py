@@ -85,7 +85,7 @@ def test_photos_that_lie_on_their_side(folder: Path, truth: np.ndarray, tagged: 
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
     loaded = load_scene(folder)
     assert right_ones(loaded, truth) == [True] * VIEWS
-    assert any(names(text, "3 of 4 photos are turned as their views show them") for text in loaded.notes)
+    assert any("they were turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
 
 
 def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> None:
@@ -94,7 +94,36 @@ def test_tags_of_photos_that_are_upright(folder: Path, truth: np.ndarray) -> Non
     exif[0x0112] = 6
     for path in photos_in(folder):
         Image.open(path).convert("RGB").save(path, exif=exif)
-    assert right_ones(load_scene(folder), truth) == [True] * VIEWS
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert any("4 of 4 photos lie otherwise" in text for text in loaded.notes)
+
+
+def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> None:
+    """As where a program could not place it; of a film whose frames mostly have none, nothing is said."""
+    spare = photos_in(folder)[0]
+    spare.with_name("spare.png").write_bytes(spare.read_bytes())
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert any(names(text, "1 of 5 photos have no camera", "spare.png") for text in loaded.notes)
+    for number in range(VIEWS):
+        spare.with_name(f"frame {number}.png").write_bytes(spare.read_bytes())
+    assert not any("no camera" in text for text in load_scene(folder).notes)
+
+
+def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
+    path = photos_in(folder)[1]
+    path.rename(path.with_suffix(".HEIC"))
+    left_out = load_scene(folder).left_out
+    assert left_out is not None
+    assert names(left_out, path.name, path.with_suffix(".HEIC").name, "convert")
+
+
+def test_smaller_copies_alone(folder: Path, truth: np.ndarray) -> None:
+    (folder / "images").rename(folder / "images_4")
+    loaded = load_scene(folder)
+    assert right_ones(loaded, truth) == [True] * VIEWS
+    assert absent(loaded) == []
 
 
 def cut(path: Path) -> None:
