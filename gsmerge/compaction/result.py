@@ -227,10 +227,13 @@ def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: P
 
 
 def measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
-    """Score Gaussians of the world on photos as their files have them; None where none of these was changed."""
-    if prepared.reference.photo_files is None:
+    """Score Gaussians of the world on photos as their files have them; None where no scored one was changed."""
+    shown, files = prepared.result_views(), prepared.reference.photo_files
+    if files is None or shown.images is None:
         return None
-    views = replace(prepared.result_views(), images=prepared.reference.photo_files)
+    if all(np.array_equal(shown.images[view], files[view]) for view in plan.scored_views):
+        return None
+    views = replace(shown, images=files)
     return _score_photos("score", gaussians, views, prepared, plan, None).psnr
 
 

@@ -410,7 +410,7 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None]) -> 
     if not proposal.exact or not 0 < len(spare) < len(used):
         return []
     which = list_some([_inside(path, proposal) for path in spare])
-    return [f"{len(spare)} of {len(spare) + len(used)} photos have no camera and are not used: {which}"]
+    return [f"photos without a camera are not used, {len(spare)} of {len(spare) + len(used)}: {which}"]
 
 
 def describe_unused(proposal: Proposal, camera_file: CameraFile) -> str:
