@@ -228,10 +228,11 @@ def measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: P
 
 def measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
     """Score Gaussians of the world on photos as their files have them; None where no scored one was changed."""
-    shown, files = prepared.result_views(), prepared.reference.photo_files
-    if files is None or shown.images is None:
+    files = prepared.reference.photo_files
+    if files is None:
         return None
-    if all(np.array_equal(shown.images[view], files[view]) for view in plan.scored_views):
+    shown = prepared.result_views()
+    if shown.images is None or all(np.array_equal(shown.images[view], files[view]) for view in plan.scored_views):
         return None
     views = replace(shown, images=files)
     return _score_photos("score", gaussians, views, prepared, plan, None).psnr
