@@ -13,11 +13,14 @@ LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians tha
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
     """Return the number of Gaussians that a budget or a file size asks for; None without either."""
+    if options.budget in DEVICES and options.most is not None:
+        return min(DEVICES[str(options.budget)], options.most)
     if options.budget in (None, AUTO, *DEVICES):
         return None
+    most = num_input if options.most is None else options.most
     if size := file_size(options):
-        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), num_input)
-    return parse_budget(str(options.budget), num_input)
+        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), most)
+    return min(parse_budget(str(options.budget), num_input), most)
 
 
 @dataclass(frozen=True)
@@ -45,5 +48,5 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians that budget, file size or device allow, at most that of the input."""
-    limit = DEVICES.get(str(options.budget), exact_count(options, num_input, sh_degree))
-    return num_input if limit is None else min(limit, num_input)
+    limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
+    return min([num_input, *(limit for limit in limits if limit is not None)])

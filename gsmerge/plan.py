@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.budget import FileSize, exact_count, file_size
+from gsmerge.budget import FileSize, exact_count, file_size, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import Agreement
 from gsmerge.facts.partition import usual_blocks
@@ -155,7 +155,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
             load_checkpoint(options.checkpoint)
         agreement = prepared.agreement
-        asked, options = options, resolve_budget(options, agreement)
+        asked, options = options, resolve_budget(size, options, agreement)
         segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])
         clean_options = options.clean
         if "sky" in clean_options.drops and reference.name == RENDERS:
@@ -395,13 +395,24 @@ def require_children(name: str, count: int, checkpoint: Checkpoint | None) -> No
         )
 
 
-def resolve_budget(options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
-    """Replace an automatic budget of a fit by a share, by how far views confirm each other's depth; with a note."""
-    if agreement is None or not options.budget.auto or options.fit.fit == "none":
+def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
+    """Fill in how many Gaussians a fit of the scene bears, by how far views confirm each other's depth; with a note.
+
+    That is an automatic budget, and the most that is taken of a share, a size or a device.
+    """
+    budget = options.budget
+    is_limit = budget.is_limit and options.method == OURS
+    if agreement is None or options.fit.fit == "none" or not (budget.auto or is_limit):
         return options
     text, why = describe_share(agreement)
-    note(f"budget: {text} of the input, because {why}")
-    return replace(options, budget=replace(options.budget, budget=text))
+    if budget.auto:
+        note(f"budget: {text} of the input, because {why}")
+        return replace(options, budget=replace(budget, budget=text))
+    most = max(size.num_views, int(agreement.share * size.num_gaussians))
+    if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
+        taken = f"{most:,} Gaussians are taken of {budget.budget}, {text} of the input"
+        note(f"budget: {taken}: more would not show new views better, because {why}; --set fill=true takes all")
+    return replace(options, budget=replace(budget, most=most))
 
 
 def describe_share(agreement: Agreement | None) -> tuple[str, str]:

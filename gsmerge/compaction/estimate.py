@@ -66,8 +66,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         machine has enough.
     """
     size = measure_size(scene)
-    if options.budget.auto and scene.aligned:
-        options = resolve_budget(options, confirm_depths(canonicalise(scene)[0]))
+    if (options.budget.auto or options.budget.is_limit) and scene.aligned:
+        options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
     choices = choose_for_scene(size, options)
     limits, settings = choices.limits, choices.settings(options)
     pixels = max(limits.num_pixels, scene.num_gaussians)

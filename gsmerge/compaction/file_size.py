@@ -35,7 +35,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     most, file = plan.size.num_bytes, plan.size.file
     for _ in range(MAX_REBUILDS):
         size, count = measure_bytes(candidate.gaussians, file), len(candidate.gaussians)
-        room = min(int(SURPLUS * count * most / size), prepared.input_scene.num_gaussians)
+        room = min(int(SURPLUS * count * most / size), plan.limits.most)
         if room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count):
             break
         candidate = rebuild(room)

@@ -22,11 +22,15 @@ DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "desktop": 3_000_000}
 class BudgetOptions(Settings):
     """Settings that decide the number of Gaussians, next to superpixels per view and K."""
 
-    budget: int | str | None = setting(None, "Gaussians in the result: a number, a share such as 2% of the input, or a "
-        "size such as 5MB, met exactly; quest3, mobile or desktop: at most what it draws fluidly; auto: as many as the "
+    budget: int | str | None = setting(None, "Gaussians in the result: a number, met exactly; at most a share such as "
+        "2% of the input, a size such as 5MB, or what quest3, mobile or desktop draw fluidly; auto: as many as the "
         "scene needs.",
-        "A size is that of the output's file, a `.ply` in Python, and never exceeded.",
+        "A size is that of the output's file, a `.ply` in Python, and never exceeded. Of a share, a size or a device "
+        "no more is taken than new views gain from, unless `fill` is true.",
         metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
+    fill: bool = setting(False, "Fill a share, a size or a device, though new views gain nothing by it.")
+    most: int | None = setting(None, "Gaussians from which on new views gain nothing, where that is known.",
+        internal=True)  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "
         "lose at most so much against the best, such as -0.2dB.",
         "The best is what the scene's own curve reaches. Where rows belong to no pixels and no number is asked for, "
@@ -55,6 +59,12 @@ class BudgetOptions(Settings):
     def auto(self) -> bool:
         """Whether the scene decides the count."""
         return self.budget == AUTO
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether the budget is a share, a size or a device, of which no more is taken than new views gain from."""
+        word = str(self.budget)
+        return not self.fill and (self.in_bytes or word in DEVICES or word.strip().endswith("%"))
 
     @property
     def in_bytes(self) -> bool:

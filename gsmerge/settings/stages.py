@@ -55,7 +55,7 @@ class SegmentOptions(Settings):
     """Settings of cutting views into superpixels."""
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
-        "auto: 1.5 to 10 %, the more the better the depths of the views agree.",
+        "auto: 4.4 to 7 %, the more the better the depths of the views agree.",
         "A share is where `bass-adaptive` starts from.", metavar="NUMBER|SHARE|auto")  # fmt: skip
     segmentation: str = setting("rdseg", "How superpixels are cut; `gsmerge.stages.superpixels` describes the methods.",
         choices=SEGMENTATIONS)  # fmt: skip

@@ -105,6 +105,7 @@ class CountLimits:
     exact: int | None  # Gaussians that a budget or a size asks for; None without either
     num_pixels: int  # Of all views
     num_input: int  # Gaussians that the count is one of
+    most: int  # Most Gaussians of those that the scene bears, where that is known
 
     @property
     def count(self) -> int | None:
@@ -150,6 +151,7 @@ def count_limits(
         exact=exact,
         num_pixels=views * scene.pixels_per_view,
         num_input=count,
+        most=count if budget.most is None else min(count, budget.most),
     )
 
 

@@ -52,6 +52,27 @@ def test_the_finest_level_is_the_result_without_levels(scene: Scene) -> None:
     assert alone.coarser == ()
 
 
+def test_sizes_and_shares_are_limits(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """No more Gaussians are taken than new views gain from, unless all are asked for; a number is met exactly."""
+    out, quick = tmp_path / "limited.ply", ("--set", "fit_steps=8", "--overwrite", "--json")
+
+    def compacted(*words: object) -> tuple[int, list[str]]:
+        document = json.loads(run("compact", small_scene, "-o", out, *words, *quick, code=0).out)
+        return document["output"]["num_gaussians"], [note for note in document["notes"] if "new views better" in note]
+
+    auto, said = compacted("--budget", "auto")
+    assert said == []
+    for limit in ("40%", "1MB", "quest3"):
+        count, said = compacted("--budget", limit)
+        assert count == auto
+        assert len(said) == 1
+        assert limit in said[0]
+    total = len(read_ply(small_scene / "scene.ply").gaussians)
+    assert compacted("--budget", "40%", "--set", "fill=true") == (int(0.4 * total), [])
+    assert compacted("--budget", auto + 200) == (auto + 200, [])
+    assert compacted("--budget", "2%") == (int(0.02 * total), [])
+
+
 def test_a_psnr_is_met_with_few(scene: Scene) -> None:
     usual = compact(scene, fit_steps=20)
     expected = usual.report.psnr_after - 1

@@ -17,9 +17,11 @@ from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.result import score
 from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
+from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
+from gsmerge.frame import canonicalise
 from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.plan import (
     EFFORTS,
@@ -29,6 +31,7 @@ from gsmerge.plan import (
     choose_for_scene,
     choose_networks,
     make_plan,
+    resolve_budget,
     resolve_fit,
     steps_for,
 )
@@ -295,10 +298,11 @@ def test_the_estimate_is_what_the_run_does(
 
     monkeypatch.setattr("gsmerge.compaction.compact.make_plan", record_plan)
     options = options_of(**settings)
+    size, agreement = measure_size(scene), confirm_depths(canonicalise(scene)[0])
     run, result, choices = (
         estimate(scene, options),
         compact(scene, options),
-        choose_for_scene(measure_size(scene), options),
+        choose_for_scene(size, resolve_budget(size, options, agreement)),
     )
     assert run["fit_steps"] == choices.fit.steps == result.report.options["fit_steps"]
     assert run["blocks"] == choices.blocks == len(result.report.choices.get("blocks", "1"))

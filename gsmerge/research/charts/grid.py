@@ -105,7 +105,7 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
 
     choice = {} if method in (OURS, INPUT) else {"method": method}
     try:
-        options = CompactOptions().with_settings({**settings, **choice, "seed": seed})
+        options = CompactOptions().with_settings({"fill": True, **settings, **choice, "seed": seed})  # counts as asked
     except ValueError as error:
         raise UsageError(str(error)) from error
     find_method(options)

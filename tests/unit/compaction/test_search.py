@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -70,6 +71,18 @@ def test_limits(settings: dict[str, object], exact: int | None, most: int) -> No
     options = BudgetOptions(**settings)
     assert exact_count(options, 50_000_000, 0) == exact
     assert max_allowed(options, 50_000_000, 0) == most
+
+
+@pytest.mark.parametrize(
+    ("budget", "taken"), [("2%", 20_000), ("40%", 70_000), ("20KB", 287), ("50MB", 70_000), ("quest3", 70_000)]
+)
+def test_no_more_than_new_views_gain_from(budget: str, taken: int) -> None:
+    options = BudgetOptions(budget=budget, most=70_000)
+    assert exact_count(options, 1_000_000, 0) == taken
+    assert max_allowed(options, 1_000_000, 0) == taken
+    assert options.is_limit
+    assert not replace(options, fill=True).is_limit
+    assert not replace(options, budget=90_000).is_limit
 
 
 def test_a_small_scene_is_its_own_limit() -> None:

@@ -184,7 +184,7 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
     )  # whose tree is there
 
     def count(tree: RegionTree, most: int = 1000) -> int:
-        limits = CountLimits(1, 1, min_count=1, max_count=most, exact=None, num_pixels=1, num_input=1000)
+        limits = CountLimits(1, 1, min_count=1, max_count=most, exact=None, num_pixels=1, num_input=1000, most=1000)
         return knee_count(scene, SuperpixelChoices(SegmentOptions(), limits, 1.0, tree))
 
     assert count(wall) == wall.min_regions < 150
