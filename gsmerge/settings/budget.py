@@ -25,10 +25,10 @@ class BudgetOptions(Settings):
     budget: int | str | None = setting(None, "Gaussians in the result: a number, met exactly; at most a share such as "
         "2% of the input, a size such as 5MB, or what quest3, mobile or desktop draw fluidly; auto: as many as the "
         "scene needs.",
-        "A size is that of the output's file, a `.ply` in Python, and never exceeded. Of a share, a size or a device "
-        "no more is taken than new views gain from, unless `fill` is true.",
+        "A size is that of the output's file, a `.ply` in Python, and never exceeded. No more is taken than new views "
+        "gain from, unless `fill` is true.",
         metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
-    fill: bool = setting(False, "Fill a share, a size or a device, though new views gain nothing by it.")
+    fill: bool = setting(False, "Whether shares, sizes and devices are filled.")
     most: int | None = setting(None, "Gaussians from which on new views gain nothing, where that is known.",
         internal=True)  # fmt: skip
     quality: str | None = setting(None, "Fewest Gaussians that render the input photos at a PSNR such as 30dB, or that "

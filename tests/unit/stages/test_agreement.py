@@ -11,7 +11,7 @@ import unaligned_scenes
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.facts.confirm_depths import confirm_depths
+from gsmerge.facts.confirm_depths import FEWEST, MOST, confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.plan import make_plan
 from gsmerge.pooling import scene_members
@@ -63,8 +63,8 @@ def test_views_that_agree_get_more_superpixels(wall: Scene) -> None:
         assert shares[-1] == pytest.approx(agreement.share, rel=0.05)
         assert len(log.notes) == 1
         assert f"other views confirm {100 * agreement.confirmed:.0f} %" in log.notes[0]
-    assert shares[0] == shares[1] == 0.1  # an eighth of the pixels is contradicted, then a quarter
-    assert 0.015 <= shares[2] < 0.1
+    assert shares[0] == shares[1] == MOST  # an eighth of the pixels is contradicted, then a quarter
+    assert FEWEST <= shares[2] < MOST
 
 
 @pytest.mark.slow
