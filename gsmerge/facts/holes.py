@@ -222,8 +222,11 @@ def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -
     """
     if not 1 < len(cameras) <= MOST_VIEWS:
         return fitted
-    cameras, splats = _small_cameras(cameras), prepare(fitted)
+    cameras = _small_cameras(cameras)
     between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
+    if len(between) == 0:  # all look elsewhere
+        return fitted
+    splats = prepare(fitted)
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
     looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
     depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))

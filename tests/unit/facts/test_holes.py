@@ -230,6 +230,15 @@ def test_what_a_camera_between_views_uncovers_is_filled_behind_what_they_see() -
     assert (new[:, 2] > 3).all()
 
 
+def test_views_that_look_elsewhere_have_nothing_between_them() -> None:
+    """Half-way between views turned by a right angle nobody knows what is there."""
+    gaussians, cameras = slit(-0.6, 0.6)
+    turn = np.array([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    apart = replace(cameras, viewmats=np.stack([cameras.viewmats[0], turn @ cameras.viewmats[1]]))
+    before = with_faint(gaussians)
+    assert fill_between(before, apart, None) is before
+
+
 def test_cameras_between_do_not_fill_the_same_twice() -> None:
     gaussians, cameras = slit(-0.6, -0.2, 0.2, 0.6)
     new = fill_between(with_faint(gaussians), cameras, None)[len(gaussians) :]
