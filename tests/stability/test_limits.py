@@ -41,7 +41,7 @@ def test_the_smallest_budget(room: Scene, settings: dict[str, Any]) -> None:
 
 @sweep("settings", [PLAIN, {"fit": "none"}, {"fit_steps": 20}], ids=str)
 def test_a_budget_of_everything(room: Scene, settings: dict[str, Any]) -> None:
-    result = scenes.compacted(room, superpixels="auto", budget="100%", match="none", **settings)
+    result = scenes.compacted(room, superpixels="auto", budget="100%", fill=True, match="none", **settings)
     assert len(result.gaussians) == room.num_gaussians
     assert scenes.psnr_of(result.gaussians, room) > scenes.psnr_of(room.gaussians, room) - 0.1
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Scene, compact
-from gsmerge.compaction.new_views import LEAST_VIEWS, MOST_KEPT, NewViews, Trial, choose_views, shrink_scene
+from gsmerge import Gaussians, Scene, compact, render
+from gsmerge.compaction.new_views import LEAST_VIEWS, MOST_KEPT, NewViews, Trial, _covered, choose_views, shrink_scene
 from gsmerge.facts.confirm_depths import Agreement
+from gsmerge.facts.views import subset
 from gsmerge.geometry import nearest_views
 from gsmerge.io.formats.arrays import copied_comments, new_views_comment, read_new_views
 from gsmerge.types import PicturedScene
@@ -97,6 +99,27 @@ def test_views_left_out_together_are_no_neighbours(aligned: bool) -> None:
     for views in rounds:
         near = {one: nearest_views(scene.cameras.centres, one)[:2].tolist() for one in views}
         assert not [one for one in views for other in views if one in near[other]]
+
+
+def test_what_only_left_out_views_show_does_not_count() -> None:
+    """Rows without pixels do not say which view saw them: the others know nothing of a wall behind them."""
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(4))
+    turn = np.diag([-1.0, 1, -1, 1])
+    wall = scene.gaussians
+    behind = replace(wall, means=(wall.means @ turn[:3, :3]).astype(np.float32))
+    viewmats = scene.cameras.viewmats.copy()
+    viewmats[3] = viewmats[3] @ turn
+    both = replace(
+        scene,
+        gaussians=Gaussians.concat([wall, behind]),
+        cameras=replace(scene.cameras, viewmats=viewmats),
+        pixel_ids=None,
+    )
+    rest = subset(pictured(both), [0, 1])
+    assert _covered(rest, subset(pictured(both), [2])).mean() > 0.9
+    turned = subset(pictured(both), [3])
+    assert render(both.gaussians, turned.cameras).alphas.mean() > 0.9
+    assert _covered(rest, turned).mean() == 0
 
 
 def test_only_views_that_show_the_scene_are_left_out() -> None:
