@@ -89,7 +89,7 @@ def _compact_sizes(
     for share in sorted(shares, key=lambda share: (share != opened, parse_share(share))):
         name = share.replace("%", " %")
         progress(f"compact to {name}", 0, 0)
-        result = compact(pair.load.scene, budget=share)
+        result = compact(pair.load.scene, budget=share, fill=True)
         results[name] = result.gaussians
         if result.report.new_views is not None:
             gains[name] = result.report.new_views.gain
