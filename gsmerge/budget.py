@@ -13,9 +13,10 @@ LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians tha
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
     """Return the number of Gaussians that a budget or a file size asks for; None without either."""
-    if options.budget in DEVICES and options.most is not None:
-        return min(DEVICES[str(options.budget)], options.most)
-    if options.budget in (None, AUTO, *DEVICES):
+    device = DEVICES.get(str(options.budget))
+    if device is not None:  # a limit alone, until it is known how many the scene bears
+        return None if options.most is None else min(device, options.most)
+    if options.budget in (None, AUTO):
         return None
     most = num_input if options.most is None else options.most
     if size := file_size(options):

@@ -19,11 +19,9 @@ from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.facts.views import pick_views, subset
 from gsmerge.geometry import nearest_views
 from gsmerge.kernels.elementary import power
-from gsmerge.kernels.matrices import invert, transform
-from gsmerge.measure.visibility import visible_pixels
+from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pipeline import Build
 from gsmerge.plan import Plan, make_plan
-from gsmerge.raster.images import seen_depths
 from gsmerge.raster.photos import NEAR, scene_photos, score_photos, shrink_pictures
 from gsmerge.runtime.record import add_seconds, record_part
 from gsmerge.settings.budget import parse_share
@@ -185,19 +183,8 @@ def _file_rows(scene: PicturedScene) -> Gaussians:
 
 def _covered(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
     """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
-    points = _file_rows(rest).means.astype(np.float64) if rest.aligned else _seen_points(rest)
+    points = _file_rows(rest).means.astype(np.float64) if rest.aligned else context_points(rest, NEAR)
     return visible_pixels(points, views.cameras, NEAR, rest.cameras)
-
-
-def _seen_points(scene: PicturedScene) -> np.ndarray:
-    """Return the points ``[n,3]`` that the pixels of views show; Gaussians alone say not which view saw them."""
-    cameras, (depths, solid) = scene.cameras, seen_depths(scene)
-    view, y, x = np.nonzero(solid)
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-    rays = transform(invert(cameras.Ks.astype(np.float64))[view], pixels)
-    local = rays * depths[solid][:, None]
-    turns, shifts = cameras.viewmats[view, :3, :3].astype(np.float64), cameras.viewmats[view, :3, 3]
-    return transform(turns.swapaxes(1, 2), local - shifts)
 
 
 def _compact_rest(rest: PicturedScene, prepared: Prepared, plan: Plan, build: Build, share: float) -> Gaussians:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -86,6 +86,11 @@ class Proposal:
     named: tuple[int | None, ...]  # of each camera: a file of the pool, None where names propose none
     exact: bool  # whether names, and not their order, propose them
     faults: tuple[str | None, ...] = ()  # of each camera: which file cannot be read, and why; None for none
+
+    @cached_property
+    def tags(self) -> Sequence[int]:
+        """Turns that the tags of orientation of all files ask for."""
+        return _Tags(self.pool)
 
     @property
     def choice(self) -> list[Assignment | None]:
@@ -261,16 +266,18 @@ def _turned_size(path: Path, turn: int) -> Size:
 
 
 class _Tags(Sequence[int]):
-    """Turns that tags of orientation ask for, read when they are asked for."""
+    """Turns that tags of orientation ask for, read when they are asked for, once."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self._paths = paths
+        self._paths, self._turns = paths, dict[int, int]()
 
     def __len__(self) -> int:
         return len(self._paths)
 
     def __getitem__(self, photo: Any) -> Any:
-        return orientation_turn(self._paths[photo])
+        if photo not in self._turns:
+            self._turns[photo] = orientation_turn(self._paths[photo])
+        return self._turns[photo]
 
 
 def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
@@ -283,7 +290,7 @@ def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
             small = np.zeros((SIDE, SIDE, 3), np.float32)
         return small if fit is None else fit.cut(small)
 
-    return Candidates(read, len(proposal.pool), _Tags(proposal.pool))
+    return Candidates(read, len(proposal.pool), proposal.tags)
 
 
 def assign_to_views(
@@ -366,11 +373,10 @@ def describe_assignment(
 ) -> tuple[list[str], list[str]]:
     """Describe how photos were assigned otherwise than their names propose: notes, and those on what is not used."""
     count, notes = len(chosen), list[str]()
-    tags = _Tags(proposal.pool)
     turned = [
         _inside(proposal.pool[each.photo], proposal)
         for each in chosen
-        if each is not None and each.turn != tags[each.photo]
+        if each is not None and each.turn != proposal.tags[each.photo]
     ]
     if turned:
         what = "lie otherwise in their views than their files say: they were turned"
