@@ -41,7 +41,7 @@ def file_size(options: BudgetOptions) -> FileSize | None:
     """Return the size that a budget in bytes asks for; None for any other, UsageError where no format counts them."""
     if not options.in_bytes:
         return None
-    file = output_format(options.output or PLY.ending, levels=True)
+    file = output_format(options.output or PLY.ending, levels=True, cameras=True)
     if not file.each:
         raise UsageError(f"budget: expected a number or a share of Gaussians for {file.ending}, got {options.budget}")
     return FileSize(parse_bytes(str(options.budget)), file)

@@ -124,6 +124,11 @@ class Plan:
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
     @property
+    def cleans_last(self) -> bool:
+        """Whether the number is searched for without clean-up: what that leaves out would count as errors."""
+        return self.keeps_input and self.clean.asked
+
+    @property
     def limits(self) -> CountLimits:
         """Limits of the number of Gaussians."""
         return self.superpixels.limits

@@ -252,7 +252,7 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     if judged := report["choices"].get("fidelity"):
         quality = ["the input", f"{judged['psnr']:.2f}"]  # which it is compared with, for lack of photos
     counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
-    gain = "" if new is None else f"{new['after'] - new['before']:+.1f} dB"
+    gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
     return output, *counts, f"{100 * report['ratio']:.2f} %", gain, *quality, f"{report['total_seconds']:.1f}"
 
 

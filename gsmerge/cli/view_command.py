@@ -70,20 +70,19 @@ def view(args: opt.Args) -> None:
 
 def _compact_sizes(
     pair: BeforeAfter, shares: Sequence[str], progress: Progress
-) -> tuple[dict[str, Gaussians], dict[str, Cameras], dict[str, float], list[int]]:
+) -> tuple[dict[str, Gaussians], dict[str, Cameras], dict[str, tuple[float, float]], list[int]]:
     """Compact the scene to ``shares`` such as "2%"; return Gaussians, cameras and expected gains by name, and bytes.
 
     Without files AFTER the one nearest the default comes first, for the page opens on it.
     """
     from gsmerge.compaction.compact import compact
-    from gsmerge.compaction.file_size import measure_bytes
-    from gsmerge.io.formats.table import PLY
+    from gsmerge.io.formats.ply import file_bytes
     from gsmerge.settings.budget import parse_share
     from gsmerge.settings.stages import SHARE
 
     results: dict[str, Gaussians] = {}
     cameras: dict[str, Cameras] = {}
-    gains: dict[str, float] = {}
+    gains: dict[str, tuple[float, float]] = {}
     nearest = min(shares, key=lambda share: abs(parse_share(share) - parse_share(SHARE)), default="")
     opened = None if pair.plys else nearest
     for share in sorted(shares, key=lambda share: (share != opened, parse_share(share))):
@@ -92,10 +91,10 @@ def _compact_sizes(
         result = compact(pair.load.scene, budget=share, fill=True)
         results[name] = result.gaussians
         if result.report.new_views is not None:
-            gains[name] = result.report.new_views.gain
+            gains[name] = result.report.new_views.bounds
         if pair.scene.aligned and len(result.cameras) == len(pair.scene):
             cameras[name] = replace(pair.scene.cameras, viewmats=result.cameras.viewmats)
-    return results, cameras, gains, [measure_bytes(gaussians, PLY) for gaussians in results.values()]
+    return results, cameras, gains, [file_bytes(len(gaussians), gaussians.sh_degree) for gaussians in results.values()]
 
 
 def _open(page: Path) -> bool:

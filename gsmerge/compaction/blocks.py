@@ -110,7 +110,7 @@ def compact_in_blocks(
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
         if asked := file_size(options.budget):
-            result = drop_to_bytes(result, asked.num_bytes, asked.file)
+            result = drop_to_bytes(result, asked.num_bytes, asked.file, scene.cameras)
         everything = work.share(result)
         scored = work.run("score", score_part, count, each_part(parts, everything))
         scores = [score for score, _ in adopt_records(scored)]

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
 from typing import Any
 from weakref import ref
 
+from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
-from gsmerge.compaction.search import add_target, level_counts, search_count
+from gsmerge.compaction.search import add_target, build_left_out, level_counts, meet, search_count
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
@@ -71,19 +72,18 @@ def compact(
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a scene of which the facts are known."""
     plan = add_target(make_plan(prepared, options), prepared)  # every "auto" is decided once; options end here
-    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
-    cleans_last = plan.keeps_input and plan.clean.asked  # what is left out would count as errors in the search
-    searched = replace(plan, clean=CleanOptions()) if cleans_last else plan
-    for count in search:
-        search.add(build_scored(method.build, prepared, searched, count))
     rebuild = partial(build_scored, method.build, prepared, plan)
-    best, packed = search.best, plan.size is not None and plan.size.packed
-    if cleans_last:
-        best = clean_candidate(best, prepared, plan)
-    if packed:
-        from gsmerge.compaction.file_size import meet_bytes
-
-        best = meet_bytes(best, rebuild, prepared, plan)
+    search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
+    if search.left_out is None:
+        uncleaned = replace(plan, clean=CleanOptions()) if plan.cleans_last else plan
+        search.run(partial(build_scored, method.build, prepared, uncleaned))
+        best = clean_last(search.best, prepared, plan)
+    else:
+        share = len(search.left_out.rest.scene) / len(prepared.scene)
+        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan), share))
+        best = rebuild(search.count)
+        add_seconds(best.record.seconds)  # beside those of the search
+    best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
@@ -97,8 +97,13 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
 
 
 @record_part()
-def clean_candidate(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up a candidate as the plan says, and score it again; UsageError if the crop contains none of the scene."""
+def clean_last(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
+    """Clean up a candidate that was searched for without, and score it again; any other stays as it is.
+
+    UsageError if the crop contains none of the scene.
+    """
+    if not plan.cleans_last:
+        return candidate
     from gsmerge.stages.clean import clean
 
     _share_inside(prepared, plan)
@@ -134,22 +139,24 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     from gsmerge.stages.clean import clean, faintest_dropped
 
     scene, share = prepared.scene, _share_inside(prepared, plan)
-    most, asked = len(scene.finite_gaussians), count
-    if count is not None:
-        asked = min(most, math.ceil(SURPLUS * count / share))
-    best: tuple[Fitted, dict[str, int], Record] | None = None
-    for _ in range(MAX_BUILDS):
+    most = len(scene.finite_gaussians)
+
+    def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
         with record_part() as record:
             fitted = build(prepared, plan, asked)
             gaussians, counts = clean(fitted.gaussians, options, scene, prepared.frame.leave)
         add_seconds(record.seconds)
-        if best is None or count is None or len(best[0].gaussians) < len(gaussians):
-            best = replace(fitted, gaussians=gaussians), counts, record
-        if count is None or asked is None or len(gaussians) >= count or asked == most:
-            break
-        asked = min(most, math.ceil(SURPLUS * asked * count / max(1, len(gaussians))))
-    assert best is not None
-    fitted, counts, record = best
+        return asked, replace(fitted, gaussians=gaussians), counts, record
+
+    def ask_for_more(built: Sequence[tuple[int | None, Fitted, dict[str, int], Record]]) -> int | None:
+        asked, left = built[-1][0], len(built[-1][1].gaussians)
+        if count is None or asked in (None, most) or left >= count or len(built) == MAX_BUILDS:
+            return None
+        return min(most, math.ceil(SURPLUS * asked * count / max(1, left)))
+
+    first = None if count is None else min(most, math.ceil(SURPLUS * count / share))
+    built = meet(build_more, build_more(first), ask_for_more)
+    _, fitted, counts, record = max(built, key=lambda each: len(each[1].gaussians))
     gaussians = fitted.gaussians
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}

@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from gsmerge.compaction.result import Candidate, shrink
+from gsmerge.compaction.search import meet
+from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.table import Format
+from gsmerge.io.formats.table import HTML, Format
 from gsmerge.plan import Plan
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
 
 NEAR, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
 ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
 TRIES, MAX_REBUILDS = 8, 3
+LONGEST_TITLE = 255  # bytes of a page's title, which is a file's name, at most
 
 Rebuild = Callable[[int], Candidate]
 
 
-def measure_bytes(gaussians: Gaussians, file: Format) -> int:
-    """Count the bytes of a file with the given Gaussians."""
+def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:
+    """Count the bytes of a file with the given Gaussians; of a page, which shows ``cameras``, at most."""
+    comments = RESULT_COMMENT, MIP_COMMENT
+    if file is HTML:
+        from gsmerge.pages.site import site_contents
+
+        return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
     if file.encode is None:
         return file_bytes(len(gaussians), gaussians.sh_degree)
-    return len(file.encode(gaussians, (RESULT_COMMENT, MIP_COMMENT)))
+    return len(file.encode(gaussians, comments))
 
 
 def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan: Plan) -> Candidate:
@@ -33,28 +42,36 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     if plan.size is None or not plan.size.packed:
         return candidate
     most, file = plan.size.num_bytes, plan.size.file
-    for _ in range(MAX_REBUILDS):
-        size, count = measure_bytes(candidate.gaussians, file), len(candidate.gaussians)
-        room = min(int(SURPLUS * count * most / size), plan.limits.most)
-        if room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count):
-            break
-        candidate = rebuild(room)
-    kept = drop_to_bytes(candidate.gaussians, most, file)
+
+    rest = measure_bytes(candidate.gaussians[:1], file, candidate.cameras)
+    if rest > most:
+        problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(most)}")
+
+    def choose_next(built: Sequence[Candidate]) -> int | None:
+        size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
+        room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
+        fits = room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count)
+        return None if fits or len(built) > MAX_REBUILDS else room
+
+    candidate = meet(rebuild, candidate, choose_next)[-1]
+    kept = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras)
     return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)
 
 
-def drop_to_bytes(gaussians: Gaussians, most: int, file: Format) -> Gaussians:
+def drop_to_bytes(gaussians: Gaussians, most: int, file: Format, cameras: Cameras) -> Gaussians:
     """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; this may be none."""
+    rest = measure_bytes(gaussians[:1], file, cameras)
     low, high = 0, len(gaussians)
     kept, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):
         tried = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        size = measure_bytes(tried, file)
+        size = measure_bytes(tried, file, cameras)
         if size <= most:
             low, kept = count, tried
         else:
             high = count - 1
         if low == len(gaussians) or (low and ENOUGH * most <= size <= most) or low >= high:
             break
-        count = min(max(low + 1, int((1 + ENOUGH) / 2 * count * most / size)), high)
+        count = min(max(low + 1, int(count * ((1 + ENOUGH) / 2 * most - rest) / max(size - rest, 1))), high)
     return kept

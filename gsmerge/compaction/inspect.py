@@ -80,10 +80,9 @@ def inspect(
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
         ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
         shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
-        ``contradicted``, ``alone``), ``new_views``: ``before`` and ``after`` of a result, see the report of a run.
-        ``compact``: the estimate
-        of a run, None where it would refuse the scene; ``auto``: ``share``, ``num_gaussians`` and ``why`` of
-        ``--budget auto``. ``notes``: warnings.
+        ``contradicted``, ``alone``), ``new_views``: ``before``, ``after``, ``low``, ``high`` of a result, see the
+        report of a run. ``compact``: the estimate of a run, None where it would refuse the scene; ``auto``: ``share``,
+        ``num_gaussians`` and ``why`` of ``--budget auto``. ``notes``: warnings.
 
     Raises:
         SceneError: If the ``.ply`` cannot be read, or a named file does not exist; cameras that are missing or do not
@@ -151,7 +150,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
             ("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement")
         ),
         "coverage": [],
-        "new_views": None if expected is None else dict(zip(("before", "after"), expected, strict=True)),
+        "new_views": None if expected is None else asdict(expected),
     }
     try:
         load = align_scene(ply, files, hints=hints)
@@ -298,4 +297,5 @@ def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
     expected = scene["new_views"]
     if expected is None:
         return []
-    return [f"new views  {expected['before']:.1f} dB from its input, {expected['after']:.1f} dB from it, expected"]
+    gain = f"{expected['low']:+.1f} to {expected['high']:+.1f} dB"
+    return [f"new views  {expected['before']:.1f} dB from its input, {gain} from it, expected"]

@@ -107,7 +107,7 @@ class CompactReport:
         share = 100 * self.num_output / max(1, self.num_input)
         facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share:.2f} %)")]
         if new := self.new_views:
-            facts += [("PSNR of new views, expected", f"{new.before:.1f} -> {new.after:.1f} dB")]
+            facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
         if self.psnr_before is not None and self.psnr_after is not None:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
         if files := self.photo_files:
@@ -208,7 +208,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         ("file", human_bytes(before["bytes"]), human_bytes(after["bytes"]), ""),
     ]
     if new := document["new_views"]:
-        source = f"expected, from {new['views']} photos left out"
+        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB"
+        source = f"{gain} expected, from {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", source)]
     if psnr["before"] is not None and psnr["after"] is not None:
         views = f"a sample, of {document['choices']['scored_views']} of its views"
@@ -277,7 +278,7 @@ def summary_line(document: Mapping[str, Any]) -> str:
     if psnr["before"] is not None and psnr["after"] is not None:
         quality = f"; a sample of {_own(document)} {psnr['before']:.2f} -> {psnr['after']:.2f} dB"
     if new := document["new_views"]:
-        quality = f"; new views {new['after'] - new['before']:+.1f} dB expected{quality}"
+        quality = f"; new views {new['low']:+.1f} to {new['high']:+.1f} dB expected{quality}"
     if covered := document["psnr_covered"]:
         share = f"on the {100 * covered['share']:.0f} % of their pixels that the input covers"
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"

@@ -21,7 +21,7 @@ from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.io.formats.rounding import as_written
 from gsmerge.plan import Plan
 from gsmerge.raster import render
-from gsmerge.raster.metrics import MAX_LOSS, describe_distance, describe_loss
+from gsmerge.raster.metrics import describe_distance, describe_loss
 from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
@@ -306,12 +306,11 @@ def make_result(
     main = report(best, measured[0], seconds, "the result")
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
     new_views = None
-    if trial is not None and before is not None and main.psnr_after is not None:
-        new_views = trial.predict(before, main.psnr_after, prepared.agreement)
-        if not prepared.scene.aligned and new_views.gain < 0:  # the input was made from the photos that the fit lacked
-            new_views = None
+    if trial is not None and prepared.agreement is not None and before is not None and main.psnr_after is not None:
+        own = (main.covered.before, main.covered.after) if main.covered else (before, main.psnr_after)
+        new_views = trial.predict(*own, prepared.agreement.confirmed)
     is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
-    if new_views is not None and is_large and main.worse is None and new_views.gain < -MAX_LOSS:
+    if new_views is not None and is_large and main.worse is None and new_views.high < 0:
         worse = f"new views of the result are expected to be {-new_views.gain:.1f} dB worse than those of the input"
         main, notes = replace(main, worse=worse), [*notes, worse]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"], new_views=new_views)

@@ -1,19 +1,20 @@
 """Search for the number of Gaussians: the knee of the scene's curve, a quality target, levels of detail.
 
-A curve is measured by short fits, judged by patches of the photos that they left out.
+A curve is measured by short fits, judged by photos or, of few, by patches of photos that they left out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
+from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, leave_out
 from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
@@ -24,7 +25,7 @@ from gsmerge.pipeline import Build
 from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
-from gsmerge.runtime.record import choose, record_part, report_progress, stage
+from gsmerge.runtime.record import choose, current_record, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
@@ -42,6 +43,9 @@ CLOSE = 1.15  # counts this near to each other are one
 NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
 PHOTOS_NEAR = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
 MAX_RUNS = 6
+# Of photos that are left out: builds, beside the one that is written; dB per doubling until two were tried, the mean
+# below the usual count of eleven captures; dB above a target at which a count is near enough, half of that
+MAX_TRIED, NEW_SLOPE, NEW_NEAR = 2, 0.3, 0.15
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
 FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
 MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
@@ -56,6 +60,20 @@ class CurvePoint:
     ssim: float  # Structural similarity
 
 
+T = TypeVar("T")
+
+
+def meet(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
+    """Build for one count after another, and return all that was built, beginning with ``first``.
+
+    ``choose_next`` chooses a count by what was built so far; None ends the search.
+    """
+    built = [first]
+    while (count := choose_next(built)) is not None:
+        built.append(build(count))
+    return built
+
+
 @dataclass(eq=False)
 class CountSearch:
     """Search for the number of Gaussians: one count, or several until a quality is met."""
@@ -63,31 +81,42 @@ class CountSearch:
     plan: Plan  # Target and limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
     rendered: bool = False  # Whether renders of the input judge, which more Gaussians always show better
+    left_out: LeftOut | None = None  # What judges in place of own views: photos that the builds leave out
+    most: int | None = None  # Gaussians from which on photos that are left out gain nothing; None: not known
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
-    def __iter__(self) -> Iterator[int | None]:
-        """Yield counts; each candidate is added before the next one is asked for."""
-        yield self.first
-        target, limits = self.plan.target_psnr, self.plan.limits
-        keeps = self.plan.keeps_input
+    def run(self, build: Callable[[int | None], Candidate]) -> None:
+        """Build a candidate for each count that the search chooses."""
+        self.candidates = meet(build, build(self.first), self.choose_next)
+
+    def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
+        """Choose the next count by the candidates built so far; None ends the search."""
+        target, limits, keeps = self.plan.target_psnr, self.plan.limits, self.plan.keeps_input
+        if target is None or len(candidates) >= (MAX_RUNS if self.left_out is None else MAX_TRIED):
+            return None
         usual = keeps and not self.plan.auto_count
         least = min(limits.default, limits.max_count) if usual else limits.min_count
         most = limits.max_count if keeps or self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
         steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, PHOTOS_NEAR if keeps else 0.0)
-        while target is not None and len(self.candidates) < MAX_RUNS:
-            count = next_count(self.tried, target, least, most, *steps)
-            if count in self.tried:
-                return
-            yield count
+        if self.left_out is not None:
+            most, steps = min(most, self.most or most), (NEW_SLOPE, NEW_NEAR)
+        tried = psnr_by_count(candidates)
+        count = next_count(tried, target, least, most, *steps)
+        return None if count in tried else count
 
     @property
     def tried(self) -> dict[int, float]:
         """PSNR (dB) by count, in the order of the runs."""
-        return {run.count: run.kept_psnr or 0.0 for run in self.candidates if run.count is not None}
+        return psnr_by_count(self.candidates)
 
-    def add(self, candidate: Candidate) -> None:
-        """Add the candidate built for the last count."""
-        self.candidates.append(candidate)
+    @property
+    def count(self) -> int | None:
+        """Number of Gaussians of the best candidate; of photos left out, the one at which they reach the target."""
+        if self.plan.target_psnr is None or self.left_out is None:
+            return self.best.count
+        reached = [point for point in sorted(self.tried.items()) if point[1] >= self.plan.target_psnr]
+        points = [CurvePoint(count, psnr, 0.0) for count, psnr in sorted(self.tried.items())]
+        return count_reaching(points, self.plan.target_psnr) if reached else self.best.count
 
     @property
     def best(self) -> Candidate:
@@ -109,8 +138,9 @@ class CountSearch:
         """Reason why the target is not met; None if it is met."""
         if self.plan.target_psnr is None or self.plan.keeps_input or self.met:
             return None
-        psnr, count = self.best.psnr or 0.0, len(self.best.gaussians)
-        reached = f"the input views reach {psnr:.2f} dB with {count} Gaussians"
+        psnr, count = self.best.psnr or 0.0, self.best.count if self.left_out else len(self.best.gaussians)
+        views = "photos left out" if self.left_out else "the input views"
+        reached = f"{views} reach {psnr:.2f} dB with {count} Gaussians"
         return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
 
     def facts(self) -> dict[str, Any]:
@@ -120,7 +150,8 @@ class CountSearch:
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
-            choices["search"] = {"count": best.count, "psnr": best.kept_psnr, "met": self.met, "tried": tried}
+            choices["search"] = {"count": self.count, "psnr": best.kept_psnr, "met": self.met, "tried": tried}
+            choices["search"] |= {"left_out": 0 if self.left_out is None else len(self.left_out.photos)}
         return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
 
     @property
@@ -142,6 +173,11 @@ class CountSearch:
         return [f"{kept}, about the fewest that {good}"]
 
 
+def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
+    """Return the PSNR (dB) that decides of each candidate by its count, in their order."""
+    return {each.count: each.kept_psnr or 0.0 for each in candidates if each.count is not None}
+
+
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
     """Return the plan with the PSNR that keeps the input, if photos show how good the input is."""
     if not plan.keeps_input or plan.target_psnr is not None:
@@ -154,14 +190,40 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Start a search for the number of Gaussians."""
-    limits = plan.limits
-    if plan.target_psnr is not None:
-        rendered = prepared.reference.name == RENDERS
-        return CountSearch(plan, min(max(limits.default, limits.min_count), limits.max_count), rendered)
-    return CountSearch(plan, choose_count(prepared, plan, build))
+    limits, left_out = plan.limits, leave_out_judges(prepared, plan)
+    if plan.target_psnr is None:
+        return CountSearch(plan, choose_count(prepared, plan, build, left_out))
+    first = min(max(limits.default, limits.min_count), limits.max_count)
+    most = None if prepared.agreement is None else int(prepared.agreement.share * limits.num_pixels)
+    return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
 
 
-def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
+def leave_out_judges(prepared: Prepared, plan: Plan) -> LeftOut | None:
+    """Leave out views whose photos judge a quality that is asked for, or a curve; None where own views do.
+
+    Without a fit no photo has been seen; and a count that keeps the input is compared with what its own views show.
+    """
+    judged = (plan.target_psnr is not None and not plan.keeps_input) or plan.max_drop is not None or plan.auto_count
+    if not judged or plan.fit.fit == "none" or not can_leave_out(prepared):
+        return None
+    views, _ = choose_views(prepared.reference.score_views)
+    return leave_out(prepared.scene, views, prepared)
+
+
+@record_part()
+def build_left_out(build: Build, left_out: LeftOut, plan: Plan, share: float, count: int | None) -> Candidate:
+    """Build a candidate of ``count`` Gaussians without some views, and score it on their photos.
+
+    It has the ``share`` of the Gaussians that the other views have of all pixels. The ``plan`` is one for these.
+    """
+    assert count is not None
+    fitted = build(left_out.rest, plan, max(1, round(share * count)))
+    with stage("score"):
+        psnr = left_out.mean(left_out.score(fitted.gaussians))
+    return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
+
+
+def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide."""
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
@@ -170,28 +232,35 @@ def choose_count(prepared: Prepared, plan: Plan, build: Build) -> int | None:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
         counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
-        points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts)
+        points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts, left_out)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)
 
 
-def measure_curve(prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int]) -> list[CurvePoint]:
+def measure_curve(
+    prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int], left_out: LeftOut | None = None
+) -> list[CurvePoint]:
     """Measure PSNR and SSIM of fits with each of the ``counts``.
 
-    The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on blocks that the fits
-    leave out.
+    The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on the photos of
+    ``left_out``, or without on blocks that the fits leave out.
     """
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
+    if left_out is None:
+        photos = scene_photos(prepared.scene)[prepared.reference.score_views]
+        weights, min_gain, share = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain, 1.0
+    else:
+        seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
+        photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.covered[seen]]
+        min_gain, share = math.inf, len(left_out.rest.scene) / len(prepared.scene)
+        prepared, plan = left_out.rest, left_out.plan(plan)
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
-    reference = prepared.reference
-    photos = scene_photos(prepared.scene)[reference.score_views]
-    weights = training_weights(photos, HOLDOUT, plan.seed)
     points: list[CurvePoint] = []
     report_progress(TRIED, 0, len(counts))
     for count in counts:
         with record_part(silent=True):
-            gaussians = build(prepared, quick, count).gaussians
-        points.append(_point(count, gaussians, photos, weights, short.tuning.min_gain))
+            gaussians = build(prepared, quick, max(1, round(share * count))).gaussians
+        points.append(_point(count, gaussians, photos, weights, min_gain))
         report_progress(TRIED, len(points), len(counts))
     return points
 
@@ -229,12 +298,16 @@ def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
-    wanted = max(p.psnr for p in points) - max_drop
-    first = next(i for i, p in enumerate(points) if p.psnr >= wanted)
+    return count_reaching(points, max(p.psnr for p in points) - max_drop)
+
+
+def count_reaching(points: Sequence[CurvePoint], psnr: float) -> int:
+    """Return the fewest Gaussians at which a curve reaches a PSNR (dB) that one of its points has; see above."""
+    first = next(i for i, p in enumerate(points) if p.psnr >= psnr)
     if first == 0:
         return points[0].count
     below, above = points[first - 1], points[first]
-    share = (wanted - below.psnr) / (above.psnr - below.psnr)
+    share = (psnr - below.psnr) / (above.psnr - below.psnr)
     return math.ceil(below.count * float(power(above.count / below.count, share)))
 
 

@@ -74,14 +74,17 @@ class Outside:
 def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
     """Place views outside the capture for a fit from a ``start``, and see how far into the scene they look.
 
-    Cameras step back from those of ``photos``. Pictures are half as large, at least ``LEAST_WIDTH`` wide. None if the
-    scene says nothing in any of them; of a scene without Gaussians, as views of blocks are joined, the start says it.
+    Cameras step back from those of ``photos``. Pictures are half as large, at least ``LEAST_WIDTH`` wide. None if no
+    step looks there, or the scene says nothing in any of them; of a scene without Gaussians, as views of blocks are
+    joined, the start says it.
     """
+    looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
+    if looks == 0:
+        return None
     rows = _sample(scene, ROWS * len(photos)) if len(scene.gaussians) else start
     if len(rows) == 0 or len(photos) == 0:
         return None
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
-    looks = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     points = rows.means[:: max(1, len(rows) // SAMPLE)]
     placed = outside_cameras(points, cameras, min(looks, max(PLACES, len(photos))), LOW, HIGH)
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]

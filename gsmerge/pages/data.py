@@ -61,7 +61,7 @@ class Side:
     covered: Quality  # over those
     seconds: float  # that drawing a view took here, with all threads
     dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
-    new_gain: float | None = None  # dB that new views are expected to gain; None: not known
+    new_gain: tuple[float, float] | None = None  # bounds of what new views are expected to gain, dB; None: not known
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def collect(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    new_gains: Mapping[str, float] | None = None,
+    new_gains: Mapping[str, tuple[float, float]] | None = None,
     light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:

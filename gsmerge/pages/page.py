@@ -9,13 +9,14 @@ import json
 import re
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.io.formats.arrays import describe_gain
+from gsmerge.io.formats.table import VIEWER
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Cameras
@@ -30,7 +31,6 @@ SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-s
 POLICY = "{policy}"  # stands for it in the templates until the hashes are known
 NONE = "-"  # in place of a figure
 FASTER = 1.2  # times, from which on the headline says it
-ENGINE = "vendor/spark-three.js.gz"
 
 
 def view_page(data: ViewData) -> str:
@@ -55,7 +55,7 @@ def view_page(data: ViewData) -> str:
     first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
     opened[left] = opened[right] = None
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
-    engine = files("gsmerge.pages").joinpath(ENGINE).read_bytes() if splats else None
+    engine = VIEWER.read_bytes() if splats else None
     places = range(min(len(data.sides) - 1, 1), len(data.sides))
     results: list[dict[str, Any]] = [
         {
@@ -112,7 +112,7 @@ def headline(data: ViewData, place: int = 1) -> str:
     share = 100 * after.num_gaussians / max(before.num_gaussians, 1)
     said = f"{share:.{1 if share >= 1 else 2}f} % of the Gaussians"
     if after.new_gain is not None and not data.held_out:
-        return f"{said}, new views expected {_nearer(after.new_gain)}"
+        return f"{said}, new views expected {describe_gain(*after.new_gain)}"
     if new is None or old is None or not np.isfinite(new):
         return said
     if not np.isfinite(old):  # the input itself is the reference

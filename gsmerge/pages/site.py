@@ -10,13 +10,13 @@ from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.arrays import read_new_views
+from gsmerge.io.formats.arrays import describe_gain, read_new_views
 from gsmerge.io.formats.sog import sog_bytes
-from gsmerge.io.formats.table import SITE_SCENE
+from gsmerge.io.formats.table import SITE_SCENE, VIEWER
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import ENGINE, base64_text, camera_numbers, data_uri, render_template
+from gsmerge.pages.page import base64_text, camera_numbers, data_uri, render_template
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
@@ -54,14 +54,14 @@ def site_contents(
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
     vendor = files("gsmerge.pages").joinpath("vendor")
     licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
-    notice, engine = "\n\n".join(licences).encode(), files("gsmerge.pages").joinpath(ENGINE).read_bytes()
+    notice, engine = "\n\n".join(licences).encode(), VIEWER.read_bytes()
     contents = dict(zip(NAMES.values(), (scene, engine, poster, notice), strict=True))
     page = render_template(
         "site.html", policy=POLICY, title=title, count=len(gaussians), names=NAMES, apart=apart,
         poster=NAMES["poster"] if apart else data_uri(poster, "image/webp"),
         licences=NAMES["licences"] if apart else data_uri(notice, "text/plain"),
         inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
-        gain=None if expected is None else expected[1] - expected[0],
+        gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(middle),

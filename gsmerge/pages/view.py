@@ -96,7 +96,7 @@ def view(
     loaded: dict[str, Any] = {**given, **files}
     gaussians = {name: value if isinstance(value, Gaussians) else value.gaussians for name, value in loaded.items()}
     gains = file_gains(files) | {
-        name: expected.gain
+        name: expected.bounds
         for name, value in given.items()
         if (expected := getattr(getattr(value, "report", None), "new_views", None)) is not None
     }
@@ -114,10 +114,10 @@ def view(
     return Page(view_page(data), headline(data))
 
 
-def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
-    """Return what new views are expected to gain, dB, by the names of results whose files say it."""
+def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
+    """Return the bounds of what new views are expected to gain, dB, by the names of results whose files say it."""
     known = {name: read_new_views(file.info.comments) for name, file in files.items()}
-    return {name: after - before for name, scores in known.items() if scores for before, after in [scores]}
+    return {name: scores.bounds for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:

@@ -50,7 +50,8 @@ class Tuning:
     # overlap, and a step takes a third less time
     scale_reg: float = 0.01
     outside_every: int = 7  # Steps from one look from outside to the next, see gsmerge.fit.outside
-    outside_from: float = 0.15  # Share of the steps that come before them; what hangs in gaps early on helps the rest
+    # Share of the steps that come before them, 1 for none; what hangs in gaps early on helps the rest
+    outside_from: float = 0.15
     iterations: int = 6  # Conjugate-gradient steps of the colour fit
     prior_weight: float = 0.03  # Weight of the unfitted colours, relative to visibility
     huber: float = 0.2  # Colour error beyond which a pixel counts less in the colour fit

@@ -140,8 +140,8 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
     new = Totals(1)
-    new.add(record("done", "z", "z.ply", report={**report, "new_views": {"before": 17.0, "after": 21.2, "views": 4}}))
-    assert new.lines()[1].split()[-4:] == ["+4.2", "dB", "20.00", "1.5"]
+    new.add(record("done", "z", "z.ply", report={**report, "new_views": {"low": 2.9, "high": 5.4}}))
+    assert new.lines()[1].split()[-6:] == ["+2.9", "to", "+5.4", "dB", "20.00", "1.5"]
     alone = Totals(1)
     alone.add(record("done", "y", "y.ply", report={**report, "choices": {"fidelity": {"psnr": 32.8}}}))
     assert alone.lines()[1].split()[-4:] == ["the", "input", "32.80", "1.5"]

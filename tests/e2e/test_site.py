@@ -56,6 +56,15 @@ def test_compact_writes_one_file_to_send(run: Run, smallest_copy: Path) -> None:
     assert document["output"]["bytes"] == page.stat().st_size < 1_100_000
 
 
+def test_a_size_counts_the_viewer_of_a_page(run: Run, smallest_copy: Path) -> None:
+    page = smallest_copy / "a.html"
+    words = ("compact", smallest_copy, "-o", page, *QUICK, "--set", "fill=true", "--budget")
+    run(*words, "930KB", code=0)
+    assert 915_000 < page.stat().st_size <= 930_000
+    assert_refused(run(*words, "800KB", "--overwrite"), 2, "", "0.85 MB for the viewer", "800.0 kB")
+    assert_refused(run(*words, "880KB", "--overwrite"), 2, "", ".html with one Gaussian", "880.0 kB")
+
+
 def test_convert_writes_a_site_and_replaces_it_when_asked(run: Run, smallest_copy: Path) -> None:
     small, site = smallest_copy / "scene.ply", smallest_copy / "site"
     run("convert", small, site, *SITE, code=0)

@@ -102,7 +102,7 @@ def test_a_batch_writes_no_levels(small_scene: Path, tmp_path: Path, run: Run) -
     assert_refused(run(*words), 2, "--name", ".ply")
 
 
-@pytest.mark.parametrize("name", ["lod-meta.json", "a.html", "colmap"])
+@pytest.mark.parametrize("name", ["lod-meta.json", "colmap"])
 def test_a_budget_in_bytes_needs_a_format_that_counts_them(
     name: str, small_scene: Path, tmp_path: Path, run: Run
 ) -> None:

@@ -47,17 +47,49 @@ def copied_comments(comments: Sequence[object]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(kept))[:MAX_COPIED_LINES]
 
 
-def new_views_comment(before: float, after: float) -> str:
+@dataclass(frozen=True)
+class ExpectedScores:
+    """PSNR (dB) that new views of a scene are expected to have.
+
+    Args:
+        before: Rendered from the input.
+        after: From the result.
+        low: Least that they are expected to gain: of ten results one gains less.
+        high: Most that they are expected to gain: of ten results one gains more.
+    """
+
+    before: float
+    after: float
+    low: float
+    high: float
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and most that new views are expected to gain, dB."""
+        return self.low, self.high
+
+
+def new_views_comment(scores: ExpectedScores) -> str:
     """Return the header comment of a result that says what new views are expected to gain, dB."""
-    return f"{NEW_VIEWS_COMMENT}: {before:.2f} to {after:.2f} dB"
+    gain = f"gain {scores.low:.2f} to {scores.high:.2f} dB"
+    return f"{NEW_VIEWS_COMMENT}: {scores.before:.2f} to {scores.after:.2f} dB, {gain}"
 
 
-def read_new_views(comments: Sequence[object]) -> tuple[float, float] | None:
-    """Read what new views of the input and of a result are expected to have, dB, from header comments; None without."""
-    pattern = re.compile(re.escape(NEW_VIEWS_COMMENT) + r": (-?\d{1,3}\.\d\d) to (-?\d{1,3}\.\d\d) dB")
+def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
+    """Read what new views of the input and of a result are expected to have from header comments; None without."""
+    number = r"(-?\d{1,3}\.\d\d)"
+    pattern = re.compile(f"{re.escape(NEW_VIEWS_COMMENT)}: {number} to {number} dB, gain {number} to {number} dB")
     matches = (pattern.fullmatch(comment) for comment in comments if isinstance(comment, str))
     match = next(filter(None, matches), None)
-    return None if match is None else (float(match[1]), float(match[2]))
+    return None if match is None else ExpectedScores(*map(float, match.groups()))
+
+
+def describe_gain(low: float, high: float) -> str:
+    """Describe the bounds of a gain (dB) in words."""
+    if low < 0 < high:
+        return f"{-low:.1f} dB farther to {high:.1f} dB closer"
+    least, most = sorted((abs(low), abs(high)))
+    return f"{least:.1f} to {most:.1f} dB {'closer' if low >= 0 else 'farther'}"
 
 
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:

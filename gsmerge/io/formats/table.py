@@ -12,6 +12,7 @@ import numpy as np
 from gsmerge.errors import UsageError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
+from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.setting import join_words
@@ -36,6 +37,7 @@ class Format:
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package or program is missing
     # bytes of a Gaussian by degree, of a .sog or .spz those of results, as measured; none where no budget counts them
     each: Sequence[float] = ()
+    rest: Callable[[], int] = lambda: 0  # bytes of a file besides those of its Gaussians, at least
     round_means: Callable[[np.ndarray], np.ndarray] = lambda means: means  # as it holds them, but for float32
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
@@ -47,6 +49,8 @@ class Format:
 
 _lazy = lazy_functions(__package__)
 _SOG = 13.0, 22.0, 36.5, 56.5
+IN_TEXT = 4 / 3  # bytes of base64, as which a page has files in its text, for each of theirs
+VIEWER = Path(__file__).parents[2] / "pages/vendor/spark-three.js.gz"
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
@@ -60,8 +64,9 @@ LEVELS = Format(
 )  # fmt: skip
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
 HTML = Format(
-    ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means")
-)
+    ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means"),
+    each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size),
+)  # fmt: skip
 SITE, SITE_SCENE = "index.html", "scene.sog"  # of a page that has its files beside it
 FILES = (  # of endings that end alike the longest first
     Format(
@@ -125,10 +130,12 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
     """
     if chosen is PLY:
         return ply.count_for_bytes(max_bytes, sh_degree)
-    each = chosen.each[min(sh_degree, len(chosen.each) - 1)]
-    if max_bytes < each:
-        raise UsageError(f"budget: expected at least {each:.0f} bytes for one Gaussian, got {max_bytes}")
-    return int(max_bytes / each)
+    each, rest = chosen.each[min(sh_degree, len(chosen.each) - 1)], chosen.rest()
+    if max_bytes < rest + each:
+        viewer = f"{rest / 1e6:.2f} MB for the viewer of a page, and " if rest else ""
+        problem = f"expected at least {viewer}{each:.0f} bytes for one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes) if rest else max_bytes}")
+    return int((max_bytes - rest) / each)
 
 
 def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:

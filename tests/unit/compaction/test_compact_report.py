@@ -85,15 +85,17 @@ def test_result_table(files: tuple[Path, Path]) -> None:
 
 
 def test_new_views_come_first(files: tuple[Path, Path]) -> None:
-    document = make_document(files, new_views=NewViews(17.25, 21.5, 3))
-    assert document["new_views"] == {"before": 17.25, "after": 21.5, "views": 3}
+    document = make_document(files, new_views=NewViews(17.25, 21.5, 3.0, 5.5, 3))
+    assert document["new_views"] == {"before": 17.25, "after": 21.5, "low": 3.0, "high": 5.5, "views": 3}
     line = report.summary_line(document)
-    assert line.index("new views +4.2 dB expected") < line.index("a sample of its own photos 20.00 -> 24.50 dB")
+    assert line.index("new views +3.0 to +5.5 dB expected") < line.index("a sample of its own photos 20.00 -> 24.50 dB")
     table = [" ".join(row.split()) for row in report.result_table(document)]
-    (place,) = (i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB expected, from 3 photos"))
+    (place,) = (
+        i for i, row in enumerate(table) if row.startswith("new views 17.2 dB 21.5 dB +3.0 to +5.5 dB expected, from 3")
+    )
     assert table[place + 1].startswith("its own photos")
-    loss = report.summary_line(make_document(files, new_views=NewViews(20.0, 18.5, 2)))
-    assert "new views -1.5 dB" in loss
+    loss = report.summary_line(make_document(files, new_views=NewViews(20.0, 18.5, -2.8, -0.3, 2)))
+    assert "new views -2.8 to -0.3 dB" in loss
     assert make_document(files)["new_views"] is None
 
 

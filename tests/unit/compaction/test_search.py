@@ -12,19 +12,23 @@ import pytest
 from messages import noted, refuses
 
 from gsmerge.budget import exact_count, max_allowed
+from gsmerge.compaction.left_out import LeftOut
 from gsmerge.compaction.search import (
     CLOSE,
     MAX_RUNS,
+    MAX_TRIED,
     CountSearch,
     CurvePoint,
     count_within,
     curve_knee,
     level_counts,
+    meet,
     rungs,
     search_count,
 )
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.fit import FitOptions
 from gsmerge.kernels import elementary
 from gsmerge.pipeline import Build
 from gsmerge.plan import KEPT_LOSS, Plan
@@ -52,7 +56,7 @@ def make_plan(
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
-    kept = {"keeps_input": keeps_input, "auto_count": False}
+    kept = {"keeps_input": keeps_input, "auto_count": False, "max_drop": None, "fit": FitOptions(fit="none")}
     return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, **kept))
 
 
@@ -172,13 +176,13 @@ def rises(count: int) -> float:
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
-    for count in counts:
-        counts.add(built(count, curve(count)))
+    counts.run(lambda count: built(count, curve(count)))
     return counts
 
 
 def built(count: int | None, psnr: float) -> Any:
-    return SimpleNamespace(count=count, psnr=psnr, kept_psnr=psnr, gaussians=range(count or 0))
+    record = SimpleNamespace(seconds={})
+    return SimpleNamespace(count=count, psnr=psnr, kept_psnr=psnr, gaussians=range(count or 0), record=record)
 
 
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
@@ -220,7 +224,8 @@ def test_search_stays_within_its_limits() -> None:
 @pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
 def test_search_begins_within_its_limits(default: int, first: int) -> None:
     plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
-    prepared = cast("Prepared", SimpleNamespace(reference=SimpleNamespace(name=PHOTOS)))
+    reference = SimpleNamespace(name=PHOTOS, score_views=range(3))
+    prepared = cast("Prepared", SimpleNamespace(reference=reference, agreement=None))
     assert search_count(prepared, plan, cast("Build", None)).first == first
 
 
@@ -228,8 +233,7 @@ def keep(curve: Callable[[int], float], default: int, most: int, *, rendered: bo
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
     plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_input=True)
     counts = CountSearch(plan, default, rendered)
-    for count in counts:
-        counts.add(built(count, curve(count)))
+    counts.run(lambda count: built(count, curve(count)))
     return counts
 
 
@@ -283,5 +287,36 @@ def test_a_count_that_is_too_few_is_not_called_enough() -> None:
 
 
 def test_one_count_is_built_once_where_no_quality_is_asked_for() -> None:
-    assert list(CountSearch(make_plan(), 300)) == [300]
-    assert list(CountSearch(make_plan(), None)) == [None]
+    for first in (300, None):
+        counts = CountSearch(make_plan(), first)
+        counts.run(lambda count: built(count, 20.0))
+        assert [candidate.count for candidate in counts.candidates] == [first]
+
+
+def judge_left_out(curve: Callable[[int], float], target: float, most: int | None = None) -> CountSearch:
+    """Run a search that photos judge which the builds leave out."""
+    photos = cast("LeftOut", SimpleNamespace(photos=range(2)))
+    counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000), 1000, left_out=photos, most=most)
+    counts.run(lambda count: built(count, curve(count)))
+    return counts
+
+
+@pytest.mark.parametrize("target", [18.0, 20.0, 21.0, 22.4])
+def test_photos_left_out_are_met_by_two_builds_at_most(target: float) -> None:
+    """What is written is built of all views, with a count between those tried."""
+    actual = judge_left_out(lambda count: 20 + log2(count / 1000), target)
+    assert actual.met
+    assert len(actual.tried) <= MAX_TRIED
+    assert min(actual.tried) <= actual.count <= max(actual.tried)
+    assert actual.count >= 0.9 * 1000 * 2 ** (target - 20)
+
+
+def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
+    actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
+    assert max(actual.tried) == actual.count == 1600
+    assert actual.unmet == "quality: 30 dB was asked for, photos left out reach 20.68 dB with 1600 Gaussians"
+    assert actual.facts()["choices"]["search"]["left_out"] == 2
+
+
+def test_a_search_builds_until_nothing_is_next() -> None:
+    assert meet(lambda count: count * 10, 5, lambda built: len(built) if len(built) < 4 else None) == [5, 10, 20, 30]

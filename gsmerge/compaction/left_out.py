@@ -1,0 +1,100 @@
+"""Leave views out of a scene: what no fit has seen says how good its result is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsmerge.facts.prepare import Prepared, Reference
+from gsmerge.facts.row_colors import PHOTOS
+from gsmerge.facts.views import pick_views, subset
+from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.plan import Plan, make_plan
+from gsmerge.raster.photos import NEAR, Photos, scene_photos, score_photos
+from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.types import Gaussians, PicturedScene
+
+LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
+PART, MOST = 6, 3  # one of so many views is left out at a time, at most so many
+LEAST_SEEN = 0.02  # share of a left-out photo that the others must cover
+# What a run of these settings decides by work on the whole scene, or leaves out of the result
+LEFT_TO_RUN: dict[str, Any] = {
+    "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None, "time_budget": None, "photo_scale": 1.0,
+    "poses": "fixed", "exposure": "fixed", "blocks": "none", "recipe": None, "new_views": False,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """A scene without some of its views, and the photos of these."""
+
+    rest: Prepared  # The scene of the other views
+    photos: Photos  # Of the views that are left out
+    covered: np.ndarray  # [v,h,w] bool, their pixels that show what the other views see
+
+    @property
+    def shares(self) -> np.ndarray:
+        """Share ``[v]`` of each photo that the other views see."""
+        return self.covered.mean((1, 2))
+
+    @property
+    def rows(self) -> Gaussians:
+        """The input's Gaussians of the other views."""
+        return file_rows(self.rest.scene)
+
+    def score(self, gaussians: Gaussians) -> np.ndarray:
+        """Return the PSNR (dB) ``[v]`` of canonical Gaussians on what each photo shows of the rest."""
+        views = enumerate(self.covered)
+        return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
+
+    def mean(self, scores: np.ndarray) -> float:
+        """Return the mean of scores ``[v]`` by how much of each photo the others see."""
+        seen = self.shares > LEAST_SEEN
+        return float(np.average(scores[seen], weights=self.shares[seen]))
+
+    def plan(self, plan: Plan, **settings: Any) -> Plan:
+        """Plan a run on the rest: as ``plan``, but for what is decided by the whole scene, and for ``settings``."""
+        settings = plan.settings | LEFT_TO_RUN | settings
+        settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
+        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
+
+
+def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:
+    """Leave views out of a canonical scene of photos; None if the others see nothing of what they show."""
+    rest = subset(scene, [view for view in range(len(scene)) if view not in views])
+    if not views or len(file_rows(rest)) == 0:
+        return None
+    every = tuple(range(len(rest)))
+    part = replace(
+        prepared, input_scene=rest, scene=rest, reference=Reference(PHOTOS, every, every), repeated=every, moved=False,
+        unseen=rest.gaussians[:0], agreement=None,
+    )  # fmt: skip
+    chosen = subset(scene, views)
+    left_out = LeftOut(part, scene_photos(chosen), cover(rest, chosen))
+    return left_out if (left_out.shares > LEAST_SEEN).any() else None
+
+
+def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Choose views to leave out in each of two rounds, evenly spread among ``views`` and no neighbours together."""
+    count = min(MOST, max(1, len(views) // PART))
+    chosen = [views[place] for place in pick_views(len(views), 2 * count)]
+    return chosen[::2], chosen[1::2]
+
+
+def can_leave_out(prepared: Prepared) -> bool:
+    """Return whether a scene has photos of so many views that some can be left out."""
+    return prepared.reference.name == PHOTOS and len(prepared.reference.score_views) >= LEAST_VIEWS
+
+
+def file_rows(scene: PicturedScene) -> Gaussians:
+    """Return the Gaussians that the file has, without those that fill holes."""
+    return scene.gaussians[scene.stored_rows]
+
+
+def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
+    """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
+    points = file_rows(rest).means.astype(np.float64) if rest.aligned else context_points(rest, NEAR)
+    return visible_pixels(points, views.cameras, NEAR, rest.cameras)
