@@ -29,9 +29,9 @@ STEPS = 200
 # Small pictures have more detail to a pixel, so that fewer Gaussians cost them more: theirs are as many times the usual
 # share as the result's times, to this power. Gains at 1 % of five captures: 1.0 dB off for 2.3.
 USUAL, LESS = parse_share(SHARE), 0.3
-# A fifth of what new views gain is that of own photos where depth is confirmed, the rest that of the trial: chosen on ten
-# captures, of which, and of five others, 80 % of the results lie within SPREAD dB of it (docs/internals/notebook.md).
-# Beyond MOST_SHARE Gaussians for a pixel nothing is known
+# A fifth of what new views gain is that of own photos where depth is confirmed, the rest that of the trial: chosen on
+# ten captures, of which, and of five others, 80 % of the results lie within SPREAD dB of it
+# (docs/internals/notebook.md). Beyond MOST_SHARE Gaussians for a pixel nothing is known
 OWN, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 

@@ -82,7 +82,7 @@ class CountSearch:
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
     rendered: bool = False  # Whether renders of the input judge, which more Gaussians always show better
     left_out: LeftOut | None = None  # What judges in place of own views: photos that the builds leave out
-    most: int | None = None  # Gaussians from which on photos that are left out gain nothing; None: not known
+    most: int | None = None  # Gaussians from which on photos that are left out gain nothing; None: as the plan allows
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def run(self, build: Callable[[int | None], Candidate]) -> None:
@@ -150,8 +150,9 @@ class CountSearch:
         choices: dict[str, Any] = {}
         if self.plan.target_psnr is not None:
             best, tried = self.best, tuple(self.tried.items())
-            choices["search"] = {"count": self.count, "psnr": best.kept_psnr, "met": self.met, "tried": tried}
-            choices["search"] |= {"left_out": 0 if self.left_out is None else len(self.left_out.photos)}
+            met, left_out = self.met, 0 if self.left_out is None else len(self.left_out.photos)
+            psnr = best.kept_psnr if self.count == best.count else self.plan.target_psnr  # between two counts
+            choices["search"] = {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
         return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
 
     @property
@@ -191,10 +192,12 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Start a search for the number of Gaussians."""
     limits, left_out = plan.limits, leave_out_judges(prepared, plan)
+    agreement, most = prepared.agreement, limits.max_count
+    if left_out is not None and agreement is not None:
+        most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
     if plan.target_psnr is None:
-        return CountSearch(plan, choose_count(prepared, plan, build, left_out))
-    first = min(max(limits.default, limits.min_count), limits.max_count)
-    most = None if prepared.agreement is None else int(prepared.agreement.share * limits.num_pixels)
+        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most))
+    first = min(max(limits.default, limits.min_count), most)
     return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
 
 
@@ -223,15 +226,18 @@ def build_left_out(build: Build, left_out: LeftOut, plan: Plan, share: float, co
     return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
 
 
-def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None) -> int | None:
-    """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide."""
+def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
+    """Choose the number of Gaussians by the budget or the scene's curve; None: ``superpixels`` and K decide.
+
+    ``left_out``: photos that judge the curve; ``most``: Gaussians that are tried.
+    """
     limits, drop = plan.limits, plan.max_drop
     if drop is None and not plan.auto_count:
         return limits.count
     if prepared.reference.name == RENDERS:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
-        counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, limits.max_count)
+        counts = rungs(AUTO_RUNGS if drop is None else RUNGS, limits.default, limits.min_count, most)
         points = measure_curve(prepared, plan, build, SHORT if drop is None else LONG, counts, left_out)
     choose(curve=[asdict(point) for point in points])
     return curve_knee(points) if drop is None else count_within(points, drop)

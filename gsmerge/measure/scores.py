@@ -152,14 +152,16 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
     for split, count in document["num_views"].items():
         means = [(result["name"], result["mean"][split]) for result in results]
-        views = f"of {count} {KINDS[split]} view{'s' * (count > 1)}"
-        yield f"Quality {views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
-        heading = f"Quality {views}, over the pixels that the input covers"
+        views = f"Quality of {count} {KINDS[split]} view{'s' * (count > 1)}"
+        if "target" not in document["num_views"]:
+            views = views.replace("Quality", "No view was held out: quality")
+        yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
+        heading = f"{views}, over the pixels that the input covers"
         yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [
             (name, f"{100 * mean['share' + COVERED]:.0f} %", *_cells(mean, ZOOMED, COVERED))
             for name, mean in means if lacks
         ]  # fmt: skip
-        yield f"Quality {views} at other sizes, photos resized", ("", *heads), [
+        yield f"{views} at other sizes, photos resized", ("", *heads), [
             (name, *(cell for entry in mean["zooms"] for cell in _cells(entry, ZOOMED)))
             for name, mean in means if sizes
         ]  # fmt: skip

@@ -71,6 +71,7 @@ def view_page(data: ViewData) -> str:
         data=data,
         results=results,
         table=results_table(data),
+        own=reference_words(data)[1],
         sources=sources,
         left=left,
         right=right,
@@ -81,10 +82,11 @@ def view_page(data: ViewData) -> str:
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [
-                result | {"figures": [[figure.new, figure.better] for figure in result["figures"]]}
+                result | {"figures": [[figure.new, figure.mark] for figure in result["figures"]]}
                 for result in results
             ],
             "sizes": [place + photos for place in by_size],
+            "own": reference_words(data)[1],
             "views": [_view(view) for view in data.shown],
         },
         stills=stills,
@@ -163,17 +165,17 @@ class Figure:
     label: str
     old: str
     new: str
-    better: bool  # than the scene's own
+    mark: str  # its class in the style: "up" for better than the scene's own, "own" for what fits have seen; ""
 
 
 def figures(data: ViewData, place: int) -> list[Figure]:
     """Collect the figures at the top for one side: size and mean quality."""
     before, after = data.sides[0], data.sides[place]
     sizes = [
-        Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", False),
-        Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), False),
+        Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
+        Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
     ]
-    views = "held-out photos" if data.held_out else "its own photos" if data.reference == PHOTOS else data.reference
+    views, own = reference_words(data)
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in ("psnr", "ssim")]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
@@ -184,8 +186,21 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         old, new = (getattr(quality, name) for quality in pair)
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
             better = place > 0 and old is not None and new is not None and old < new
-            made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, better))
+            mark = "own" if own else "up" if better else ""
+            made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
+    expected = [side.new_gain for side in data.sides]
+    if any(expected) and not data.held_out:
+        low, high = expected[place] or (None, None)
+        words = NONE if low is None or high is None else f"{low:+.1f} to {high:+.1f} dB"
+        sizes.append(Figure("New views, expected", "", words, "up" if low is not None and low > 0 else ""))
     return sizes + (made if data.scored else [])
+
+
+def reference_words(data: ViewData) -> tuple[str, bool]:
+    """Describe what a page's scores are compared with, and say whether fits have seen it: own photos."""
+    if data.held_out:
+        return "held-out photos", False
+    return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)
 
 
 def results_table(data: ViewData) -> tuple[list[str], list[list[str]]]:

@@ -32,10 +32,10 @@ function showResult(source) {
   const { headline, figures, speed } = data.results[source - FIRST_RESULT];
   id("headline").textContent = headline;
   showSpeed(speed);
-  figures.forEach(([words, better], i) => {
+  figures.forEach(([words, mark], i) => {
     const figure = id("figures").children[i].querySelector("b");
-    figure.className = better ? "up" : "";
-    figure.lastElementChild.textContent = `→ ${words}`;
+    figure.className = mark;
+    figure.lastElementChild.textContent = figure.children.length > 1 ? `→ ${words}` : words;
   });
   for (const card of id("strip").querySelectorAll(".score:has(b)")) showScore(card, data.views[card.parentElement.dataset.view]);
   markResult();
@@ -45,7 +45,7 @@ function showResult(source) {
 function showScore(line, named) {
   const [before] = named.scores[0];
   const [after] = scoreOf(named, state.result);
-  line.replaceChildren(`${number(before, 1)} → `, make("b", `${number(after, 1)} dB`, { className: (after || 0) < (before || 0) ? "down" : "" }));
+  line.replaceChildren(`${number(before, 1)} → `, make("b", `${number(after, 1)} dB`, { className: (after || 0) < (before || 0) ? "down" : data.own ? "own" : "" }));
 }
 
 // The end of the headline.

@@ -46,6 +46,7 @@ def make_page(
         names=names,
         words=words + (f"; {len(failed)} failed" if failed else ""),
         part=PARTS[results.part],
+        doubt=results.doubt,
         results=_results(results),
         figures=[(figure, data_uri(drawings[figure.name], "image/svg+xml")) for figure in figures],
         views=_views(results, folder),

@@ -143,7 +143,7 @@ def _against(results: Results, cost: str, name: str, words: tuple[str, str, str]
     """Plot quality against a cost; ``words``: its title, description and label."""
     title, described, label = words
     panels = _quality_panels(results, lambda score: results.by_size(cost, score), level=True)
-    caption = f"Quality against {described}. Measured on {PARTS[results.part]}."
+    caption = f"{results.doubt}Quality against {described}. Measured on {PARTS[results.part]}."
     figure = _curves(name, title, caption, label, panels, log=True)
     return figure and replace(figure, labelled=cost == "seconds")
 
@@ -152,8 +152,8 @@ def _over_views(results: Results) -> Figure | None:
     panels = _quality_panels(results, results.by_views, level=False)
     panels = [panel for panel in panels if any(line.ours for line in panel.lines)]
     caption = (
-        "Quality against the number of input views, evenly spread; held-out views lie midway between them where their"
-        f" order is known. Measured on {PARTS[results.part]}. Size:"
+        f"{results.doubt}Quality against the number of input views, evenly spread; held-out views lie midway between"
+        f" them where their order is known. Measured on {PARTS[results.part]}. Size:"
         f" {results.size or 'the default superpixels'}."
     )
     return _curves("quality-views", "Quality against views", caption, "Input views", panels, log=False)

@@ -175,6 +175,11 @@ class Results:
                 ratios.setdefault(size_label(record), []).append(math.log(record.ratio / TYPICAL_RATIO))
         self.size = min(ratios, key=lambda size: (abs(float(np.mean(ratios[size]))), size), default="")
 
+    @property
+    def doubt(self) -> str:
+        """What captions begin with where no view was held out; empty where some were."""
+        return "" if self.part.startswith("target") else "No view was held out: fits have seen these. "
+
     def name(self, record: RunRecord) -> str:
         """Return the name of a run's line."""
         return self.names[line_key(record)]

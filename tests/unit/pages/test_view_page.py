@@ -120,13 +120,27 @@ def test_a_table_has_no_column_without_figures(data: ViewData) -> None:
 
 
 def test_every_result_has_its_headline_and_figures(data: ViewData) -> None:
-    page = view_page(with_three_results(data))
+    page = view_page(replace(with_three_results(data), reference="renders of the input"))
     half, tenth, least = json.loads(block(page, "data"))["results"]
-    assert half["figures"] == [["500", False], ["2.0 kB", False], ["25.00 dB", True], ["0.750", True]]
-    assert tenth["figures"][2:] == [["19.00 dB", False], ["0.500", False]]
+    assert half["figures"] == [["500", ""], ["2.0 kB", ""], ["25.00 dB", "up"], ["0.750", "up"]]
+    assert "No photo was held out" not in page
+    assert tenth["figures"][2:] == [["19.00 dB", ""], ["0.500", ""]]
     assert [one["headline"].split("\u00a0")[0] for one in (half, tenth, least)] == ["50.0", "10.0", "1.0"]
     assert "farther" in tenth["headline"]
     assert '<select id="result"' not in page
+
+
+def test_new_views_come_before_own_photos_which_never_count_as_better(data: ViewData) -> None:
+    three = with_three_results(data)
+    gains = (None, (2.0, 4.5), (-1.0, 1.5), None)
+    sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
+    page = view_page(replace(three, sides=sides))
+    half, tenth, least = json.loads(block(page, "data"))["results"]
+    assert "new views expected 2.0 to 4.5 dB closer" in half["headline"].replace("\u00a0", " ")
+    assert half["figures"][2:] == [["+2.0 to +4.5 dB", "up"], ["25.00 dB", "own"], ["0.750", "own"]]
+    assert tenth["figures"][2] == ["-1.0 to +1.5 dB", ""]
+    assert least["figures"][2] == ["-", ""]
+    assert "No photo was held out: scores are those of photos that fits have seen." in page
 
 
 def test_the_slider_is_over_sizes(data: ViewData) -> None:
