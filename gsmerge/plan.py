@@ -20,7 +20,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
+from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_share
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -205,7 +205,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         auto_count=options.budget.auto,
         levels=options.budget.levels,
         output=options.budget.output,
-        size=file_size(options.budget),
+        size=file_size(asked.budget),
         scored_views=_choose_scored_views(prepared, None if keeps or target is not None else EFFORTS[options.effort]),
         seed=options.seed,
         checkpoint=checkpoint,
@@ -417,6 +417,9 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
     if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
         taken = f"{most:,} Gaussians are taken of {budget.budget}, {text} of the input"
         note(f"budget: {taken}: more would not show new views better, because {why}; --set fill=true takes all")
+        usual = options.segment.superpixels == SHARE and options.decode.k == AUTO
+        if usual and agreement.share <= parse_share(SHARE):  # as without a budget
+            budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 
 

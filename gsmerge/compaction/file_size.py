@@ -51,7 +51,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     def choose_next(built: Sequence[Candidate]) -> int | None:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
         room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
-        fits = room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= count)
+        fits = room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= SURPLUS * count)
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]

@@ -82,8 +82,7 @@ def view_page(data: ViewData) -> str:
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [
-                result | {"figures": [[figure.new, figure.mark] for figure in result["figures"]]}
-                for result in results
+                result | {"figures": [[figure.new, figure.mark] for figure in result["figures"]]} for result in results
             ],
             "sizes": [place + photos for place in by_size],
             "own": reference_words(data)[1],

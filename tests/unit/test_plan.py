@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
@@ -17,7 +18,7 @@ from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.result import score
 from gsmerge.compaction.search import MAX_RUNS, add_target
 from gsmerge.errors import UsageError
-from gsmerge.facts.confirm_depths import confirm_depths
+from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
@@ -314,3 +315,16 @@ def test_the_estimate_is_what_the_run_does(
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
         assert run["k"] == plan.decode.k
         assert (plan.checkpoint is None) == (run["checkpoint"] == "none")
+
+
+@pytest.mark.parametrize("budget", ["40%", "5MB", "quest3"])
+def test_limits_beyond_what_wrong_depth_bears_are_as_no_budget(budget: str) -> None:
+    size, wrong = SceneSize(1_000_000, 10, 250, 400, True, "photos"), Agreement(0.3, 0.6, 0.1)
+    with record_run() as record:
+        limits = choose_for_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).limits
+        usual = choose_for_scene(size, options_of()).limits
+    assert (limits.exact, limits.count, limits.default) == (usual.exact, usual.count, usual.default)
+    assert limits.most == 44_000
+    assert noted(record.notes, "44,000", budget)
+    asked = resolve_budget(size, options_of(budget="2%"), wrong)
+    assert choose_for_scene(size, asked).limits.count == 20_000
