@@ -83,6 +83,20 @@ def test_a_psnr_is_met_with_few(scene: Scene) -> None:
     assert actual.report.choices["search"]["met"]
 
 
+def test_a_psnr_is_that_of_photos_left_out() -> None:
+    """Of four or more; the result is made of all views, with the number that two builds without some reach it with."""
+    wide = scenes.make_scene(scenes.room(), scenes.arc(6, 32, 24), noise=0.01)
+    easy, hard = (compact(wide, fit_steps=20, quality=asked, checkpoint="none").report for asked in ("12dB", "50dB"))
+    search = easy.choices["search"]
+    assert easy.unmet is None
+    assert search["met"]
+    assert search["left_out"] == 1
+    assert len(search["tried"]) <= 2
+    assert easy.num_output == search["count"]
+    assert "photos left out reach" in hard.unmet
+    assert hard.psnr_after > max(psnr for _, psnr in hard.choices["search"]["tried"])  # own photos, which the fit saw
+
+
 def test_a_target_out_of_reach_ends_with_4(small_scene: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "best.ply"
     said = run(
