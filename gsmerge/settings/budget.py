@@ -34,8 +34,8 @@ class BudgetOptions(Settings):
     quality: str | None = setting(None, "Fewest Gaussians that render photos at a PSNR such as 30dB, or that lose at "
         "most so much against the best, such as -0.2dB.",
         "These are photos that are left out, of four or more, or those of the input. Where rows belong to no pixels "
-        "and no number is asked for, the result keeps the input: its renders at 32.5 dB without photos, the photos within "
-        "0.3 dB with them.",
+        "and no number is asked for, the result keeps the input: its renders at 32.5 dB without photos, the photos "
+        "within 0.3 dB with them.",
         metavar="30dB|-0.2dB")  # fmt: skip
     output: str = setting(
         "", "Name of the file that is written and whose bytes a size counts, with its ending.", internal=True
