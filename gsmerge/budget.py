@@ -14,8 +14,9 @@ LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians tha
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
     """Return the number of Gaussians that a budget or a file size asks for; None without either."""
     device = DEVICES.get(str(options.budget))
-    if device is not None:  # a limit alone, until it is known how many the scene bears
-        return None if options.most is None else min(device, options.most)
+    if device is not None:  # a limit alone, until it is known how many the scene bears, unless it is to be filled
+        known = [num_input] if options.fill else [] if options.most is None else [options.most]
+        return min(device, *known) if known else None
     if options.budget in (None, AUTO):
         return None
     most = num_input if options.most is None else options.most

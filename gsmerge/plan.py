@@ -415,8 +415,8 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         return replace(options, budget=replace(budget, budget=text))
     most = max(size.num_views, int(agreement.share * size.num_gaussians))
     if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
-        taken = f"{most:,} Gaussians are taken of {budget.budget}, {text} of the input"
-        note(f"budget: {taken}: more would not show new views better, because {why}; --set fill=true takes all")
+        taken = f"at most {most:,} Gaussians are taken, {text} of the input"
+        note(f"budget {budget.budget}: {taken}: more would not show new views better, as {why}; fill=true takes all")
         usual = options.segment.superpixels == SHARE and options.decode.k == AUTO
         if usual and agreement.share <= parse_share(SHARE):  # as without a budget
             budget = replace(budget, budget=None)

@@ -72,7 +72,12 @@ def compact(
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a scene of which the facts are known."""
     plan = add_target(make_plan(prepared, options), prepared)  # every "auto" is decided once; options end here
-    rebuild = partial(build_scored, method.build, prepared, plan)
+
+    def rebuild(count: int | None) -> Candidate:
+        candidate = build_scored(method.build, prepared, plan, count)
+        add_seconds(candidate.record.seconds)  # beside those of the search
+        return candidate
+
     search = search_count(prepared, plan, method.build)  # one count, or counts until a quality is met
     if search.left_out is None:
         uncleaned = replace(plan, clean=CleanOptions()) if plan.cleans_last else plan
@@ -82,12 +87,11 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         share = len(search.left_out.rest.scene) / len(prepared.scene)
         search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan), share))
         best = rebuild(search.count)
-        add_seconds(best.record.seconds)  # beside those of the search
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
     levels = [build_scored(method.build, *fixed, count) for count in level_counts(len(best.gaussians), plan)]
     trial = try_new_views(prepared, plan, method.build, len(best.gaussians))
-    return make_result(best, levels, prepared, plan, search.facts(), trial)
+    return make_result(best, levels, prepared, plan, search.facts(best), trial)
 
 
 @record_part()

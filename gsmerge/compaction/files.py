@@ -90,7 +90,7 @@ def compact_files(
         result = _padded(result) if outputs.full_columns else result
         compacted, results = perf_counter(), (result, *result.coarser)
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
-        if expected is not None and not settings.budget.in_bytes:  # which leaves no room for it
+        if expected is not None:
             comments.append(new_views_comment(expected))
         views_named = result.cameras[views], name_photos(load.files.images, names), scene_title(files.ply)
         notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)

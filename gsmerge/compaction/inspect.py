@@ -298,4 +298,4 @@ def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
     if expected is None:
         return []
     gain = f"{expected['low']:+.1f} to {expected['high']:+.1f} dB"
-    return [f"new views  {expected['before']:.1f} dB from its input, {gain} from it, expected"]
+    return [f"new views  {gain} expected against its input, which shows them at {expected['before']:.1f} dB"]

@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
-from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, leave_out
+from gsmerge.compaction.left_out import LEAST_SEEN, LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out
 from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.row_colors import RENDERS
+from gsmerge.facts.row_colors import PHOTOS, RENDERS
 from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
@@ -25,7 +25,7 @@ from gsmerge.pipeline import Build
 from gsmerge.plan import KEPT_LOSS, Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
-from gsmerge.runtime.record import choose, current_record, record_part, report_progress, stage
+from gsmerge.runtime.record import choose, current_record, note, record_part, report_progress, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
@@ -45,7 +45,7 @@ PHOTOS_NEAR = 0.2  # the same for photos that decide the default: below KEPT_LOS
 MAX_RUNS = 6
 # Of photos that are left out: builds, beside the one that is written; dB per doubling until two were tried, the mean
 # below the usual count of eleven captures; dB above a target at which a count is near enough, half of that
-MAX_TRIED, NEW_SLOPE, NEW_NEAR = 2, 0.3, 0.15
+MAX_TRIED, NEW_SLOPE, NEW_NEAR = 3, 0.3, 0.15
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
 FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
 MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
@@ -114,9 +114,7 @@ class CountSearch:
         """Number of Gaussians of the best candidate; of photos left out, the one at which they reach the target."""
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
-        reached = [point for point in sorted(self.tried.items()) if point[1] >= self.plan.target_psnr]
-        points = [CurvePoint(count, psnr, 0.0) for count, psnr in sorted(self.tried.items())]
-        return count_reaching(points, self.plan.target_psnr) if reached else self.best.count
+        return count_reaching(sorted(self.tried.items()), self.plan.target_psnr) if self.met else self.best.count
 
     @property
     def best(self) -> Candidate:
@@ -133,27 +131,27 @@ class CountSearch:
         """Whether a candidate reaches the target."""
         return self.plan.target_psnr is not None and max(self.tried.values()) >= self.plan.target_psnr
 
-    @property
-    def unmet(self) -> str | None:
-        """Reason why the target is not met; None if it is met."""
-        if self.plan.target_psnr is None or self.plan.keeps_input or self.met:
-            return None
-        psnr, count = self.best.psnr or 0.0, self.best.count if self.left_out else len(self.best.gaussians)
-        views = "photos left out" if self.left_out else "the input views"
-        reached = f"{views} reach {psnr:.2f} dB with {count} Gaussians"
-        return f"quality: {self.plan.target_psnr:g} dB was asked for, {reached}"
+    def facts(self, result: Candidate) -> dict[str, Any]:
+        """Return the search's entries of a report: ``seconds`` of all candidates, ``choices``, ``notes``, ``unmet``.
 
-    def facts(self) -> dict[str, Any]:
-        """Return the search's entries of a report: ``seconds`` of all candidates, ``choices``, ``notes``, ``unmet``."""
+        ``result`` is what was made of the best candidate.
+        """
         names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
         seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
         choices: dict[str, Any] = {}
+        notes, unmet = self.notes, None
         if self.plan.target_psnr is not None:
-            best, tried = self.best, tuple(self.tried.items())
-            met, left_out = self.met, 0 if self.left_out is None else len(self.left_out.photos)
+            best, tried, met = self.best, tuple(self.tried.items()), self.met
+            left_out = 0 if self.left_out is None else len(self.left_out.photos)
             psnr = best.kept_psnr if self.count == best.count else self.plan.target_psnr  # between two counts
             choices["search"] = {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
-        return {"seconds": seconds, "choices": choices, "notes": self.notes, "unmet": self.unmet}
+            views = f"{left_out} photo(s) left out" if left_out else "the input views"
+            reached = f"{views} reach {psnr or 0.0:.2f} dB with {len(result.gaussians):,} Gaussians"
+            if left_out and met:
+                notes = [*notes, f"quality: {reached}"]
+            elif not met and not self.plan.keeps_input:
+                unmet = f"quality: {self.plan.target_psnr:g} dB was asked for; {reached}, the best that was tried"
+        return {"seconds": seconds, "choices": choices, "notes": notes, "unmet": unmet}
 
     @property
     def notes(self) -> list[str]:
@@ -207,10 +205,16 @@ def leave_out_judges(prepared: Prepared, plan: Plan) -> LeftOut | None:
     Without a fit no photo has been seen; and a count that keeps the input is compared with what its own views show.
     """
     judged = (plan.target_psnr is not None and not plan.keeps_input) or plan.max_drop is not None or plan.auto_count
-    if not judged or plan.fit.fit == "none" or not can_leave_out(prepared):
+    if not judged or plan.fit.fit == "none":
         return None
-    views, _ = choose_views(prepared.reference.score_views)
-    return leave_out(prepared.scene, views, prepared)
+    if can_leave_out(prepared):
+        for views in choose_views(prepared.reference.score_views):
+            if left_out := leave_out(prepared.scene, views, prepared):
+                return left_out
+    if prepared.reference.name == PHOTOS and not plan.auto_count:
+        why = f"there are fewer than {LEAST_VIEWS} photos, or others see nothing of what these show"
+        note(f"quality: judged by photos that the fit has seen, as {why}: new views look worse")
+    return None
 
 
 @record_part()
@@ -298,23 +302,23 @@ def level_counts(finest: int, plan: Plan) -> list[int]:
 
 
 def count_within(points: Sequence[CurvePoint], max_drop: float) -> int:
-    """Return the fewest Gaussians at which the curve lies at most ``max_drop`` dB below its best point.
+    """Return the fewest Gaussians whose quality, PSNR + 40 SSIM, lies at most ``max_drop`` dB below the curve's best.
 
     Points come by rising count. Between them the curve is linear in the logarithm of the count.
     """
     if not points:
         raise ValueError("points: expected at least one, got none")
-    return count_reaching(points, max(p.psnr for p in points) - max_drop)
+    qualities = [(p.count, p.psnr + SSIM_DB * p.ssim) for p in points]
+    return count_reaching(qualities, max(quality for _, quality in qualities) - max_drop)
 
 
-def count_reaching(points: Sequence[CurvePoint], psnr: float) -> int:
-    """Return the fewest Gaussians at which a curve reaches a PSNR (dB) that one of its points has; see above."""
-    first = next(i for i, p in enumerate(points) if p.psnr >= psnr)
+def count_reaching(points: Sequence[tuple[int, float]], wanted: float) -> int:
+    """Return the fewest Gaussians at which a curve of (count, quality) reaches a quality that one of its points has."""
+    first = next(i for i, (_, quality) in enumerate(points) if quality >= wanted)
     if first == 0:
-        return points[0].count
-    below, above = points[first - 1], points[first]
-    share = (psnr - below.psnr) / (above.psnr - below.psnr)
-    return math.ceil(below.count * float(power(above.count / below.count, share)))
+        return points[0][0]
+    (count, quality), (more, better) = points[first - 1 : first + 1]
+    return math.ceil(count * float(power(more / count, (wanted - quality) / (better - quality))))
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:

@@ -189,6 +189,7 @@ def figures(data: ViewData, place: int) -> list[Figure]:
             made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
     expected = [side.new_gain for side in data.sides]
     if any(expected) and not data.held_out:
+        made = [figure for figure in made if not figure.label.startswith("SSIM")]  # the headline needs its place
         low, high = expected[place] or (None, None)
         words = NONE if low is None or high is None else f"{low:+.1f} to {high:+.1f} dB"
         sizes.append(Figure("New views, expected", "", words, "up" if low is not None and low > 0 else ""))

@@ -33,7 +33,7 @@ USAGE = {
     "compact room --k 2 --set k=2": "--set k*--k too",
     "compact room --hint oder=none": "--hint oder*unknown*order",
     "compact room --threads 0": "--threads*1",
-    "compact room --budget 5B": "budget*502*5",
+    "compact room --budget 5B": "budget*579*5",
     "compact room --effort slow": "--effort*'slow'*'draft'",
     "compact room -o -": "--output*file*stdout",
     "compact room -o a.ksplat": "a.ksplat*.ply*lod-meta.json",

@@ -9,7 +9,7 @@ import scenes
 from messages import refuses
 
 from gsmerge import write_ply
-from gsmerge.io.formats.ply import count_for_bytes, file_bytes
+from gsmerge.io.formats.ply import COMMENT_BYTES, count_for_bytes, file_bytes
 from gsmerge.settings.budget import parse_budget, parse_bytes
 
 
@@ -79,12 +79,12 @@ def test_count_for_bytes_is_the_most_that_fits(degree: int) -> None:
     sizes += [file_bytes(10**k, degree) - d for k in (1, 2, 5) for d in (0, 1, 2)]
     for size in sizes:
         if size >= file_bytes(1, degree):
-            count = count_for_bytes(size, degree)
+            count = count_for_bytes(size + COMMENT_BYTES, degree)
             assert file_bytes(count, degree) <= size < file_bytes(count + 1, degree)
 
 
 def test_count_for_bytes_out_of_range() -> None:
-    with refuses(ValueError, "budget", 502, 100):
+    with refuses(ValueError, "budget", 502 + COMMENT_BYTES, 100):
         count_for_bytes(100, 0)
     with refuses(ValueError, "sh_degree", "0 to 4", 5):
         count_for_bytes(10**6, 5)

@@ -28,6 +28,8 @@ from gsmerge.types import Gaussians
 
 _PACKED_ROWS = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
 MAX_DEGREE = 3  # of the harmonics that results have: splat-transform 3.7 and gsply refuse a .ply with more
+# Of the longest comment on new views
+COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4
 THIN = 1e-3  # of the smaller scale: the third of a 2D Gaussian
 MAX_LOGIT = 16.0  # from 16.6 on the sigmoid is 1 in float32, and its logit infinite
@@ -379,10 +381,13 @@ def file_bytes(count: int, sh_degree: int) -> int:
 
 
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits."""
+    """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; UsageError if none fits.
+
+    There is room for a comment on new views.
+    """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")
-    least = file_bytes(1, sh_degree)
+    least = file_bytes(1, sh_degree) + COMMENT_BYTES
     if max_bytes < least:
         raise UsageError(f"budget: expected at least {least} bytes for one Gaussian, got {max_bytes}")
-    return bisect_right(range(max_bytes), max_bytes, key=lambda count: file_bytes(count, sh_degree)) - 1
+    return bisect_right(range(max_bytes), max_bytes - COMMENT_BYTES, key=lambda count: file_bytes(count, sh_degree)) - 1

@@ -51,6 +51,7 @@ _lazy = lazy_functions(__package__)
 _SOG = 13.0, 22.0, 36.5, 56.5
 IN_TEXT = 4 / 3  # bytes of base64, as which a page has files in its text, for each of theirs
 VIEWER = Path(__file__).parents[2] / "pages/vendor/spark-three.js.gz"
+PAGE = 43_000  # bytes of a page besides: its scripts, licences, and the picture and textures of one Gaussian
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
@@ -65,7 +66,7 @@ LEVELS = Format(
 COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
 HTML = Format(
     ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means"),
-    each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size),
+    each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size) + PAGE,
 )  # fmt: skip
 SITE, SITE_SCENE = "index.html", "scene.sog"  # of a page that has its files beside it
 FILES = (  # of endings that end alike the longest first
