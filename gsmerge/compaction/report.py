@@ -265,7 +265,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
         + (f"  <- the result has {count:,}" if p is nearest else "")
         for p in points
     ]
-    return ["after short fits, on patches of the photos that they left out:", head, *rows]
+    return ["after short fits, on photos that they left out, or patches of them:", head, *rows]
 
 
 def summary_line(document: Mapping[str, Any]) -> str:

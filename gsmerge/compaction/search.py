@@ -145,7 +145,7 @@ class CountSearch:
             left_out = 0 if self.left_out is None else len(self.left_out.photos)
             psnr = best.kept_psnr if self.count == best.count else self.plan.target_psnr  # between two counts
             choices["search"] = {"count": self.count, "psnr": psnr, "met": met, "tried": tried, "left_out": left_out}
-            views = f"{left_out} photo(s) left out" if left_out else "the input views"
+            views = "photos left out" if left_out else "the input views"
             reached = f"{views} reach {psnr or 0.0:.2f} dB with {len(result.gaussians):,} Gaussians"
             if left_out and met:
                 notes = [*notes, f"quality: {reached}"]

@@ -94,7 +94,7 @@ def test_a_psnr_is_that_of_photos_left_out() -> None:
     assert len(search["tried"]) <= 3
     assert easy.num_output == search["count"]
     assert "left out reach" in hard.unmet
-    assert noted(easy.notes, "quality: 1 photo(s) left out reach")
+    assert noted(easy.notes, "quality: photos left out reach")
     assert hard.psnr_after > max(psnr for _, psnr in hard.choices["search"]["tried"])  # own photos, which the fit saw
 
 

@@ -313,7 +313,7 @@ def test_photos_left_out_are_met_by_few_builds(target: float) -> None:
 def test_photos_left_out_take_no_more_than_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
     assert max(actual.tried) == actual.count == 1600
-    facts, reached = actual.facts(actual.best), "2 photo(s) left out reach 20.68 dB with 1,600 Gaussians"
+    facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"
     assert facts["unmet"] == f"quality: 30 dB was asked for; {reached}, the best that was tried"
     assert facts["choices"]["search"]["left_out"] == 2
 
