@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians
 NEAR, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
 ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
-TRIES, MAX_REBUILDS = 8, 3
+TRIES, MAX_REBUILDS = 8, 2
 LONGEST_TITLE = 255  # bytes of a page's title, which is a file's name, at most
 
 Rebuild = Callable[[int], Candidate]
