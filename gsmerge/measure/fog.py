@@ -1,8 +1,9 @@
-"""Fog and veils: what a compact scene shows where its input shows nothing or something behind, seen from outside.
+"""Fog, veils and spikes: what a compact scene shows from outside where its input shows nothing, or surfaces.
 
 Photos judge a scene from where they stand. A viewer's first move is to step back and turn: Gaussians that hang in gaps
-between the views then show as haze, those of wrong depth as veils before surfaces, and gaps in surfaces as holes. The
-measure needs no photos, only the input and the cameras of its views; docs/guide/evaluate.md defines it for others.
+between the views then show as haze, those of wrong depth as veils before surfaces, gaps in surfaces as holes, and long
+thin ones, which made the texture of one view, as strokes. The measure needs no photos, only the input and the cameras
+of its views; docs/guide/evaluate.md defines it for others.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import numpy as np
 
 from gsmerge.facts.views import pick_views
 from gsmerge.fit.report import HAZE
-from gsmerge.geometry import middle_depth, step_outside
+from gsmerge.geometry import camera_depths, middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.raster import Splats, prepare, tile_view
+from gsmerge.raster import Splats, prepare, render, tile_view
 from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
@@ -32,6 +33,9 @@ MARGIN = 17  # pixels per side of the square that erodes what is empty
 FAR = 0.1  # of the width: distance from what the input shows from which fog is far
 VEIL = 0.7  # of the input's depth: what a result shows nearer than that is a veil
 VEILED = 0.08  # worst veil above which a result gets a note
+# Spikes are Gaussians so many times as long as their second axis, and longer (3 sigma) than a share of the width; they
+# show where a channel changes by more than CHANGED without them
+RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
 NEAREST = 0.25  # of the median depth of the view: what is nearer to a camera is drawn in neither picture of depth
 
 
@@ -46,6 +50,9 @@ class Fog:
         veil: Share of the pixels where the input is solid whose depth in the result is less than 0.7 of the input's,
             mean of the cameras.
         veil_worst: The same of the camera where it is most.
+        spikes: Share of the pictures that changes visibly without Gaussians at least five times as long as their second
+            axis and longer than 5 % of the width.
+        strokes: The same of those at least three times as long.
     """
 
     fog_near: float | None = None
@@ -53,6 +60,8 @@ class Fog:
     holes: float | None = None
     veil: float | None = None
     veil_worst: float | None = None
+    spikes: float | None = None
+    strokes: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +80,7 @@ def measure_fog(
     near: float = 0.01,
     progress: Progress = lambda *_: None,
 ) -> dict[str, dict[str, Fog]]:
-    """Measure fog, veils and holes of results, by name, seen from outside the ``cameras`` of the scene ``reference``.
+    """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
@@ -83,7 +92,8 @@ def measure_fog(
         progress("views from outside", number, len(outside))
         expected = look(first, camera, near, NEAREST * depth)
         for name in results:
-            pictures[name].append((kind, count_pixels(expected, look(splats[name], camera, near, NEAREST * depth))))
+            seen = count_pixels(expected, look(splats[name], camera, near, NEAREST * depth))
+            pictures[name].append((kind, np.concatenate([seen, count_spikes(results[name], camera, near)])))
     return {
         name: {
             kind: mean_fog(np.stack([counts for other, counts in rows if kind in (other, ALL)]))
@@ -138,8 +148,25 @@ def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:
     return np.array([*fog, holes, (float(veil.sum()), float(covered.sum()))])
 
 
+def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarray:
+    """Return (pixels that change without spikes, pixels) ``[2,2]`` of a picture, for each of ``RATIOS``."""
+    _, second, longest = np.sort(gaussians.scales, 1).T
+    depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
+    long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
+    whole, counts = render(gaussians, camera, near=near).images[0], []
+    for ratio in RATIOS:
+        spikes = long & (longest >= ratio * second)
+        less = render(gaussians[~spikes], camera, near=near).images[0] if spikes.any() else whole
+        counts.append((float((np.abs(whole - less).max(-1) > CHANGED).sum()), float(camera.width * camera.height)))
+    return np.array(counts)
+
+
 def mean_fog(counts: np.ndarray) -> Fog:
-    """Divide the sums by the numbers of pixels of :func:`count_pixels`, ``[pictures,4,2]``; veils by picture."""
-    near, far, holes, _ = (above / count if count else None for above, count in counts.sum(0).tolist())
+    """Divide the sums of :func:`count_pixels` and :func:`count_spikes`, ``[pictures,6,2]``, by the pixels.
+
+    Veils are divided by picture.
+    """
+    near, far, holes, _, *spikes = (above / count if count else None for above, count in counts.sum(0).tolist())
     veils = [above / count for above, count in counts[:, 3].tolist() if count]
-    return Fog(near, far, holes, *((sum(veils) / len(veils), max(veils)) if veils else ()))
+    mean, worst = (sum(veils) / len(veils), max(veils)) if veils else (None, None)
+    return Fog(near, far, holes, mean, worst, *spikes)

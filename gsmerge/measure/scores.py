@@ -23,6 +23,7 @@ COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips
 METRICS = tuple(field.name for field in fields(Quality))
 OUTSIDE = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
+    "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
 # Columns that a narrow terminal leaves out, the first one first
 LEAST = ("bytes each", "overdraw", "smaller by", "threads", "earned back after", "ms/view", "kept")
@@ -39,10 +40,11 @@ def evaluation_document(
 ) -> dict[str, Any]:
     """Convert an evaluation to plain JSON types, with further facts on each result, such as path and bytes.
 
-    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog, holes and veils,
-    null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other sizes
-    than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is true,
-    ``lpips_views`` if LPIPS was measured on fewer views of some split. Within one schema version keys are only added.
+    ``schema_version`` 1: tool, reference, views, results (facts, count, ratio, render seconds, fog, holes, veils and
+    spikes, null for the input, means by split, a score for each view), notes. Means and scores have ``zooms`` if other
+    sizes than that of the photos were requested; ``photo_side`` is present if it is not 0, ``antialiased`` if it is
+    true, ``lpips_views`` if LPIPS was measured on fewer views of some split. Within one schema version keys are only
+    added.
     """
     return {
         **document_head(),

@@ -38,5 +38,5 @@ class EvaluateOptions(Settings):
     antialiased: bool = setting(False, "Lower the opacity of small Gaussians by what the low-pass adds to them, as "
         "some viewers do (Mip-Splatting).",
         "See `antialiased` of `gsmerge.render`.")  # fmt: skip
-    fog: bool = setting(True, "Also measure fog, veils and holes of the results, which the scene's Gaussians are drawn "
-        "24 more times for.")  # fmt: skip
+    fog: bool = setting(True, "Also measure fog, veils, holes and spikes of the results, which the scene's Gaussians "
+        "are drawn 24 more times for.")  # fmt: skip

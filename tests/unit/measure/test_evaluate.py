@@ -380,8 +380,8 @@ def test_fog_and_holes_are_of_each_result(scene: Scene, half: Gaussians, actual:
 def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     document = json.loads(to_json(evaluation_document(actual, {})))
     given, result = document["results"]
-    names = ["fog_near", "fog_far", "holes", "veil", "veil_worst"]
-    assert [given[name] for name in names] == [None] * 5
+    names = ["fog_near", "fog_far", "holes", "veil", "veil_worst", "spikes", "strokes"]
+    assert [given[name] for name in names] == [None] * 7
     assert given["fog_by_kind"] == {}
     assert [result[name] for name in names] == list(vars(actual.results[1].fog["all"]).values())
     assert result["fog_by_kind"]["turned"] == vars(actual.results[1].fog["turned"])
@@ -390,7 +390,7 @@ def test_documents_have_fog_and_holes(actual: Evaluation) -> None:
     assert (rows[0]["holes"], float(rows[-1]["holes"])) == ("", result["holes"])
     heading, head, row = evaluation_lines(document)[-3:]
     assert heading.startswith("Seen")
-    assert head.split() == ["near", "fog", "far", "fog", "holes", "veil", "worst", "veil"]
+    assert head.split() == ["near", "fog", "far", "fog", "holes", "veil", "worst", "veil", "spikes", "strokes"]
     assert row.split() == ["half", *(f"{result[name]:.3f}" for name in names)]
 
 

@@ -55,6 +55,12 @@ def cameras(width: int = WIDTH, height: int = HEIGHT, views: int = 1) -> Cameras
     return Cameras(np.tile(np.eye(4), (views, 1, 1)), scenes.intrinsics(views, width, height), width, height)
 
 
+def needle(length: float, width: float) -> Gaussians:
+    """A white Gaussian in the middle of the wall, along x; standard deviations, world units."""
+    one = balls(np.array([[0, 0, DEPTH - 0.2]]), width, 0.95)
+    return replace(one, scales=np.float32([[length, width, width]]), sh0=one.sh0 + np.float32(1.7))
+
+
 def fog_of(given: Gaussians, result: Gaussians, seen: Cameras | None = None, near: float = 0.01) -> dict[str, Fog]:
     return measure_fog(given, {"it": result}, seen or cameras(), near)["it"]
 
@@ -80,7 +86,7 @@ def test_a_curtain_is_fog_of_its_opacity() -> None:
 def test_a_rim_about_the_outline_is_no_fog() -> None:
     """Stepped back by half the depth the wall is 107 pixels wide, and what it is widened by a third less, too."""
     thin = fog_of(wall(), wall(-1.1, 1.1))["back"]  # 5 pixels a side: within the eroded rim
-    assert list(vars(thin).values()) == pytest.approx([0, 0, 0, 0, 0], abs=2e-3)
+    assert list(vars(thin).values()) == pytest.approx([0] * 7, abs=2e-3)
     wide = fog_of(wall(), wall(-1.3, 1.3))["back"]  # 16 pixels, a tenth of the width: near fog alone
     assert wide.fog_near > 0.02
     assert wide.fog_far == pytest.approx(0, abs=2e-3)
@@ -138,8 +144,8 @@ def test_missing_pieces_are_holes() -> None:
 
 def test_nothing_empty_and_nothing_solid() -> None:
     kinds = (*CAMERAS, ALL)
-    assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0, 0.0, 0.0))
-    assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog())
+    assert fog_of(curtain(0.95), curtain(0.95)) == dict.fromkeys(kinds, Fog(None, None, 0.0, 0.0, 0.0, 0.0, 0.0))
+    assert fog_of(curtain(0.5), curtain(0.2)) == dict.fromkeys(kinds, Fog(spikes=0.0, strokes=0.0))
 
 
 def test_places_of_the_cameras() -> None:
@@ -171,7 +177,7 @@ def test_units_and_rigid_motions_change_nothing(factor: float) -> None:
     added = curtain(0.8, (1.5, 0.2, DEPTH), size=0.2), curtain(0.9, (0.3, 0, 0.5), size=0.1)
     result = Gaussians.concat([wall(-1.0, 0.5), *added])
     expected = figures(fog_of(wall(), result))
-    assert (expected[2] > 0.01).all()
+    assert (expected[2, :5] > 0.01).all()
     turn, shift = rotation(0.4, -0.3, 0.9), factor * np.array([3.0, -2, 1])
     given, moved = (scenes.move_gaussians(one, turn, factor, shift) for one in (wall(), result))
     viewmats = np.eye(4)[None].copy()
@@ -189,3 +195,15 @@ def test_a_note_on_haze() -> None:
     note = describe_fog("small.ply", Fog(0.4, 0.314, 0))
     assert note is not None
     assert says(note, "small.ply", "outside", "fog 0.31")
+
+
+@pytest.mark.parametrize(
+    ("length", "width", "spikes", "strokes"),
+    [(0.2, 0.02, True, True), (0.2, 0.05, False, True), (0.2, 0.1, False, False), (0.01, 0.001, False, False)],
+)
+def test_long_thin_gaussians_are_spikes(length: float, width: float, spikes: bool, strokes: bool) -> None:
+    """Of at least five times, or three times, their second axis; short ones, and round ones, are none."""
+    fog = fog_of(wall(), Gaussians.concat([wall(), needle(length, width)]))[ALL]
+    assert (fog.spikes > 0, fog.strokes > 0) == (spikes, strokes)
+    assert max(fog.spikes, fog.strokes) < 0.05
+    assert fog_of(wall(), wall())[ALL].strokes == 0
