@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.budget import FileSize, exact_count, file_size, max_allowed
 from gsmerge.errors import UsageError
-from gsmerge.facts.confirm_depths import Agreement
+from gsmerge.facts.confirm_depths import FEWEST, Agreement
 from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
@@ -20,7 +20,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_share
+from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -418,7 +418,7 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         taken = f"at most {most:,} Gaussians are taken, {text} of the input"
         note(f"budget {budget.budget}: {taken}: more would not show new views better, as {why}; fill=true takes all")
         usual = options.segment.superpixels == SHARE and options.decode.k == AUTO
-        if usual and agreement.share <= parse_share(SHARE):  # as without a budget
+        if usual and agreement.share <= FEWEST:  # as without a budget
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
-from gsmerge.compaction.file_size import drop_to_bytes
+from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.compaction.result import CompactResult, measure_besides, measure_input, measure_on_files, measure_result
 from gsmerge.facts.partition import (
@@ -110,7 +110,8 @@ def compact_in_blocks(
         if most is not None and most < len(result):
             result = faintest_dropped(result, most)
         if asked := file_size(options.budget):
-            result = drop_to_bytes(result, asked.num_bytes, asked.file, scene.cameras)
+            page = asked.num_bytes, asked.file, scene.cameras
+            result = drop_to_bytes(result, *page, measure_rest(result, *page))
         everything = work.share(result)
         scored = work.run("score", score_part, count, each_part(parts, everything))
         scores = [score for score, _ in adopt_records(scored)]

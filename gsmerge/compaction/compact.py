@@ -84,8 +84,7 @@ def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions
         search.run(partial(build_scored, method.build, prepared, uncleaned))
         best = clean_last(search.best, prepared, plan)
     else:
-        share = len(search.left_out.rest.scene) / len(prepared.scene)
-        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan), share))
+        search.run(partial(build_left_out, method.build, search.left_out, search.left_out.plan(plan)))
         best = rebuild(search.count)
     best = meet_bytes(best, rebuild, prepared, plan)
     fixed = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()

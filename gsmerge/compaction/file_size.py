@@ -42,11 +42,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     if plan.size is None or not plan.size.packed:
         return candidate
     most, file = plan.size.num_bytes, plan.size.file
-
-    rest = measure_bytes(candidate.gaussians[:1], file, candidate.cameras)
-    if rest > most:
-        problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
-        raise UsageError(f"budget: {problem}, got {human_bytes(most)}")
+    rest = measure_rest(candidate.gaussians, most, file, candidate.cameras)
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
@@ -55,13 +51,21 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]
-    kept = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras)
+    kept = drop_to_bytes(candidate.gaussians, most, file, candidate.cameras, rest)
     return candidate if len(kept) == len(candidate.gaussians) else shrink(candidate, kept, prepared, plan)
 
 
-def drop_to_bytes(gaussians: Gaussians, most: int, file: Format, cameras: Cameras) -> Gaussians:
-    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; this may be none."""
+def measure_rest(gaussians: Gaussians, most: int, file: Format, cameras: Cameras) -> int:
+    """Count the bytes of a file with one of the Gaussians; UsageError if they are more than ``most``."""
     rest = measure_bytes(gaussians[:1], file, cameras)
+    if rest > most:
+        problem = f"expected at least {human_bytes(rest)} for a {file.ending} with one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(most)}")
+    return rest
+
+
+def drop_to_bytes(gaussians: Gaussians, most: int, file: Format, cameras: Cameras, rest: int) -> Gaussians:
+    """Keep as many of the largest and most opaque Gaussians as fit into ``most`` bytes; one takes ``rest``."""
     low, high = 0, len(gaussians)
     kept, count = gaussians[:0], len(gaussians)
     for _ in range(TRIES):

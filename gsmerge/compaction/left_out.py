@@ -50,10 +50,10 @@ class LeftOut:
         views = enumerate(self.covered)
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
-    def mean(self, scores: np.ndarray) -> float:
-        """Return the mean of scores ``[v]`` by how much of each photo the others see."""
-        seen = self.shares > LEAST_SEEN
-        return float(np.average(scores[seen], weights=self.shares[seen]))
+    def reduce(self, count: int) -> int:
+        """Return as many of ``count`` Gaussians of the whole scene as its other views have of all pixels."""
+        views = len(self.rest.scene)
+        return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
         """Plan a run on the rest: as ``plan``, but for what is decided by the whole scene, and for ``settings``."""
@@ -75,6 +75,12 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
     chosen = subset(scene, views)
     left_out = LeftOut(part, scene_photos(chosen), cover(rest, chosen))
     return left_out if (left_out.shares > LEAST_SEEN).any() else None
+
+
+def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
+    """Return the mean of scores ``[v]`` of photos by the ``shares [v]`` of them that others see, of those they see."""
+    seen = shares > LEAST_SEEN
+    return float(np.average(scores[seen], weights=shares[seen]))
 
 
 def choose_views(views: Sequence[int]) -> tuple[list[int], list[int]]:

@@ -11,7 +11,15 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut, can_leave_out, choose_views, file_rows, leave_out
+from gsmerge.compaction.left_out import (
+    LEAST_SEEN,
+    LeftOut,
+    can_leave_out,
+    choose_views,
+    file_rows,
+    leave_out,
+    mean_seen,
+)
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power
@@ -81,7 +89,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     """
     scene = prepared.scene
     pixels = scene.pixels_per_view * len(scene)
-    if not plan.new_views or not scene.aligned or count > MOST_SHARE * pixels or not can_leave_out(prepared):
+    known = prepared.agreement is not None and count <= MOST_SHARE * pixels
+    if not (plan.new_views and known and can_leave_out(prepared)):
         return None
     with record_part(silent=True) as record:
         small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // SIDE))
@@ -92,9 +101,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     if not scores:
         return None
     shares, *each = np.concatenate(scores, 1)
-    seen = shares > LEAST_SEEN
-    own, before, after = (float(np.average(psnr[seen], weights=shares[seen])) for psnr in each)
-    return Trial(own, before, after, int(seen.sum()))
+    own, before, after = (mean_seen(psnr, shares) for psnr in each)
+    return Trial(own, before, after, int((shares > LEAST_SEEN).sum()))
 
 
 def _score_round(left_out: LeftOut, small: PicturedScene, plan: Plan, build: Build, share: float) -> np.ndarray:

@@ -14,7 +14,15 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsmerge.budget import LEVEL_FACTOR
-from gsmerge.compaction.left_out import LEAST_SEEN, LEAST_VIEWS, LeftOut, can_leave_out, choose_views, leave_out
+from gsmerge.compaction.left_out import (
+    LEAST_SEEN,
+    LEAST_VIEWS,
+    LeftOut,
+    can_leave_out,
+    choose_views,
+    leave_out,
+    mean_seen,
+)
 from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
@@ -218,15 +226,15 @@ def leave_out_judges(prepared: Prepared, plan: Plan) -> LeftOut | None:
 
 
 @record_part()
-def build_left_out(build: Build, left_out: LeftOut, plan: Plan, share: float, count: int | None) -> Candidate:
-    """Build a candidate of ``count`` Gaussians without some views, and score it on their photos.
+def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
+    """Build a candidate of ``count`` Gaussians without some views, by a ``plan`` for the rest, and score it on them.
 
-    It has the ``share`` of the Gaussians that the other views have of all pixels. The ``plan`` is one for these.
+    It has as many of the Gaussians as the rest has of the views.
     """
     assert count is not None
-    fitted = build(left_out.rest, plan, max(1, round(share * count)))
+    fitted = build(left_out.rest, plan, left_out.reduce(count))
     with stage("score"):
-        psnr = left_out.mean(left_out.score(fitted.gaussians))
+        psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
     return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
 
 
@@ -258,18 +266,17 @@ def measure_curve(
     short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
     if left_out is None:
         photos = scene_photos(prepared.scene)[prepared.reference.score_views]
-        weights, min_gain, share = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain, 1.0
+        weights, min_gain = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain
     else:
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
         photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.covered[seen]]
-        min_gain, share = math.inf, len(left_out.rest.scene) / len(prepared.scene)
-        prepared, plan = left_out.rest, left_out.plan(plan)
+        prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
     points: list[CurvePoint] = []
     report_progress(TRIED, 0, len(counts))
     for count in counts:
         with record_part(silent=True):
-            gaussians = build(prepared, quick, max(1, round(share * count))).gaussians
+            gaussians = build(prepared, quick, left_out.reduce(count) if left_out else count).gaussians
         points.append(_point(count, gaussians, photos, weights, min_gain))
         report_progress(TRIED, len(points), len(counts))
     return points

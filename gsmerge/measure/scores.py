@@ -152,11 +152,10 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
     lacks = (first["share" + COVERED] or 1) < WHOLE  # of the input's own views, where they are measured
     sizes = [entry["zoom"] for entry in first.get("zooms", ())]
     heads = [f"{name.upper()} {zoom:g}x" for zoom in sizes for name in ZOOMED]
+    quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
     for split, count in document["num_views"].items():
         means = [(result["name"], result["mean"][split]) for result in results]
-        views = f"Quality of {count} {KINDS[split]} view{'s' * (count > 1)}"
-        if "target" not in document["num_views"]:
-            views = views.replace("Quality", "No view was held out: quality")
+        views = f"{quality} of {count} {KINDS[split]} view{'s' * (count > 1)}"
         yield f"{views}, {seen}", ("", *COLUMNS.values()), [(name, *_cells(mean)) for name, mean in means]
         heading = f"{views}, over the pixels that the input covers"
         yield heading, ("", "of all", *(COLUMNS[name] for name in ZOOMED)), [

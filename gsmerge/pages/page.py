@@ -15,7 +15,6 @@ import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.io.formats.arrays import describe_gain
 from gsmerge.io.formats.table import VIEWER
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
@@ -122,6 +121,14 @@ def headline(data: ViewData, place: int = 1) -> str:
     return f"{said}, {_nearer(new - old)} {'to' if new >= old else 'from'} {words}"
 
 
+def describe_gain(low: float, high: float) -> str:
+    """Describe the bounds of a gain (dB) in words."""
+    if low < 0 < high:
+        return f"{-low:.1f} dB farther to {high:.1f} dB closer"
+    least, most = sorted((low, high), key=abs)
+    return f"{abs(least):.1f} to {_nearer(most)}"
+
+
 def _nearer(gain: float) -> str:
     return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
 
@@ -175,7 +182,9 @@ def figures(data: ViewData, place: int) -> list[Figure]:
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
     ]
     views, own = reference_words(data)
-    qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in ("psnr", "ssim")]
+    is_expected = not data.held_out and any(side.new_gain for side in data.sides)
+    names = ("psnr",) if is_expected else ("psnr", "ssim")  # the headline needs its place
+    qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
         label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
         qualities.append((label, "psnr", before.covered, after.covered))
@@ -187,12 +196,10 @@ def figures(data: ViewData, place: int) -> list[Figure]:
             better = place > 0 and old is not None and new is not None and old < new
             mark = "own" if own else "up" if better else ""
             made.append(Figure(label, _number(old, digits), _number(new, digits) + unit, mark))
-    expected = [side.new_gain for side in data.sides]
-    if any(expected) and not data.held_out:
-        made = [figure for figure in made if not figure.label.startswith("SSIM")]  # the headline needs its place
-        low, high = expected[place] or (None, None)
-        words = NONE if low is None or high is None else f"{low:+.1f} to {high:+.1f} dB"
-        sizes.append(Figure("New views, expected", "", words, "up" if low is not None and low > 0 else ""))
+    if is_expected:
+        gain = after.new_gain
+        words = NONE if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
+        sizes.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
     return sizes + (made if data.scored else [])
 
 

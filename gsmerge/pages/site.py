@@ -10,13 +10,13 @@ from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.arrays import describe_gain, read_new_views
+from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import SITE_SCENE, VIEWER
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import base64_text, camera_numbers, data_uri, render_template
+from gsmerge.pages.page import base64_text, camera_numbers, data_uri, describe_gain, render_template
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 

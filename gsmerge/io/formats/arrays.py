@@ -84,14 +84,6 @@ def read_new_views(comments: Sequence[object]) -> ExpectedScores | None:
     return None if match is None else ExpectedScores(*map(float, match.groups()))
 
 
-def describe_gain(low: float, high: float) -> str:
-    """Describe the bounds of a gain (dB) in words."""
-    if low < 0 < high:
-        return f"{-low:.1f} dB farther to {high:.1f} dB closer"
-    least, most = sorted((abs(low), abs(high)))
-    return f"{least:.1f} to {most:.1f} dB {'closer' if low >= 0 else 'farther'}"
-
-
 def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
     """Return the column names of the base colour: ``f_dc_*``, or those of plain colours where a file has none."""
     plain = (colors for colors in PLAIN_COLORS if set(colors) <= set(names or ()))

@@ -177,7 +177,7 @@ class Results:
 
     @property
     def doubt(self) -> str:
-        """What captions begin with where no view was held out; empty where some were."""
+        """Return what captions begin with where no view was held out; empty where some were."""
         return "" if self.part.startswith("target") else "No view was held out: fits have seen these. "
 
     def name(self, record: RunRecord) -> str:

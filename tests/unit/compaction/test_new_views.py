@@ -9,11 +9,12 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out
+from gsmerge.compaction.left_out import LEAST_VIEWS, choose_views, cover, leave_out, mean_seen
 from gsmerge.compaction.new_views import MOST_SHARE, OWN, SPREAD, NewViews, Trial, shrink_scene
 from gsmerge.facts.prepare import prepare
 from gsmerge.facts.views import subset
-from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, describe_gain, new_views_comment, read_new_views
+from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_new_views
+from gsmerge.pages.page import describe_gain
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene
 
@@ -107,7 +108,7 @@ def test_left_out_views_leave_neither_photos_nor_rows(room: Scene) -> None:
     assert (left_out.photos.images == prepared.scene.images[[1, 3]]).all()
     assert leave_out(prepared.scene, [], prepared) is None
     scores = left_out.score(left_out.rows)
-    assert left_out.mean(scores) == pytest.approx(np.average(scores, weights=left_out.shares))
+    assert mean_seen(scores, left_out.shares) == pytest.approx(np.average(scores, weights=left_out.shares))
 
 
 def test_nothing_is_said_of_rows_without_pixels_nor_of_many(room: Scene) -> None:
