@@ -416,7 +416,8 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
     most = max(size.num_views, int(agreement.share * size.num_gaussians))
     if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
         taken = f"at most {most:,} Gaussians are taken, {text} of the input"
-        note(f"budget {budget.budget}: {taken}: more would not show new views better, as {why}; fill=true takes all")
+        more = f"more would not show new views better, as {why}; --set fill=true takes all"
+        note(f"budget {budget.budget}: {taken}: {more}")
         usual = options.segment.superpixels == SHARE and options.decode.k == AUTO
         if usual and agreement.share <= FEWEST:  # as without a budget
             budget = replace(budget, budget=None)
