@@ -58,7 +58,6 @@ def test_install_and_then_every_command(root: Path, project: Path, tmp_path: Pat
         run(f"{make} {folder} --width 64 --height 48", tmp_path, PATH=path)
     run("cp -r monday/. .", tmp_path)
     run("\n".join(install[1:]), tmp_path, PATH=path, BROWSER="true")
-    run("cp scene.compact.ply small.ply", tmp_path)
     run(find_block(root, "gsmerge batch scenes/"), tmp_path, PATH=path)
     for name in ("small.sog", "small.spz", "clip.mp4", "room.gsm", "small"):
         assert (tmp_path / name).exists(), name
