@@ -59,5 +59,5 @@ def test_install_and_then_every_command(root: Path, project: Path, tmp_path: Pat
     run("cp -r monday/. .", tmp_path)
     run("\n".join(install[1:]), tmp_path, PATH=path, BROWSER="true")
     run(find_block(root, "gsmerge batch scenes/"), tmp_path, PATH=path)
-    for name in ("small.sog", "small.spz", "clip.mp4", "room.gsm", "small"):
+    for name in ("small.ply", "small.spz", "clip.mp4", "room.gsm", "small"):
         assert (tmp_path / name).exists(), name
