@@ -461,7 +461,7 @@ def _merge_unseen(
     if clean_options.asked:
         from gsmerge.stages.clean import clean
 
-        merged, _ = clean(merged, clean_options, scene, prepared.frame.leave)
+        merged, _ = clean(merged, clean_options, scene.cameras, scene.images, prepared.frame.leave)
     return merged, num_input
 
 

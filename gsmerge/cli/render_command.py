@@ -43,6 +43,8 @@ def parse_size(text: str) -> tuple[int, int]:
         opt.option("frames", int, "Frames of a clip, 30 a second, or 12.5 of a GIF.",
                    wording="6 seconds of a turntable, else 4", min=2, max=100_000),
         opt.option("views", int, "Views at most, at equal intervals.", wording="4 on a panel, else all", min=1),
+        opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
+                   "yellow, red."),
         opt.option("background", float, "Grey level behind the scene.", default=0.0, min=0.0, max=1.0),
     ),
     "overwrite",
@@ -65,7 +67,7 @@ def render(args: opt.Args) -> None:
     else:
         check_folder(args.output, inputs, overwrite=args.overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
-    arguments = args.given(("views", "path", "frames", "size", "background"))
+    arguments = args.given(("views", "path", "frames", "size", "overlay", "background"))
     drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(files, args.scenes, like, args.output, args.opacity, hints, **arguments)
     )

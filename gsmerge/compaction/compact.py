@@ -111,8 +111,8 @@ def clean_last(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 
     _share_inside(prepared, plan)
     adopt(candidate.record)
-    gaussians, counts = clean(candidate.fitted.gaussians, plan.clean, prepared.scene, prepared.frame.leave)
-    _note_clean(counts, len(gaussians), None)
+    gaussians, counts = clean(*_to_clean(candidate.fitted, prepared, plan))
+    _note_clean(counts, len(gaussians), None, prepared)
     return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
 
@@ -141,13 +141,12 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
         return build(prepared, plan, count)
     from gsmerge.stages.clean import clean, faintest_dropped
 
-    scene, share = prepared.scene, _share_inside(prepared, plan)
-    most = len(scene.finite_gaussians)
+    share, most = _share_inside(prepared, plan), len(prepared.scene.finite_gaussians)
 
     def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
         with record_part() as record:
             fitted = build(prepared, plan, asked)
-            gaussians, counts = clean(fitted.gaussians, options, scene, prepared.frame.leave)
+            gaussians, counts = clean(*_to_clean(fitted, prepared, plan))
         add_seconds(record.seconds)
         return asked, replace(fitted, gaussians=gaussians), counts, record
 
@@ -164,11 +163,17 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     if count is not None and len(gaussians) > count:
         gaussians, counts = faintest_dropped(gaussians, count), counts | {"surplus": len(gaussians) - count}
     adopt(record)
-    _note_clean(counts, len(gaussians), count)
+    _note_clean(counts, len(gaussians), count, prepared)
     return replace(fitted, gaussians=gaussians)
 
 
-def _note_clean(counts: Mapping[str, Any], left: int, count: int | None) -> None:
+def _to_clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Any, ...]:
+    """Return what :func:`gsmerge.stages.clean.clean` takes; placed cameras judge a scene, and do not show all of it."""
+    cameras = None if prepared.reference.placed else fitted.cameras
+    return fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave
+
+
+def _note_clean(counts: Mapping[str, Any], left: int, count: int | None, prepared: Prepared) -> None:
     """Record what clean-up left out, and whether fewer than ``count`` are left."""
     choose(clean=counts)
     words = {
@@ -176,6 +181,7 @@ def _note_clean(counts: Mapping[str, Any], left: int, count: int | None) -> None
         "sky": "sky",
         "floaters": "floater(s)",
         "transparent": "transparent",
+        "unseen": f"that no {'placed camera' if prepared.reference.placed else 'view'} shows",
         "surplus": "more than the budget",
     }
     parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())

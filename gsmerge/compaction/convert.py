@@ -19,6 +19,7 @@ from gsmerge.compaction.placement import (
     place,
 )
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.facts.place_cameras import place_cameras
 from gsmerge.frame import scene_frame
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
@@ -40,7 +41,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean
-from gsmerge.types import Cameras, Gaussians, PicturedScene, StrPath
+from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
 
@@ -95,6 +96,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     notes += unread
+    if "unseen" in options.clean.drops and stored is None:
+        notes.append("drop unseen: without cameras, views placed around and inside the scene count; name --cameras")
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
@@ -149,19 +152,22 @@ def _clean(
     gaussians: Gaussians, options: ConvertOptions, stored: CameraFile | None
 ) -> tuple[Gaussians, dict[str, int]]:
     """Crop the Gaussians and drop unwanted ones; return the rest, and the number dropped for each reason."""
-    if "sky" not in options.clean.drops:
-        return clean(gaussians, options.clean, None, lambda g: g)
-    photos = named_path(options.images)
-    if stored is None or photos is None:
+    drops = options.clean.drops
+    if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
+        return clean(gaussians, options.clean, None, None, lambda g: g)
+    photos, images, cameras = named_path(options.images), None, None
+    if "sky" in drops and (stored is None or photos is None):
         problem = "expected photos and their cameras, which say where the sky is"
         raise UsageError(f"--drop sky: {problem}; give --set images=FOLDER")
-    images = read_images(photos, stored.names)
-    cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
-    scene = PicturedScene(gaussians, cameras, images, None, stored.names)
-    frame = scene_frame(scene)
+    if stored is not None and photos is not None:
+        images = read_images(photos, stored.names)
+        cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
+    elif stored is not None:
+        cameras = to_cameras(stored)
+    placed = place_cameras(gaussians) if cameras is None else cameras
+    frame = scene_frame(Scene(gaussians, placed, None, None, tuple(map(str, range(len(placed))))))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
-    seen = replace(scene, gaussians=canonical, cameras=frame.enter_cameras(cameras))
-    left, counts = clean(canonical, options.clean, seen, frame.leave)
+    left, counts = clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)
     return frame.leave(left), counts
 
 

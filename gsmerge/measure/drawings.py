@@ -10,7 +10,9 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
+from gsmerge.facts.support import count_views, tint
 from gsmerge.facts.views import pick_views, subset
+from gsmerge.frame import scene_frame
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
@@ -65,6 +67,7 @@ class DrawOptions:
     path: str | None = None  # See :func:`gsmerge.measure.camera_path.parse_path`, or a file of cameras
     frames: int | None = None  # Along the path; None: those of SECONDS, of a spline at least 4 for each view
     size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
+    overlay: str | None = None  # "support": colours by how many views show a Gaussian
     background: float = 0.0  # Grey level
 
     def choose(self, count: int, most: int | None = None) -> list[int]:
@@ -152,7 +155,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         shown = [photos[used[i]] for i in ids] if len(photos) else None
         if shown and options.size:
             shown = [fill_photo(photo, *options.size) for photo in shown]
-        rows = view_pictures(parts, cameras[ids], shown, ids, background=options.background)
+        plain = options.overlay is None
+        rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.background)
         outside = outside_pictures(parts, cameras, photos=len(photos) > 0, background=options.background)
         yield contact_sheet([*rows, outside])
 
@@ -267,6 +271,10 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
+    if options.overlay is not None and len(load.scene):
+        frame = scene_frame(load.scene)
+        cameras = frame.enter_cameras(load.scene.cameras)
+        scenes = [tint(gaussians, count_views(frame.enter(gaussians), cameras)) for gaussians in scenes]
     sizes = [file.info.file_bytes for file in (first, *plys)]
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, named if plys else list(notes[0]), load)
 

@@ -67,13 +67,15 @@ def view_pictures(
     cameras: Cameras,
     photos: Sequence[np.ndarray] | None = None,
     ids: Sequence[int] | None = None,
+    *,
+    scored: bool = True,
     **drawing: Any,
 ) -> list[list[tuple[str, Picture]]]:
     """Render each scene in every view, in rows that begin with the photo if there is one.
 
-    Every picture comes with a line of text: its name, its number of Gaussians, and its PSNR against the photo
-    ``[h,w,3]``, or without photos against the first scene; a photo with the number of its view in ``ids``. ``drawing``
-    is passed on to :func:`gsmerge.render`.
+    Every picture comes with a line of text: its name, its number of Gaussians, and, if it is ``scored``, its PSNR
+    against the photo ``[h,w,3]``, or without photos against the first scene; a photo with the number of its view in
+    ``ids``. ``drawing`` is passed on to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
@@ -82,8 +84,9 @@ def view_pictures(
         if photos is not None:
             columns.insert(0, (f"photo, view {view}", photos[row]))
         first, *others = columns
-        compared = [(f"{text}, {psnr(image, first[1]):.1f} dB", image) for text, image in others]
-        views.append([(text, to_picture(image)) for text, image in (first, *compared)])
+        if scored:
+            others = [(f"{text}, {psnr(image, first[1]):.1f} dB", image) for text, image in others]
+        views.append([(text, to_picture(image)) for text, image in (first, *others)])
     return views
 
 

@@ -28,8 +28,8 @@ from gsmerge.measure.evaluate import (
 )
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE, Picture, borders, mean_colors, to_picture
-from gsmerge.pages.drops import draw_drops, find_drops
-from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
+from gsmerge.pages.marks import DROPS, SEEN, Marks, draw_masks, find_marks
+from gsmerge.pages.splats import MAX_GAUSSIANS, drawn_rows, highest_degree, pack_splats, pack_support
 from gsmerge.raster import render
 from gsmerge.raster.photos import WHOLE
 from gsmerge.runtime.threads import use_threads
@@ -61,6 +61,8 @@ class Side:
     covered: Quality  # over those
     seconds: float  # that drawing a view took here, with all threads
     dropped: Mapping[str, int]  # Gaussians that ``--drop`` would take, by its words
+    seen: Mapping[str, int]  # Gaussians that "none" of the input views shows, or "one", where any are known
+    support: bytes | None  # how many of them show each packed Gaussian, see :func:`pack_support`; None: not known
     new_gain: tuple[float, float] | None = None  # bounds of what new views are expected to gain, dB; None: not known
 
 
@@ -79,6 +81,8 @@ class PageView:
     outlines: bytes | None = None  # borders of the photo's superpixels as WebP; None of held-out views
     outside: bool = False  # a camera where no photo is; it has no scores
     drops: tuple[bytes | None, ...] = ()  # WebP, one for each side: what ``--drop`` would take, coloured
+    seen: tuple[bytes | None, ...] = ()  # the same of what none or one of the input views shows
+    faded: tuple[bytes | None, ...] = ()  # stills from outside with that made faint which no view shows
 
 
 @dataclass(frozen=True)
@@ -185,21 +189,29 @@ def page_data(
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
     cameras = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
-    drops = {name: find_drops(entered[name], cameras, pictures if len(pictures) else None) for name in looked_at}
+    photos = pictures if len(pictures) else None
+    marks = {name: Marks() for name in named} | {
+        name: find_marks(entered[name], cameras, photos, aligned=name == INPUT and scene.aligned) for name in looked_at
+    }
     split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
     sides = [
-        _side(result, size, split, _pack(entered[result.name], result.name, scene, cameras, light), drops)
+        _side(result, size, split, entered[result.name], marks[result.name], scene, cameras, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = entered[evaluation.results[:2][-1].name].means
     views = _page_views(splits, evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
     *drawn, outside = (
-        replace(view, drops=tuple(
-            draw_drops(entered[name], drops[name], view.camera, near) if drops.get(name) else None for name in named
-        ))
+        replace(
+            view,
+            drops=tuple(draw_masks(entered[name], marks[name].drops, DROPS, view.camera, near) for name in named),
+            seen=tuple(draw_masks(entered[name], marks[name].seen, SEEN, view.camera, near) for name in named),
+        )
         for view in (*shown, _outside_view(scene, named, frame, len(views)))
-    )  # fmt: skip
+    )
+    faint = (marks[name].fade(gaussians) for name, gaussians in entered.items())
+    faded = (None if g is None else render(g, outside.camera, near=near).images[0] for g in faint)
+    outside = replace(outside, faded=tuple(None if one is None else encode_still(to_picture(one)) for one in faded))
     measured = evaluation.notes if results else ()  # which are about what was fitted
     notes = (*measured, *_limits(sides, len(shown), len(views)))
     share, _ = evaluation.results[0].mean_covered("context")
@@ -322,13 +334,21 @@ def _side(
     result: ResultScores,
     file_bytes: int,
     split: str,
-    packed: tuple[bytes | None, int, int],
-    drops: Mapping[str, Mapping[str, np.ndarray]],
+    gaussians: Gaussians,
+    marks: Marks,
+    scene: Scene,
+    cameras: Cameras,
+    *,
+    light: bool,
 ) -> Side:
-    counts = {word: int(mask.sum()) for word, mask in drops.get(result.name, {}).items()}
+    """Collect what the page says of one side: of canonical ``gaussians`` what is marked, packed for its 3D."""
+    packed = _pack(gaussians, result.name, scene, cameras, light)
+    support = None if marks.support is None or packed[0] is None else pack_support(marks.support[drawn_rows(gaussians)])
+    dropped, seen = ({word: int(mask.sum()) for word, mask in masks.items()} for masks in (marks.drops, marks.seen))
     mean, covered = result.mean(split)[1], result.mean_covered(split)
     return Side(
-        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds, counts
+        result.name, result.num_gaussians, file_bytes, mean, *packed, *covered, result.render_seconds,
+        dropped, seen, support,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import hashlib
 import html
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -36,11 +37,13 @@ def view_page(data: ViewData) -> str:
     """Make the HTML page of a scene and its results."""
     photos = any(view.photo is not None for view in data.views)
     picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0, "dropped": {}}] if photos else []
+    sources: list[dict[str, Any]] = (
+        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}] if photos else []
+    )
     sources += [
         {
             "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
-            "dropped": side.dropped,
+            "dropped": side.dropped, "seen": side.seen, "support": None if side.support is None else f"support-{i}",
         }
         for i, side in enumerate(data.sides)
     ]  # fmt: skip
@@ -53,8 +56,16 @@ def view_page(data: ViewData) -> str:
     opened = stills[data.start]
     first = {side: opened[side] for side in (left, right)}  # in the page itself, to be seen at once
     opened[left] = opened[right] = None
+
+    def pictures(of_sides: Sequence[bytes | None]) -> list[str | None]:
+        some = [None] * (len(sources) - len(of_sides)) + list(of_sides)
+        return [None if one is None else data_uri(one, "image/webp") for one in some]
+
     splats = {f"splats-{i}": base64_text(side.splats) for i, side in enumerate(data.sides) if side.splats is not None}
     engine = VIEWER.read_bytes() if splats else None
+    splats |= {
+        f"support-{i}": base64_text(side.support) for i, side in enumerate(data.sides) if side.support is not None
+    }
     places = range(min(len(data.sides) - 1, 1), len(data.sides))
     results: list[dict[str, Any]] = [
         {
@@ -91,10 +102,9 @@ def view_page(data: ViewData) -> str:
         speed_words=speed_words(results[0]["speed"]),
         agreement=agreement_words(data),
         outlines=[view.outlines and data_uri(view.outlines, "image/webp") for view in data.shown],
-        drops=[
-            [None] * photos + [one and data_uri(one, "image/webp") for one in view.drops or [None] * len(data.sides)]
-            for view in data.shown
-        ],
+        drops=[pictures(view.drops) for view in data.shown],
+        seen=[pictures(view.seen) for view in data.shown],
+        faded=pictures(data.outside.faded),
         splats=splats,
         engine=engine and base64_text(engine),
     )

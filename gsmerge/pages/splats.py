@@ -36,10 +36,7 @@ def pack_splats(
     ``cameras`` have depths and shifts within their pixel for positions. ``gaussians`` and ``cameras`` are in the page's
     frame, where the scene is about 1 large: browsers keep means in 16 bits.
     """
-    drawn = gaussians.opacities >= MIN_OPACITY
-    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= reduce(np.logical_and, np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T, True)
-    rows, means = np.flatnonzero(drawn), np.ascontiguousarray(gaussians.means, np.float32)
+    rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
     if count > MAX_GAUSSIANS:
         return None, 0
@@ -71,6 +68,19 @@ def pack_splats(
         head["sizes"].append(size)
     line = json.dumps(head).encode() + b"\n"
     return spz.gzip_bytes(line + b"".join(planes), 1, zlib.Z_RLE), degree  # differences seldom repeat longer runs
+
+
+def drawn_rows(gaussians: Gaussians) -> np.ndarray:
+    """Return the ids of the rows that :func:`pack_splats` packs: finite and visible."""
+    drawn = gaussians.opacities >= MIN_OPACITY
+    for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
+        drawn &= reduce(np.logical_and, np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T, True)
+    return np.flatnonzero(drawn)
+
+
+def pack_support(support: np.ndarray) -> bytes:
+    """Pack how many views show each Gaussian, ``[n]`` uint8, as a gzip stream of a byte for each."""
+    return spz.gzip_bytes(support.tobytes(), 9, zlib.Z_DEFAULT_STRATEGY)
 
 
 def _pixel_places(rows: np.ndarray, means: np.ndarray, cameras: Cameras, ids: np.ndarray) -> np.ndarray | None:

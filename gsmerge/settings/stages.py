@@ -28,7 +28,7 @@ NEIGHBORS = {"overlap": 16, "aabb": 1}  # Nearest neighbours that are compared; 
 CROP = "sphere:x,y,z,radius, box:x0,y0,z0,x1,y1,z1 or a box with the degrees by which it is turned"
 CROP_FILES = (".json", ".toml")  # endings of files that hold a crop, which the command line reads
 CROP_NUMBERS = {"sphere": (4,), "box": (6, 9)}
-DROPS = ("floaters", "sky", "transparent")
+DROPS = ("floaters", "sky", "transparent", "unseen")
 
 
 @dataclass(frozen=True)
@@ -163,9 +163,9 @@ class CleanOptions(Settings):
         "scene's world units, or inside the shape that a .json or .toml file describes; a budget is met after it.",
         "Three more numbers of a box turn it about its middle: degrees about x, y and z. The command line alone reads "
         "files.", metavar="SHAPE")  # fmt: skip
-    drop: str | None = setting(None, "Leave out floaters, sky or transparent Gaussians, with commas between.",
+    drop: str | None = setting(None, "Leave out floaters, sky, transparent or unseen Gaussians, with commas between.",
         "`floaters`: isolated, far beyond the scene, or hanging across it; `sky`: what is sky in the photos; "
-        "`transparent`: of an opacity below 1/255.",
+        "`transparent`: of an opacity below 1/255; `unseen`: what no camera shows, without cameras no placed one.",
         metavar="floaters,sky,...")  # fmt: skip
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters or sky."""
+"""Fitted Gaussians -> wanted Gaussians: cropped to a box or a sphere, without floaters, sky or what no view shows."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsmerge.facts.place_cameras import place_cameras
+from gsmerge.facts.support import count_views
 from gsmerge.geometry import turn_by
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.sky import sky
-from gsmerge.types import Gaussians, PicturedScene
+from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # % of the positions along each axis: the scene's box
 OUTLIER_BOX = 10.0  # times that box: what lies beyond is far from the scene
@@ -100,14 +102,18 @@ def floater_share(gaussians: Gaussians) -> float:
 
 
 def clean(
-    gaussians: Gaussians, options: CleanOptions, scene: PicturedScene | None, to_world: ToWorld
+    gaussians: Gaussians, options: CleanOptions, cameras: Cameras | None, photos: np.ndarray | None, to_world: ToWorld
 ) -> tuple[Gaussians, Counts]:
     """Remove unwanted Gaussians; return the rest and the numbers removed: ``cropped``, and one for each of ``drop``.
 
-    Gaussians and scene are canonical; ``to_world`` maps to the frame of the crop. The sky is found in the scene's
-    photos; nothing else needs the scene.
+    Gaussians and ``cameras`` are canonical; ``to_world`` maps to the frame of the crop. The sky is found in the
+    ``photos [v,h,w,3]``; without cameras, what no placed camera shows is unseen.
     """
     counts = {}
+    if "unseen" in options.drops:  # before others go that hide it
+        placed = place_cameras(gaussians) if cameras is None and len(gaussians) else cameras
+        shown = np.zeros(0, bool) if placed is None else count_views(gaussians, placed) > 0
+        gaussians, counts["unseen"] = gaussians[shown], int((~shown).sum())
     if options.crop is not None:
         inside = inside_crop(to_world(gaussians).means, options.crop)
         gaussians, counts["cropped"] = gaussians[inside], int((~inside).sum())
@@ -115,8 +121,9 @@ def clean(
         faint = gaussians.opacities < TRANSPARENT
         gaussians, counts["transparent"] = gaussians[~faint], int(faint.sum())
     if "sky" in options.drops:
-        assert scene is not None, "sky is dropped where there are photos"
-        above = sky(gaussians, scene.cameras, scene.images)
+        assert cameras is not None, "sky is dropped where there are photos"
+        assert photos is not None, "sky is dropped where there are photos"
+        above = sky(gaussians, cameras, photos)
         gaussians, counts["sky"] = gaussians[~above], int(above.sum())
     if "floaters" in options.drops:
         isolated = floaters(gaussians)

@@ -21,7 +21,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
 from gsmerge.io.cameras.colmap_model import model_files
-from gsmerge.io.cameras.json_files import viewer_cameras
+from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats.ply import header_content
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
@@ -214,6 +214,20 @@ def test_parts_are_kept_or_left_out(result: Path, tmp_path: Path) -> None:
     with refuses(UsageError, "--drop sky", "images"):
         convert_files(ConvertOptions([result], tmp_path / "d.ply", clean=CleanOptions(drop="sky")))
     assert not (tmp_path / "d.ply").exists()
+
+
+def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
+    """By the cameras beside a result, without them by placed ones, which a note says."""
+    whole, clean = read(result), CleanOptions(drop="unseen")
+    behind = replace(whole, means=whole.means - 500 * np.array([0, 0, 1], np.float32))
+    gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([whole, behind]))
+    cameras = viewer_cameras_path(result)
+    document = convert_files(ConvertOptions([tmp_path / "both.ply"], tmp_path / "a.ply", cameras=cameras, clean=clean))
+    assert document["left_out"]["unseen"] >= 400
+    assert not document["notes"]
+    bare = convert_files(ConvertOptions([result], tmp_path / "b.ply", cameras="none", clean=clean))
+    assert bare["output"]["num_gaussians"] == 400 - bare["left_out"]["unseen"] > 200
+    assert any("placed" in note for note in bare["notes"])
 
 
 def test_harmonics_are_left_out_and_results_stay_results(result: Path, tmp_path: Path) -> None:

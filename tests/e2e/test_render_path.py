@@ -177,3 +177,34 @@ def test_a_small_world_is_drawn_as_a_large_one(kind: str, small_copy: Path, tmp_
         picture = cv2.imread(str(path))
         assert picture.std() > 10
         assert error(picture, cv2.imread(str(tmp_path / "small out" / path.name))) < 0.1
+
+
+def test_an_overlay_colours_what_few_views_show(small_copy: Path, tmp_path: Path, run: Run) -> None:
+    """Red where the scene's Gaussians stand again, behind all cameras, and nothing where many views show them."""
+    scene = gsmerge.read_scene(small_copy)
+    some, forward = scene.finite_gaussians[::7], scene.cameras.viewmats[:, 2, :3].mean(0)
+    behind = replace(some, means=some.means - 30 * forward.astype(np.float32))
+    gsmerge.write_ply(tmp_path / "both.ply", gsmerge.Gaussians.concat([some, behind]))
+    cameras = small_copy / "transforms.json"
+    run("render", tmp_path / "both.ply", "--cameras", cameras, "-o", tmp_path / "own", "--overlay", "support", code=0)
+    run("render", tmp_path / "both.ply", "--cameras", cameras, "-o", tmp_path / "plain", code=0)
+    for path in sorted((tmp_path / "plain").iterdir()):
+        assert error(cv2.imread(str(path)), cv2.imread(str(tmp_path / "own" / path.name))) < 12
+    turned = json.loads(cameras.read_text())
+    for frame in turned["frames"]:
+        matrix = np.array(frame["transform_matrix"])
+        matrix[:3, 0], matrix[:3, 2] = -matrix[:3, 0], -matrix[:3, 2]  # looks back
+        frame["transform_matrix"] = matrix.tolist()
+    (tmp_path / "back.json").write_text(json.dumps(turned))
+    for name, more in (("away", ["--overlay", "support"]), ("grey", [])):
+        where = ("--path", tmp_path / "back.json", "-o", tmp_path / name)
+        run("render", tmp_path / "both.ply", "--cameras", cameras, *where, *more, code=0)
+    red, plain = (cv2.imread(str(sorted((tmp_path / name).iterdir())[0])).astype(float) for name in ("away", "grey"))
+    assert red[..., 2].mean() > 3 * red[..., 0].mean()
+    assert abs(plain[..., 2].mean() - plain[..., 0].mean()) < 0.5 * plain.mean()
+
+
+def test_a_panel_under_an_overlay_has_no_scores(small_copy: Path, run: Run) -> None:
+    args = ("render", small_copy, small_copy / "scene.ply", "--overlay", "support", "--views", 1)
+    run(*args, "-o", small_copy / "a.png", code=0)
+    assert cv2.imread(str(small_copy / "a.png")) is not None

@@ -32,7 +32,7 @@ FRESH = (
     "solid.request = () => {};"
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', '');"
+    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('seen', '');"
     "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
@@ -236,6 +236,40 @@ def test_what_would_be_dropped_is_shown_in_colour(opened: tuple[Browser, Any]) -
     assert tab.run("id('legend').textContent").startswith("floaters: ")
     tab.press("x")
     assert tab.run(f"[{layer}.hidden, id('legend').hidden]") == [True, True]
+
+
+def test_what_no_view_shows_is_faint_from_outside(opened: tuple[Browser, Any]) -> None:
+    """In stills and in 3D, without a click after the step back; and in colour where one asks for it."""
+    tab, _ = opened
+    tab.run("choose(3); jump(data.start)")
+    assert tab.run("[data.sources[3].seen.none > 0, state.seen, seenOf(0)]") == [True, "", None]
+    tab.press("b")
+    assert tab.run("[state.seen, id('right').src === faded[3], id('seen-legend').hidden]") == ["fade", True, False]
+    assert tab.run("id('seen-legend').textContent").startswith("no view: ")
+    tab.press("b")
+    assert tab.run("[state.seen, id('seen-legend').hidden]") == ["", True]
+    where = "data.views.findIndex((named, i) => !named.outside && (seen[i] || [])[3])"
+    tab.run(f"jump({where}); set('seen', 'color')")
+    layer = "document.querySelector('#right-pane .seen')"
+    assert tab.run(f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/webp')]") == [
+        False,
+        True,
+    ]
+    each = "mesh.forEachSplat((i, c, s, q, o, color) => all.push([o, color.r, color.g]))"
+    looks = f"(() => {{ const all = []; solid.results.get(3).{each}; return all; }})()"
+    tab.run("set('seen', ''); set('solid', '1')")
+    plain = np.array(tab.run(looks))
+    tab.run("set('seen', 'fade')")
+    faint = np.array(tab.run(looks))
+    tab.run("set('seen', 'color')")
+    colored = np.array(tab.run(looks))
+    tab.run("set('seen', '')")
+    none, one = (tab.run(f"data.sources[3].seen.{word} || 0") for word in ("none", "one"))
+    fainter = faint[:, 0] < 0.2 * plain[:, 0] + 0.01
+    assert 0 < fainter.sum() <= none
+    np.testing.assert_array_equal(faint[~fainter], plain[~fainter])
+    assert 0 < (np.abs(colored - plain).max(1) > 0.02).sum() <= none + one
+    np.testing.assert_array_equal(np.array(tab.run(looks)), plain)
 
 
 def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:

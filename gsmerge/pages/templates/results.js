@@ -77,6 +77,18 @@ function showLegend() {
   id("legend").replaceChildren(...parts, ` of ${count.toLocaleString("en")} Gaussians`);
 }
 
+// What few views show of the same side.
+function showSeen() {
+  if (!id("seen-legend")) return;
+  const source = [state.right, state.left].find((one) => Object.keys(data.sources[one].seen).length);
+  id("seen-legend").hidden = !state.seen || source === undefined;
+  if (id("seen-legend").hidden) return;
+  const { seen: counts, count } = data.sources[source];
+  const words = { none: "no view", one: "one view" };
+  const parts = Object.entries(counts).map(([word, number]) => make("span", `${words[word]}: ${number.toLocaleString("en")}`, { className: word }));
+  id("seen-legend").replaceChildren(...parts, ` of ${count.toLocaleString("en")} Gaussians`);
+}
+
 function markResult() {
   if (id("size")) {
     id("size").value = data.sizes.indexOf(state.result);

@@ -7,7 +7,7 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", drops: "", other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, outlines: "", drops: "", seen: "", other: false, from: data.start, // the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
@@ -20,6 +20,8 @@ const NARROW = 640; // pixels of the stage, below which sides go one above the o
 let stills = null; // per view the pictures of every source; those that are seen first are in the page itself
 let outlines = []; // per view the borders of its superpixels, where there are any
 let drops = []; // per view and source what would be dropped of it, in colour
+let seen = []; // per view and source what one view of the input shows, and what none, in colour
+let faded = []; // per source the picture from outside in which that is faint which no view shows
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
 let chosen = false; // whether the reader has chosen stills or 3D
@@ -29,7 +31,8 @@ const view = () => data.views[state.view];
 const inSolid = (source) => Boolean(state.solid && solid && solid.has(source));
 
 function stillOf(source) {
-  return stills ? stills[state.view][source] : null;
+  const faint = state.seen === "fade" && view().outside && faded[source];
+  return stills ? faint || stills[state.view][source] : null;
 }
 
 // Whether a source can be seen from here; the photos cannot once the camera has moved, nor what 3D has not taken in.
@@ -96,6 +99,7 @@ function showZoom() {
 }
 
 const dropsOf = (source) => (drops[state.view] || [])[source] || null;
+const seenOf = (source) => (seen[state.view] || [])[source] || null;
 
 // Lays a picture over a side: the photo, outlines, or what would be dropped of a source.
 function lay(layer, address, opacity, source = "") {
@@ -132,6 +136,7 @@ function show() {
     lay(pane.querySelector(".overlay"), data.photos && plain && stillOf(0), state.overlay);
     lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
     lay(pane.querySelector(".drops"), plain && state.drops && dropsOf(source), OUTLINES, source);
+    lay(pane.querySelector(".seen"), plain && state.seen === "color" && !drawn && seenOf(source), OUTLINES, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
@@ -146,8 +151,12 @@ function show() {
   }
   id("outside").setAttribute("aria-pressed", String(view().outside));
   showLegend();
+  showSeen();
   showLimits();
-  if (solid && state.solid) solid.request();
+  if (solid && state.solid) {
+    [left, right].filter(inSolid).forEach((source) => solid.mark(source, state.seen));
+    solid.request();
+  }
 }
 
 // Greys out what has no effect now, and says why; what is about 3D alone is there with it.
@@ -157,11 +166,13 @@ function showLimits() {
   const unseen = [state.left, state.right].some(dropsOf) ? "" : "Nothing of it is seen here";
   const outside = view().outside ? "No photo is outside" : "";
   const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
-  const reasons = { outlines: bare || away, drops: away || unseen };
+  const unknown = [state.left, state.right].some((source) => Object.keys(data.sources[source].seen).length) ? "" : "Nothing of it is seen here";
+  const reasons = { outlines: bare || away, drops: away || unseen, seen: unknown || (state.solid ? "" : away) };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
-    grey(button, name === "solid" && value ? none : reasons[name]);
+    const still = name === "seen" && value === "fade" && !state.solid && !view().outside ? "Photos show nothing of it: step back" : "";
+    grey(button, name === "solid" && value ? none : reasons[name] || still);
   }
   if (id("overlay-share")) grey(id("overlay-share"), outside || away);
   id("full").hidden = !document.fullscreenEnabled;
@@ -174,8 +185,11 @@ function grey(control, reason) {
 
 // To the camera of a view, exactly.
 function jump(index) {
+  const away = view().outside;
   state.view = clamp(index, 0, data.views.length - 1);
   state.atCamera = true;
+  if (!away && view().outside && !state.seen) state.seen = "fade"; // from there a guess passes for surface
+  else if (away && !view().outside && state.seen === "fade") state.seen = "";
   for (const card of id("strip").children) {
     const current = Number(card.dataset.view) === state.view;
     card.setAttribute("aria-current", String(current));
@@ -226,6 +240,8 @@ function startStrip() {
   stills = JSON.parse(id("stills").textContent);
   outlines = JSON.parse(id("outline-pictures").textContent);
   drops = JSON.parse(id("drop-pictures").textContent);
+  seen = JSON.parse(id("seen-pictures").textContent);
+  faded = JSON.parse(id("faded-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference
   for (const card of id("strip").children) {
@@ -243,9 +259,11 @@ function say(words) {
 // Takes in what the sides show; without a GPU nothing that would take minutes for a frame.
 async function load(made) {
   for (const source of [state.left, state.right]) {
-    const { splats, count } = data.sources[source];
+    const { splats, support, count } = data.sources[source];
     const drawable = splats && !(made.software && count > SOFTWARE_MOST);
-    if (drawable && !made.has(source) && id(splats)) await made.add(source, await unpackSplats(takeBytes(splats)));
+    if (!drawable || made.has(source) || !id(splats)) continue;
+    await made.add(source, await unpackSplats(takeBytes(splats)));
+    if (support) made.support(source, await gunzip(takeBytes(support)));
   }
 }
 

@@ -184,6 +184,21 @@ def test_what_would_be_dropped_has_a_switch(data: ViewData) -> None:
     assert 'data-set="drops"' not in view_page(replace(data, sides=bare))
 
 
+def test_what_no_view_shows_has_a_switch(data: ViewData) -> None:
+    bare = tuple(replace(side, seen={}, support=None) for side in data.sides)
+    known = (bare[0], replace(bare[1], seen={"none": 7}, support=b"two"))
+    views = tuple(replace(view, seen=(None, b"one")) for view in data.views)
+    outside = replace(data.outside, faded=(None, b"one"))
+    page = view_page(replace(data, sides=known, views=views, outside=outside))
+    assert 'data-set="seen"' in page
+    assert "--drop unseen" in page
+    assert json.loads(block(page, "seen-pictures"))[0] == [None, None, f"{WEBP}b25l"]
+    assert json.loads(block(page, "faded-pictures")) == [None, None, f"{WEBP}b25l"]
+    assert base64.b64decode(block(page, "support-1")) == b"two"
+    assert json.loads(block(page, "data"))["sources"][2]["support"] == "support-1"
+    assert 'data-set="seen"' not in view_page(replace(data, sides=bare))
+
+
 def test_colours_are_readable_in_both_schemes(page: str) -> None:
     """Contrast of at least 4.5 of text on what it stands on."""
     style = re.findall("<style>(.*?)</style>", page, re.DOTALL)[0]

@@ -9,8 +9,9 @@ import pytest
 import scenes
 from messages import noted, refuses
 
-from gsmerge import CompactOptions, Gaussians, Scene, compact
+from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
+from gsmerge.facts.support import count_views
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters, inside_crop
@@ -75,7 +76,7 @@ def test_floaters_are_alone_or_far_away(scene: Scene) -> None:
     large = replace(moved, scales=np.full((1600, 3), 4, np.float32))  # which touch across the gap
     assert np.flatnonzero(floaters(large)).tolist() == list(range(6, 16))
     assert not floaters(given[:8]).any()
-    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop="floaters"), scene, lambda g: g)
+    left, counts = clean(moved, CleanOptions(crop="box:-1,-1,-1,50,50,50", drop="floaters"), None, None, lambda g: g)
     assert (len(left), counts) == (1589, {"cropped": 10, "floaters": 1})
 
 
@@ -153,3 +154,22 @@ def test_what_cannot_be(scene: Scene) -> None:
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop": "floaters"}).whole_only == [
         "crop", "drop floaters",
     ]  # fmt: skip
+
+
+def test_what_no_view_shows_is_left_out(scene: Scene) -> None:
+    """What stands behind the cameras, and nothing that takes part in a picture."""
+    given = scene.finite_gaussians
+    behind = given.means - 1000 * scene.cameras.viewmats[0, 2, :3].astype(np.float32)
+    both = Gaussians.concat([given, replace(given, means=behind)])
+    options = CleanOptions(drop="unseen")
+    left, counts = clean(both, options, scene.cameras, None, lambda g: g)
+    assert counts["unseen"] >= len(given)
+    pictures = [render(some, scene.cameras).images for some in (both, left)]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1 / 255
+    assert len(clean(given[:0], options, None, None, lambda g: g)[0]) == 0
+
+
+def test_a_result_without_what_no_view_shows_has_its_count(scene: Scene) -> None:
+    result = compact(scene, budget=150, drop="unseen", **QUICK)
+    assert (count_views(result.gaussians, scene.cameras) > 0).mean() > 0.9
+    assert any("that no view shows" in note for note in result.report.notes)

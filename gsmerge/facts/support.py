@@ -1,0 +1,51 @@
+"""Gaussians and cameras -> support: in how many views each Gaussian takes part.
+
+A fit fills what no photo shows with guesses: behind what stands in front, beyond the borders of the pictures. From the
+photos' cameras nobody sees them; who steps back takes them for surface. So results can say which these are, leave them
+out, or show them faintly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
+from gsmerge.raster import contributions, prepare, tile_view
+from gsmerge.raster.photos import blank_photos
+from gsmerge.runtime.threads import in_turn
+from gsmerge.settings.fit import FitOptions
+from gsmerge.types import Cameras, Gaussians
+
+LEAST = FitOptions().min_contribution  # blending weight of a pixel from which on a view shows a Gaussian, as for a fit
+LEVEL, SIDE = 2, 480  # pictures are that much smaller, as where a fit looks for Gaussians, and at most so wide
+# Colours, sRGB, of what no view and what one view shows, and their share in a picture; the rest keeps its own
+TINTS, TINT = {0: (230, 40, 40), 1: (255, 190, 0)}, 0.7
+
+
+def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
+
+    A view shows a Gaussian that has a blending weight of at least 1/255 in some pixel, the least that a fit keeps.
+    """
+    splats = prepare(gaussians)
+    pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
+
+    def is_shown(view: int) -> np.ndarray:
+        return contributions(tile_view(splats, **pictures.camera(view)))[1] >= LEAST
+
+    counts = np.zeros(len(gaussians), np.int32)
+    for shown in in_turn(is_shown, range(len(pictures))):
+        counts += shown
+    return counts
+
+
+def tint(gaussians: Gaussians, counts: np.ndarray) -> Gaussians:
+    """Colour what one view and what no view shows, by the ``counts [n]`` of :func:`count_views`."""
+    sh0, shN = gaussians.sh0.copy(), gaussians.shN.copy()
+    for count, color in TINTS.items():
+        rows = counts == count
+        own = (1 - TINT) * sh0_to_rgb(sh0[rows])
+        sh0[rows], shN[rows] = rgb_to_sh0(own + TINT * np.array(color, np.float32) / 255), 0
+    return replace(gaussians, sh0=sh0, shN=shN)

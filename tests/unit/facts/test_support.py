@@ -1,0 +1,55 @@
+"""In how many views a Gaussian takes part, against a count by alpha compositing pixel by pixel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians
+from gsmerge.facts.support import TINT, TINTS, count_views, tint
+from gsmerge.geometry import sh0_to_rgb
+from gsmerge.raster import composite, prepare, tile_view
+from gsmerge.raster.photos import blank_photos
+from gsmerge.types import Cameras
+
+
+@pytest.fixture(scope="module")
+def cameras() -> Cameras:
+    return scenes.arc(3, 64, 48)
+
+
+@pytest.fixture(scope="module")
+def room(cameras: Cameras) -> Gaussians:
+    made = scenes.make_scene(scenes.room(), cameras, noise=0.01).finite_gaussians
+    return made[:: max(1, len(made) // 150)]
+
+
+def test_a_view_counts_where_a_picture_shows_the_gaussian(room: Gaussians, cameras: Cameras) -> None:
+    """A white Gaussian among black ones shows its own weights."""
+    half = blank_photos(cameras, 2)
+    views = [tile_view(prepare(room), **half.camera(view)) for view in range(len(half))]
+    counts = np.zeros(len(room), int)
+    for row in range(len(room)):
+        white = np.zeros((len(room), 3), np.float32)
+        white[row] = 1
+        counts[row] = sum(composite(view, white)[0].max() >= 1 / 255 for view in views)
+    assert (counts > 1).any()
+    np.testing.assert_array_equal(count_views(room, cameras), counts)
+
+
+def test_what_hides_behind_a_wall_or_a_camera_is_seen_by_none(room: Gaussians, cameras: Cameras) -> None:
+    away = replace(room, means=room.means - 1000 * cameras.viewmats[:, 2, :3].mean(0).astype(np.float32))
+    assert not count_views(away, cameras).any()
+    assert len(count_views(room[:0], cameras)) == 0
+
+
+def test_tints_mark_what_one_and_what_no_view_shows(room: Gaussians) -> None:
+    counts = np.arange(len(room)) % 3
+    colors, own = (sh0_to_rgb(g.sh0[:, 0]) for g in (tint(room, counts), room))
+    for count, color in TINTS.items():
+        wanted = (1 - TINT) * own[counts == count] + TINT * np.array(color) / 255
+        np.testing.assert_allclose(colors[counts == count], wanted, atol=1e-6)
+    np.testing.assert_array_equal(colors[counts == 2], own[counts == 2])
