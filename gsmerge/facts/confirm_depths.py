@@ -7,7 +7,7 @@ alone.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +25,12 @@ SAME = 0.05  # logarithm of two depths of one surface
 TINY = 1e-9  # canonical units, least depth
 # Of 15 captures everything below POOR is poor, and nothing sound is; LONELY tells apart why
 POOR, LONELY = 0.5, 0.2
+# Parts of pictures, as a range of columns and of rows in thirds; a part is poor where most of its pixels are
+THIRDS = {
+    "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
+    "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
+}  # fmt: skip
+MOSTLY = 0.5
 # Gaussians per pixel that a scene bears: most, down to a share of confirmed pixels, then falling to the usual share at
 # another one. More are learned by heart (docs/guide/how-many.md): the most is the largest share at which no capture
 # with so much confirmed depth lost .1 dB in photos that were not used.
@@ -38,10 +44,13 @@ class Agreement:
     confirmed: float  # by at least one view, and by no fewer than see through it
     contradicted: float  # more views see through it than confirm it
     alone: float  # no other view looks there
+    # Where most is contradicted, and where alone, as "left third of 4 of 7 views"; empty: nowhere more than elsewhere
+    contradicted_part: str = field(default="", compare=False)
+    alone_part: str = field(default="", compare=False)
 
     def to_dict(self) -> dict[str, float]:
         """Return the shares of the scene, for reports."""
-        return {name: round(share, 4) for name, share in asdict(self).items()}
+        return {name: round(getattr(self, name), 4) for name in ("confirmed", "contradicted", "alone")}
 
     @property
     def share(self) -> float:
@@ -57,8 +66,11 @@ class Agreement:
         problem = f"only {100 * self.confirmed:.0f} % of the pixels have a depth that another view confirms"
         if self.alone > LONELY:
             cause = f"{100 * self.alone:.0f} % are seen by no other view: the photos are too few or too far apart"
-            return f"{problem}, and {cause}; more photos between these would help most"
-        return f"{problem}, though others look at them: the depth is wrong; an export with better depth would help most"
+            where = f" ({self.alone_part})" if self.alone_part else ""
+            return f"{problem}, and {cause}{where}; more photos between these would help most"
+        where = f" ({self.contradicted_part})" if self.contradicted_part else ""
+        cause = f"though others look at them: the depth is wrong{where}"
+        return f"{problem}, {cause}; an export with better depth would help most"
 
 
 def confirm_depths(scene: Scene) -> Agreement | None:
@@ -91,9 +103,28 @@ def confirm_depths(scene: Scene) -> Agreement | None:
             agrees = (away < 1) & (np.abs(behind) < SAME)
             same[ids] += agrees
             through[ids] += ~agrees & ((behind < -2 * SAME) | ((behind < 0) & (away > 2)))
-        confirmed = (same > 0) & (same >= through)
-        return np.array([len(rows), confirmed.sum(), (through > same).sum(), (~inside.any(0)).sum()])
+        kinds = (same > 0) & (same >= through), through > same, ~inside.any(0)
+        thirds = np.stack([3 * (rows % width) // width, 3 * (rows // width) // height])
+        within = [
+            np.logical_and(*((third >= low) & (third < high) for third, (low, high) in zip(thirds, part, strict=True)))
+            for part in THIRDS.values()
+        ]
+        parts = [np.ones(len(rows), bool), *within]
+        return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
 
-    counts = np.stack(parallel_map(count, range(views)))
-    confirmed, contradicted, alone = counts[:, 1:].sum(0) / counts[:, 0].sum()
-    return Agreement(float(confirmed), float(contradicted), float(alone))
+    counts = np.stack(parallel_map(count, range(views)))  # [v,part,4], first the whole
+    confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / counts[:, 0, 0].sum()
+    parts = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
+    return Agreement(float(confirmed), float(contradicted), float(alone), *parts)
+
+
+def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:
+    """Name the part of pictures in which ``poor [v,part]`` of the ``pixels`` are most in most views.
+
+    Empty where no part is poor in more views than any other one.
+    """
+    views = (poor > MOSTLY * np.maximum(pixels, 1)).sum(0)
+    worst = int(views.argmax())
+    if views[worst] == 0 or views.min() == views[worst]:
+        return ""
+    return f"{list(THIRDS)[worst]} of {views[worst]} of {len(poor)} views"

@@ -131,6 +131,17 @@ def test_threads_change_nothing(wall: Scene) -> None:
     assert actual[0] == actual[1]
 
 
+def test_the_worst_part_is_named(wall: Scene) -> None:
+    """The right half of two views; of a view that is alone all is, which no part says."""
+    agreement = confirm_depths(with_nearer_half(wall, [0, 2]))
+    assert (agreement.contradicted_part, agreement.alone_part) == (f"right third of 2 of {VIEWS} views", "")
+    assert confirm_depths(turned_away(wall, 2)).alone_part == ""
+    assert confirm_depths(wall).contradicted_part == ""
+    wrong = replace(agreement, confirmed=0.4).doubt
+    assert wrong is not None
+    assert "the depth is wrong (right third of 2 of 4 views)" in wrong
+
+
 def test_what_a_scene_bears_falls_with_the_share() -> None:
     shares = [Agreement(confirmed, 0, 0).share for confirmed in (1, 0.75, 0.7, 0.65, 0.6, 0.1)]
     assert shares == sorted(shares, reverse=True)
