@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_outputs, check_replaced, input_files, write_texts
+from gsmerge.cli.paths import check_folder, check_outputs, check_replaced, input_files, write_texts
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
@@ -49,6 +49,8 @@ class MeasuringOptions(Settings):
         opt.OUTPUT,
         opt.option("output", list[Path], "A file to write: .json, .csv (a row for each result and view), .md, or the "
                    "page of view with these scores, .html; may be repeated.", "--output", "-o"),
+        opt.option("maps", Path, "A folder for a picture of each result and view: photo, result, and a map of how far "
+                   "off new views are likely to be, by the photos of other views.", metavar="DIR"),
     ),
 )  # fmt: skip
 def evaluate(args: opt.Args) -> None:
@@ -63,6 +65,8 @@ def evaluate(args: opt.Args) -> None:
     if args.quiet and not (outputs or args.json):
         raise UsageError("--quiet: expected -o or --json with it, since nothing would be shown")
     _check_files(args, outputs, own, input_files(files))
+    if args.maps is not None:
+        check_folder(args.maps, tuple(input_files(files)), overwrite=True)
     seconds = [_seconds_of(making) for making in own.merge_seconds]
     from gsmerge.measure.evaluate import evaluate as evaluate_scene
     from gsmerge.measure.scores import evaluation_document, evaluation_lines
@@ -71,6 +75,11 @@ def evaluate(args: opt.Args) -> None:
     with stage_progress(quiet=args.silent) as progress:
         progress("read", 0, 0)
         pair = read_before_after(args, files)
+    if args.maps is not None:
+        from gsmerge.measure.error_maps import require_photos
+
+        with opt.usage_errors():
+            require_photos(pair.scene)
     notes = [*pair.notes, *missing]
     if pair.plys and len(pair.scene) < len(pair.load.scene):
         notes.append(
@@ -86,6 +95,7 @@ def evaluate(args: opt.Args) -> None:
         facts = _facts(pair, options, own, dict(zip(pair.plys, seconds, strict=False)))
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
+    document["maps"] = [] if args.maps is None else [str(path) for path in _write_maps(args.maps, pair)]
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, quiet=args.silent)
@@ -157,6 +167,28 @@ def _write(
         from gsmerge.pages.page import view_page
 
         sizes = [result["bytes"] for result in document["results"]]
-        data = page_data(pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, evaluation, stills)
+        data = page_data(
+            pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, evaluation, stills, cameras=pair.cameras
+        )
         texts |= {path: view_page(data) for path in outputs if path not in texts}
     write_texts(texts, overwrite=True)
+
+
+def _write_maps(folder: Path, pair: BeforeAfter) -> list[Path]:
+    """Write the sheet of each result and view into a folder, named after both; return their paths."""
+    from gsmerge.measure.drawings import picture_stems
+    from gsmerge.measure.error_maps import draw_sheets
+    from gsmerge.measure.evaluate import INPUT
+    from gsmerge.measure.preview import save_picture
+
+    views = picture_stems([*pair.scene.names, *(() if pair.held_out is None else pair.held_out.names)])
+    results, paths = pair.gaussians or {INPUT: pair.scene.file_gaussians}, list[Path]()
+    stems = dict(
+        zip(results, picture_stems([Path(name).with_suffix(".png").as_posix() for name in results]), strict=True)
+    )
+    sheets = draw_sheets(pair.scene, results, pair.held_out, pair.cameras)
+    for name, view, sheet in sheets:
+        paths.append(folder / f"{stems[name]}.{views[view]}.map.png")
+        folder.mkdir(parents=True, exist_ok=True)
+        save_picture(paths[-1], sheet)
+    return paths

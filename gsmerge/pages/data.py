@@ -15,6 +15,7 @@ from gsmerge.frame import Frame, scene_frame
 from gsmerge.geometry import middle_depth
 from gsmerge.io.photo_files import encode_indexed, photo_array
 from gsmerge.measure.camera_path import outside_camera
+from gsmerge.measure.error_maps import Witnesses, call_witnesses, draw_errors, expected_errors
 from gsmerge.measure.evaluate import (
     INPUT,
     EvaluateOptions,
@@ -82,6 +83,7 @@ class PageView:
     outside: bool = False  # a camera where no photo is; it has no scores
     drops: tuple[bytes | None, ...] = ()  # WebP, one for each side: what ``--drop`` would take, coloured
     seen: tuple[bytes | None, ...] = ()  # the same of what none or one of the input views shows
+    maps: tuple[bytes | None, ...] = ()  # WebP, one for each side: see :mod:`gsmerge.measure.error_maps`
     faded: tuple[bytes | None, ...] = ()  # stills from outside with that made faint which no view shows
 
 
@@ -154,7 +156,7 @@ def collect(
     )
     progress("superpixels and the view from outside", 0, 0)
     with use_threads():
-        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
+        data = page_data(title, scene, results, file_bytes, held_out, evaluation, stills, cameras=cameras, light=light)
     progress("done", 0, 0)
     gains = new_gains or {}
     return replace(data, sides=tuple(replace(side, new_gain=gains.get(side.name)) for side in data.sides))
@@ -178,6 +180,7 @@ def page_data(
     evaluation: Evaluation,
     stills: Stills,
     *,
+    cameras: Mapping[str, Cameras] | None = None,
     light: bool = False,
 ) -> ViewData:
     """Make the content of a page of what was measured: see :func:`collect`."""
@@ -187,23 +190,29 @@ def page_data(
     frame = scene_frame(scene)
     named = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
     entered = {name: frame.enter(gaussians) for name, gaussians in named.items()}
-    cameras = frame.enter_cameras(scene.cameras.numpy())
+    placed = frame.enter_cameras(scene.cameras.numpy())
     looked_at = [name for name in named if name != INPUT or not results]
     photos = pictures if len(pictures) else None
     marks = {name: Marks() for name in named} | {
-        name: find_marks(entered[name], cameras, photos, aligned=name == INPUT and scene.aligned) for name in looked_at
+        name: find_marks(entered[name], placed, photos, aligned=name == INPUT and scene.aligned) for name in looked_at
     }
     split, near = "context" if held_out is None else "target", near_plane(scene) / frame.unit
     sides = [
-        _side(result, size, split, entered[result.name], marks[result.name], scene, cameras, light=light)
+        _side(result, size, split, entered[result.name], marks[result.name], scene, placed, light=light)
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = entered[evaluation.results[:2][-1].name].means
     views = _page_views(splits, evaluation, stills, frame, means)
     shown, num_superpixels = with_outlines(_shown(views), pictures)
+    moved = {name: frame.enter_cameras(own.numpy()) for name, own in (cameras or {}).items()}
+    witnesses = {
+        name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names))
+        for name in (looked_at if len(pictures) > 1 else ())
+    }
     *drawn, outside = (
         replace(
             view,
+            maps=() if view.outside else tuple(_map(witnesses.get(name), view) for name in named),
             drops=tuple(draw_masks(entered[name], marks[name].drops, DROPS, view.camera, near) for name in named),
             seen=tuple(draw_masks(entered[name], marks[name].seen, SEEN, view.camera, near) for name in named),
         )
@@ -218,7 +227,7 @@ def page_data(
     lacks_pixels = share is not None and share < WHOLE
     return ViewData(
         title, tuple(sides), tuple(drawn), outside, len(views), evaluation.reference, notes, num_superpixels,
-        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=cameras)),
+        lacks_pixels, confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=placed)),
     )  # fmt: skip
 
 
@@ -310,6 +319,15 @@ def encode_outlines(photo: np.ndarray, labels: np.ndarray) -> bytes:
     every = np.indices((OUTLINE_LEVELS,) * 3).reshape(3, -1).T * (255 // (OUTLINE_LEVELS - 1))
     colors = np.pad(every, ((1, 0), (0, 0))).astype(np.uint8)
     return encode_indexed(np.where(borders(enlarged), ids[enlarged], 0), colors)
+
+
+def _map(witnesses: Witnesses | None, view: PageView) -> bytes | None:
+    """Draw by other photos how far off one side is likely to be in a view; None without other photos."""
+    if witnesses is None:
+        return None
+    own = None if view.held_out else view.place
+    camera = view.camera if own is None else witnesses.views.cameras[[own]]
+    return encode_still(draw_errors(expected_errors(witnesses, camera, own)))
 
 
 def _pack(

@@ -105,6 +105,7 @@ def view_page(data: ViewData) -> str:
         drops=[pictures(view.drops) for view in data.shown],
         seen=[pictures(view.seen) for view in data.shown],
         faded=pictures(data.outside.faded),
+        maps=[pictures(view.maps) for view in data.shown],
         splats=splats,
         engine=engine and base64_text(engine),
     )

@@ -7,7 +7,7 @@ const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
   view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
-  order: "worst", overlay: 0, outlines: "", drops: "", seen: "", other: false, from: data.start, // the view before the step back
+  order: "worst", overlay: 0, outlines: "", drops: "", seen: "", maps: "", other: false, from: data.start, // the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // of the stills: what lies in the middle, in shares of the picture
 };
@@ -21,6 +21,7 @@ let stills = null; // per view the pictures of every source; those that are seen
 let outlines = []; // per view the borders of its superpixels, where there are any
 let drops = []; // per view and source what would be dropped of it, in colour
 let seen = []; // per view and source what one view of the input shows, and what none, in colour
+let maps = []; // per view and source how far off new views are likely to be
 let faded = []; // per source the picture from outside in which that is faint which no view shows
 let solid = null; // the 3D view, once it is there
 let blinking = 0; // the timer
@@ -99,6 +100,7 @@ function showZoom() {
 }
 
 const dropsOf = (source) => (drops[state.view] || [])[source] || null;
+const mapOf = (source) => (maps[state.view] || [])[source] || null;
 const seenOf = (source) => (seen[state.view] || [])[source] || null;
 
 // Lays a picture over a side: the photo, outlines, or what would be dropped of a source.
@@ -137,6 +139,7 @@ function show() {
     lay(pane.querySelector(".outlines"), plain && state.outlines && outlines[state.view], OUTLINES);
     lay(pane.querySelector(".drops"), plain && state.drops && dropsOf(source), OUTLINES, source);
     lay(pane.querySelector(".seen"), plain && state.seen === "color" && !drawn && seenOf(source), OUTLINES, source);
+    lay(pane.querySelector(".maps"), plain && state.maps && mapOf(source), 1, source);
     const tag = id(`${side}-tag`);
     tag.hidden = !here;
     tag.textContent = data.sources[source].name;
@@ -152,6 +155,7 @@ function show() {
   id("outside").setAttribute("aria-pressed", String(view().outside));
   showLegend();
   showSeen();
+  if (id("map-legend")) id("map-legend").hidden = !state.maps;
   showLimits();
   if (solid && state.solid) {
     [left, right].filter(inSolid).forEach((source) => solid.mark(source, state.seen));
@@ -166,8 +170,9 @@ function showLimits() {
   const unseen = [state.left, state.right].some(dropsOf) ? "" : "Nothing of it is seen here";
   const outside = view().outside ? "No photo is outside" : "";
   const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
+  const unmapped = view().outside ? outside : [state.left, state.right].some(mapOf) ? "" : "Of results alone";
   const unknown = [state.left, state.right].some((source) => Object.keys(data.sources[source].seen).length) ? "" : "Nothing of it is seen here";
-  const reasons = { outlines: bare || away, drops: away || unseen, seen: unknown || (state.solid ? "" : away) };
+  const reasons = { outlines: bare || away, drops: away || unseen, seen: unknown || (state.solid ? "" : away), maps: away || unmapped };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
@@ -241,6 +246,7 @@ function startStrip() {
   outlines = JSON.parse(id("outline-pictures").textContent);
   drops = JSON.parse(id("drop-pictures").textContent);
   seen = JSON.parse(id("seen-pictures").textContent);
+  maps = JSON.parse(id("map-pictures").textContent);
   faded = JSON.parse(id("faded-pictures").textContent);
   stills[data.start] = stills[data.start].map((still, source) => still || inPage.get(source) || null);
   const shown = Number(!data.photos && data.sources.length > 1); // without photos the result, not its reference

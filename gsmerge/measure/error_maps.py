@@ -1,0 +1,144 @@
+"""Gaussians, cameras and photos -> a map for each view of how far off a new view from there is likely to be.
+
+A result has seen the photos of its own views, so its error there says little. So each pixel's surface, as the result
+has it, is looked up in the nearest photos of other views, and what they show there is compared with what is drawn.
+Where none of them looks, nothing but the view's own photo speaks for what is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gsmerge.frame import scene_frame
+from gsmerge.geometry import project
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.kernels.pictures import blur, sample_bilinear
+from gsmerge.measure.preview import Picture, contact_sheet, to_picture
+from gsmerge.measure.sizes import shrink_cameras, shrink_views
+from gsmerge.raster import render
+from gsmerge.raster.photos import NEAR
+from gsmerge.types import Cameras, Gaussians, Scene, Views
+
+SIDE = 320  # pixels, at most, of the longer side of a map
+# Nearest other photos that are asked, and how many of those that see a surface count, the nearest: held-out errors of
+# four captures rank as those by two (0.53 to 0.63), less as those by four (0.44 to 0.58): some show what stands before
+NEIGHBORS, COUNTED = 8, 2
+NEEDED = 2  # views with photos, for each to have another
+OPAQUE = 0.5  # opacity from which on a pixel shows a surface
+BEHIND = 1.05  # times the depth that the other view has there, from which on it is hidden from it
+SIGMA = 2.0  # pixels that errors are averaged over: their sum in a pixel is chance
+MOST = 0.2  # error, of the range of a channel, from which on it has the last colour
+STOPS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))  # of errors, even steps; sRGB
+UNKNOWN = (0, 130, 140)  # where no other photo looks
+
+
+@dataclass(frozen=True, eq=False)
+class Witnesses:
+    """Photos that say how far off a canonical scene is, and how deep it sees from them."""
+
+    gaussians: Gaussians
+    views: Views  # canonical cameras, photos of at most SIDE pixels
+    depths: dict[int, np.ndarray] = field(default_factory=dict)  # [h,w] camera z of a view; 0: nothing
+
+    def depth(self, view: int) -> np.ndarray:
+        """Draw the depth ``[h,w]`` of a view, once."""
+        if view not in self.depths:
+            self.depths[view] = _look(self.gaussians, self.views.cameras[[view]])[1]
+        return self.depths[view]
+
+
+def call_witnesses(gaussians: Gaussians, views: Views) -> Witnesses:
+    """Take the photos of canonical ``views`` for witnesses of canonical ``gaussians``."""
+    return Witnesses(gaussians, shrink_views(views, SIDE))
+
+
+def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = None) -> np.ndarray:
+    """Measure by the photos of other views how far off a canonical camera's picture is likely to be.
+
+    Returns ``[h,w]`` float32 of at most ``SIDE`` pixels a side: mean absolute differences of the channels, in [0, 1],
+    from the nearest photos that see the surface there; NaN where none does. ``own``: the view of the camera, whose
+    photo does not count.
+    """
+    camera = shrink_cameras(camera, SIDE)
+    image, depth = _look(witnesses.gaussians, camera)
+    y, x = np.nonzero(depth > 0)
+    rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
+    pose = invert(camera.viewmats[0].astype(np.float64))
+    points = matmul(rays * depth[y, x, None], pose[:3, :3].T) + pose[:3, 3]
+    sums, counts = np.zeros((2, len(points)), np.float32)
+    for other in _nearest(witnesses.views.cameras, camera, own):
+        cameras = witnesses.views.cameras[[other]]
+        ((pixels,), (z,)), size = project(points, cameras), np.array([cameras.width, cameras.height])
+        seen = np.flatnonzero((counts < COUNTED) & (z > 0) & ((pixels >= 0) & (pixels < size)).all(1))
+        column, row = pixels[seen].astype(np.int64).T
+        seen = seen[z[seen] < BEHIND * witnesses.depth(other)[row, column]]
+        there = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5))
+        sums[seen] += np.abs(there - image[y[seen], x[seen]]).mean(1)
+        counts[seen] += 1
+    errors = np.zeros((*depth.shape, 2), np.float32)
+    errors[y, x, 0], errors[y, x, 1] = sums / np.maximum(counts, 1), counts > 0
+    known = errors[..., 1] > 0
+    total, weight = np.moveaxis(blur(errors, SIGMA), 2, 0)
+    return np.where(known, total / np.maximum(weight, np.float32(1e-6)), np.float32(np.nan))
+
+
+def draw_errors(errors: np.ndarray) -> Picture:
+    """Draw errors ``[h,w]``: from black over red to yellow, which is 0.2 or more, and teal where nothing is known."""
+    places = np.nan_to_num(errors).clip(0, MOST) * ((len(STOPS) - 1) / MOST)
+    colors = [np.interp(places, range(len(STOPS)), channel) for channel in np.array(STOPS).T]
+    return np.where(np.isnan(errors)[..., None], UNKNOWN, np.stack(colors, 2)).round().astype(np.uint8)
+
+
+def _look(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Draw the picture ``[h,w,3]`` and the depth ``[h,w]``, 0 where nothing is opaque, of a camera."""
+    drawn = render(gaussians, camera, near=NEAR, with_depths=True)
+    assert drawn.depths is not None
+    (depth,), (alpha,) = drawn.depths[..., 0], drawn.alphas[..., 0]
+    return drawn.images[0].clip(0, 1), np.where(alpha > OPAQUE, depth, np.float32(0))
+
+
+def _nearest(cameras: Cameras, camera: Cameras, own: int | None) -> list[int]:
+    """Return the nearest other views of a camera, the nearest first."""
+    away = np.square(cameras.centres - camera.centres[0]).sum(1)
+    order = [int(view) for view in np.argsort(away, kind="stable") if view != own]
+    return order[:NEIGHBORS]
+
+
+def require_photos(scene: Scene) -> None:
+    """Raise ValueError unless a scene has two photos or more."""
+    count = 0 if scene.images is None else len(scene)
+    if count < NEEDED:
+        raise ValueError(
+            f"photos: expected those of {NEEDED} views or more, which say how far off others are; got {count}"
+        )
+
+
+def draw_sheets(
+    scene: Scene, results: Mapping[str, Gaussians], targets: Views | None, cameras: Mapping[str, Cameras]
+) -> Iterator[tuple[str, int, Picture]]:
+    """Draw the photo, the picture and the map of each result and view, side by side.
+
+    Yields (result, number of the view among all, the input views first, sheet). ``cameras`` are those of the input
+    views by name of a result that was made with others. ValueError unless the scene has two photos or more.
+    """
+    require_photos(scene)
+    assert scene.images is not None
+    frame = scene_frame(scene)
+    for name, gaussians in results.items():
+        placed = frame.enter_cameras(cameras.get(name, scene.cameras))
+        witnesses = call_witnesses(frame.enter(gaussians), Views(placed, scene.images, scene.names))
+        views: list[tuple[Views, int, int | None]] = [(witnesses.views, view, view) for view in range(len(placed))]
+        if targets is not None:
+            held_out = shrink_views(replace(targets, cameras=frame.enter_cameras(targets.cameras)), SIDE)
+            views += [(held_out, view, None) for view in range(len(held_out))]
+        for number, (of, view, own) in enumerate(views):
+            camera = of.cameras[[view]]
+            drawn, errors = _look(witnesses.gaussians, camera)[0], expected_errors(witnesses, camera, own)
+            pictures = to_picture(of.images[view]), to_picture(drawn), draw_errors(errors)
+            known = errors[~np.isnan(errors)]
+            said = f"likely error: {known.mean():.3f}" if len(known) else "no other photo looks there"
+            texts = f"{of.names[view]}{'' if own is not None else ', held out'}", name, said
+            yield name, number, contact_sheet([list(zip(texts, pictures, strict=True))])
