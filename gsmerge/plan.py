@@ -180,7 +180,8 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         pairs = checkpoint is None and merges_pairs(size, asked)
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
             factor = PLACED_STEPS if reference.placed else RENDERS_STEPS
-            fit = replace(fit, judged=False, tuning=fit.tuning.scaled(factor))
+            tuning = replace(fit.tuning.scaled(factor), max_ratio=math.inf)  # strokes of the input are wanted
+            fit = replace(fit, judged=False, tuning=tuning)
         if pairs and reference.placed and fit.fit == "none" != options.fit.fit:
             note(NO_FIT)
     if keeps and has_few_rows(size):

@@ -22,7 +22,7 @@ from gsmerge.runtime.threads import parallel_map
 SPARE = 1.25  # times the intersections of a view for which there is no room yet
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities")
-OF_STEP = {"camera": CAMERA, "background": 3, "loss_weights": 2, "rates": 14, "limits": 3, "betas": 2, "regs": 2}
+OF_STEP = {"camera": CAMERA, "background": 3, "loss_weights": 2, "rates": 14, "limits": 5, "betas": 2, "regs": 2}
 
 
 def is_prepared(state: FitState) -> bool:

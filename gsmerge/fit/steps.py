@@ -10,9 +10,9 @@ from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.loss import image_gradient
 from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.prepared_step import StepTables, is_prepared
-from gsmerge.fit.schedule import FitRun, Step, loss_weights, step_sizes
+from gsmerge.fit.schedule import GROWTH, FitRun, Step, loss_weights, step_sizes
 from gsmerge.geometry import motion_matrices
-from gsmerge.kernels.elementary import power
+from gsmerge.kernels.elementary import log, power
 from gsmerge.kernels.gaussians import optimise as kernels
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster.blend import MAX_ALPHA
@@ -131,9 +131,14 @@ class Optimiser:
         """Return the optimiser's constants at a step."""
         options, count = self.run.job.options, max(len(state.x), 1)
         rates = options.tuning
+        moves = rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change
+        widest = max(photos.width for photos in self.run.job.photos)  # of the size whose pixels the least scale counts
+        ratio, long = log(np.array([rates.max_ratio, rates.long_share * widest / (3 * max(rates.min_scale, 1e-9))]))
+        if not options.grows or step.progress < GROWTH:  # none come that could fill what is cut
+            ratio = np.inf
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
-            "limits": np.array([rates.max_mean_shift, rates.max_scale_change, rates.max_opacity_change], np.float32),
+            "limits": np.array([*moves, ratio, long], np.float32),
             "betas": np.array([rates.beta1, rates.beta2], np.float32),
             "regs": np.array([rates.opacity_reg / count, rates.scale_reg / count], np.float32),
         }

@@ -38,6 +38,11 @@ class Tuning:
     # Least scale, in pixels of the photo that a Gaussian is nearest to: thinner ones show as
     # needles when a viewer enlarges them. 0 for none
     min_scale: float = 0.5
+    # Gaussians whose three sigma reach this share of the width of the nearest photo are at most so
+    # many times as long as their second axis, once a run has grown: from elsewhere longer ones show
+    # as strokes. Before, they help few Gaussians to find their places
+    long_share: float = 0.25
+    max_ratio: float = 3.0
     average_share: float = 0.2  # Share of the last steps that the parameters are averaged over
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss, the rest is L1
     # Weight in the loss, at the end, of the L1 of differences between neighbouring pixels; it

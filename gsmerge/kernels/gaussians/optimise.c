@@ -39,7 +39,7 @@ static inline v16f sum_groups(v16f v) {
 typedef struct {
   v16f rates;  // made up for first moments that began at zero
   float beta1, beta2, second;  // decays of the moments, and what makes up for the second ones
-  float mean_limit, size_limit, logit_limit;
+  float mean_limit, size_limit, logit_limit, ratio_limit, long_limit;
   float opacity_reg, scale_reg;  // gradients of the weights of opacity, and of scales in sizes
 } Step;
 
@@ -100,6 +100,14 @@ static inline v16f confine(const Block *b, int64_t j, Step s, v16f x0, float lea
   return sel(OF_MEAN, nearer, sel(OF_QUAT, x * b->length[j], inside));
 }
 
+// Log scales of which the largest is no longer than a ratio of the second, or than what counts as long.
+static inline v16f shorten(v16f x, Step s, float least) {
+  float a = x[SIZE], b = x[SIZE + 1], c = x[SIZE + 2];
+  float low = a < b ? a : b, high = a < b ? b : a, second = c < low ? low : c < high ? c : high;
+  float wide = second + s.ratio_limit, most = least + s.long_limit;
+  return sel(OF_SIZE, min16(x, splat(wide > most ? wide : most)), x);
+}
+
 // The gradients as the rasterizer gives them, in the optimiser's parameters: means in units of the
 // Gaussian's size, log, logit.
 static inline void gather(Block *b, int64_t j, Step s, const float *scale, float opacity,
@@ -135,6 +143,8 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
             .mean_limit = limits[0],
             .size_limit = limits[1],
             .logit_limit = limits[2],
+            .ratio_limit = limits[3],
+            .long_limit = limits[4],
             .opacity_reg = regs[0],
             .scale_reg = regs[1]};
   Block b = {0};
@@ -155,7 +165,7 @@ API int32_t adam(float *restrict x, const float *restrict x0, float *restrict m,
     confine_groups(&b, s);
     for (int64_t j = 0; j < size; j++) {
       int64_t i = rows[j];
-      v16f row = confine(&b, j, s, load_row(x0 + COLUMNS * i), min_sizes[i]);
+      v16f row = shorten(confine(&b, j, s, load_row(x0 + COLUMNS * i), min_sizes[i]), s, min_sizes[i]);
       store_row(x + COLUMNS * i, row);
       for (int c = 0; c < 3; c++) means[3 * i + c] = row[MEAN + c];
       for (int c = 0; c < 4; c++) quats[4 * i + c] = row[QUAT + c];

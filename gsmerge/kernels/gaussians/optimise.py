@@ -15,7 +15,7 @@ MAX_LOGIT, MIN_LOGIT = np.float32(6.9), np.float32(-5.5)
     STATUS, x=f4("n", COLUMNS, out=True), x0=f4("n", COLUMNS), m=f4("n", COLUMNS, out=True),
     v=f4("n", COLUMNS, out=True), units=f4("n"), box_shares=f4("n"), min_sizes=f4("n"), ids=i4("k"),
     g_means=f4("k", 3), g_quats=f4("k", 4), g_scales=f4("k", 3), g_opacities=f4("k"), g_colors=f4("k", 3),
-    rates=f4(COLUMNS), limits=f4(3), betas=f4(2), regs=f4(2), step=i8(least=1), first=i8(least=0, most="k"),
+    rates=f4(COLUMNS), limits=f4(5), betas=f4(2), regs=f4(2), step=i8(least=1), first=i8(least=0, most="k"),
     last=i8(least="first", most="k"), means=f4("n", 3, out=True), quats=f4("n", 4, out=True),
     scales=f4("n", 3, out=True), opacities=f4("n", out=True), colors=f4("n", 3, out=True),
 )  # fmt: skip
@@ -33,7 +33,8 @@ def adam(
         min_sizes: ``[n]`` least log scale of each, whatever the box.
         ids: ``[k]`` rows with a gradient, each once; the gradients have k rows.
         rates: Of mean (in units of each Gaussian's size), log scale, quaternion, logit, colour.
-        limits: Of the mean (in sizes), log scale, logit.
+        limits: Of the mean (in sizes), log scale, logit; by how much the largest log scale may exceed the second, or
+            the least one if that is more.
         betas: Decay of the first and second moment.
         regs: Added to the gradients of the opacity, and of scales in units of the Gaussian's size.
         step: From 1.

@@ -32,7 +32,7 @@ STEP = Table(
     gradient=f4("height", "width", 3, out=True), errors=f4("height", out=True),
     terms=f4("threads", ROWS, TERMS, "line", out=True), rows=f4("threads", EDGE_ROWS, "line", out=True),
     photo=f4("height", "width", 3), weight=f4("height", "width"), camera=f4(CAMERA), background=f4(3),
-    loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(3), betas=f4(2), regs=f4(2),
+    loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2), regs=f4(2),
 )  # fmt: skip
 
 

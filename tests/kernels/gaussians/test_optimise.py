@@ -14,7 +14,8 @@ from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.optimise import COLOR, COLUMNS, LOGIT, MAX_LOGIT, MIN_LOGIT, QUAT, SIZE, adam
 
 RATES = np.array([0.1] * 3 + [0.2] * 3 + [0.03] * 4 + [0.3] + [0.03] * 3)
-LIMITS, BETAS = np.array([2.0, 2.5, 4.0]), np.array([0.7, 0.99])
+# of the mean, log scale, logit; of the largest scale above the second, and above the least
+LIMITS, BETAS = np.array([2.0, 2.5, 4.0, 1.1, 2.0]), np.array([0.7, 0.99])
 REGS = np.array([0.02, 0.03], np.float32)
 MEAN, TURN = slice(0, SIZE), slice(QUAT, LOGIT)
 
@@ -114,6 +115,8 @@ def step_slowly(run: Run, g: Wanted, step: int) -> None:
         reach = run.box_shares[i] * LIMITS[1]
         size = np.clip(x[SIZE:QUAT], x0[SIZE:QUAT] - reach, x0[SIZE:QUAT] + reach)
         x[SIZE:QUAT] = np.maximum(size, run.min_sizes[i])
+        most = max(sorted(x[SIZE:QUAT])[1] + LIMITS[3], run.min_sizes[i] + LIMITS[4])
+        x[SIZE:QUAT] = np.minimum(x[SIZE:QUAT], most)
         logit = np.clip(x[LOGIT], x0[LOGIT] - LIMITS[2], x0[LOGIT] + LIMITS[2])
         x[LOGIT] = np.clip(logit, MIN_LOGIT, MAX_LOGIT)
         x[COLOR:] = np.clip(x[COLOR:], np.minimum(x0[COLOR:], -0.05), np.maximum(x0[COLOR:], 1.05))

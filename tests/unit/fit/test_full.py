@@ -52,6 +52,7 @@ def test_perturbed_scene_comes_back(scene: Scene, truth: Gaussians, photos: Pair
 
 def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     box = {"max_mean_shift": 0.5, "max_scale_change": 0.1, "max_opacity_change": 0.2, "min_scale": 0}
+    box["max_ratio"] = np.inf
     start = scenes.spoil(truth)
     result, report = fit_full(start, scenes.run_for(photos, scenes.tuned(QUICK, **box)))
     assert report.accepted
@@ -60,6 +61,25 @@ def test_moves_stay_in_the_box(truth: Gaussians, photos: Pair) -> None:
     assert float(np.abs(np.log(result.scales / start.scales)).max()) <= 0.1001
     before, after = (elementary.log(a / (1 - a)) for a in (g.opacities.astype(np.float64) for g in (start, result)))
     assert float(np.abs(after - before).max()) <= 0.2001
+
+
+def test_no_stroke_is_left_of_what_photos_show(truth: Gaussians, photos: Pair) -> None:
+    """Every twentieth Gaussian starts as a needle across the picture; without the limit most stay long."""
+    rows = np.arange(0, len(truth), 20)
+    scales = truth.scales.copy()
+    scales[rows] = scales[rows].mean() * np.array([12, 1, 0.5], np.float32)
+    start, left = replace(truth, scales=scales), []
+    for most in (3.0, np.inf):
+        options = replace(LONG, judged=False)
+        run = scenes.run_for(photos, scenes.tuned(options, max_ratio=most, long_share=0.1, max_scale_change=0.7))
+        survey = survey_photos(start, run)
+        result, report = fit_full(start, run)
+        assert report.origins is not None
+        pixels = survey.pixels[report.origins]
+        _, second, longest = np.sort(result.scales, 1).T
+        long = np.isfinite(pixels) & (3 * longest > 1.01 * 0.1 * photos[0].width * pixels)
+        left.append(int((long & (longest > 3.2 * second)).sum()))  # means of the last steps may exceed 3
+    assert left[0] == 0 < left[1]
 
 
 def test_what_one_photo_shows_has_a_smaller_box(truth: Gaussians, photos: Pair) -> None:
