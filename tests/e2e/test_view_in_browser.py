@@ -32,7 +32,7 @@ FRESH = (
     "solid.request = () => {};"
     "for (const one of document.querySelectorAll('.handle, .tag, .back')) one.style.display = '';"
     "for (const name of ['borderRadius', 'width', 'margin']) stage.style[name] = '';"
-    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('seen', '');"
+    "set('scheme', ''); set('order', 'worst'); set('outlines', ''); set('drops', ''); set('seen', ''); set('maps', '');"
     "set('pixels', 'screen'); set('shape', 'splats');"
     "set('solid', ''); set('mode', 'swipe'); set('other', false); pick('left', 1); choose(2); zoomTo(1); swipeTo(0.5);"
     "jump(data.start); document.fullscreenElement && document.exitFullscreen(); scrollTo(0, 0)"
@@ -270,6 +270,26 @@ def test_what_no_view_shows_is_faint_from_outside(opened: tuple[Browser, Any]) -
     np.testing.assert_array_equal(faint[~fainter], plain[~fainter])
     assert 0 < (np.abs(colored - plain).max(1) > 0.02).sum() <= none + one
     np.testing.assert_array_equal(np.array(tab.run(looks)), plain)
+
+
+def test_a_map_of_likely_errors_lies_over_a_result(opened: tuple[Browser, Any]) -> None:
+    tab, _ = opened
+    layer = "document.querySelector('#right-pane .maps')"
+    assert tab.run(f"[{layer}.hidden, id('map-legend').hidden]") == [True, True]
+    tab.press("m")
+    shown = (
+        f"[{layer}.hidden, {layer}.style.backgroundImage.startsWith('url(\"data:image/webp'), id('map-legend').hidden]"
+    )
+    assert tab.run(shown) == [False, True, False]
+    assert tab.run("document.querySelector('#left-pane .maps').hidden") is True  # photos and the input have none
+    tab.press("b")
+    assert tab.run(f"[{layer}.hidden, document.querySelector('[data-set=maps]').title]") == [
+        True,
+        "No photo is outside",
+    ]
+    tab.press("b")
+    tab.press("m")
+    assert tab.run(f"{layer}.hidden") is True
 
 
 def test_swipe_shows_each_on_its_side(opened: tuple[Browser, Any]) -> None:
