@@ -11,12 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.frame import scene_frame
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, Scene
 
 LEAST = FitOptions().min_contribution  # blending weight of a pixel from which on a view shows a Gaussian, as for a fit
 LEVEL, SIDE = 2, 480  # pictures are that much smaller, as where a fit looks for Gaussians, and at most so wide
@@ -39,6 +40,13 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     for shown in in_turn(is_shown, range(len(pictures))):
         counts += shown
     return counts
+
+
+def count_views_in_world(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
+    """Count the views, at least one, that show each of n Gaussians of their own world, ``[n]`` int32."""
+    names = tuple(map(str, range(len(cameras))))
+    frame = scene_frame(Scene(gaussians, cameras, None, None, names))
+    return count_views(frame.enter(gaussians), frame.enter_cameras(cameras))
 
 
 def tint(gaussians: Gaussians, counts: np.ndarray) -> Gaussians:

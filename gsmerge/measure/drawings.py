@@ -10,9 +10,8 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
-from gsmerge.facts.support import count_views, tint
+from gsmerge.facts.support import count_views_in_world, tint
 from gsmerge.facts.views import pick_views, subset
-from gsmerge.frame import scene_frame
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
@@ -272,9 +271,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
     if options.overlay is not None and len(load.scene):
-        frame = scene_frame(load.scene)
-        cameras = frame.enter_cameras(load.scene.cameras)
-        scenes = [tint(gaussians, count_views(frame.enter(gaussians), cameras)) for gaussians in scenes]
+        scenes = [tint(gaussians, count_views_in_world(gaussians, load.scene.cameras)) for gaussians in scenes]
     sizes = [file.info.file_bytes for file in (first, *plys)]
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, named if plys else list(notes[0]), load)
 

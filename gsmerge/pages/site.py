@@ -6,17 +6,22 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
+
 from gsmerge.facts.place_cameras import place_viewpoints
+from gsmerge.facts.support import count_views_in_world
 from gsmerge.facts.views import even_views
 from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
-from gsmerge.io.formats.sog import sog_bytes
+from gsmerge.io.formats.sog import file_order, sog_bytes
 from gsmerge.io.formats.table import SITE_SCENE, VIEWER
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
+from gsmerge.pages.marks import MORE
 from gsmerge.pages.page import base64_text, camera_numbers, data_uri, describe_gain, render_template
+from gsmerge.pages.splats import pack_support
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 
@@ -52,6 +57,7 @@ def site_contents(
     middle = 0 if is_free else median_camera(shown)  # of placed ones the first stands outside
     poster = encode_still(to_picture(render(gaussians.numpy(), shown[[middle]]).images[0]))
     views = sorted({*even_views(len(shown), min(len(shown), MAX_VIEWS)), middle})
+    support = np.minimum(count_views_in_world(gaussians.numpy(), shown[views]), MORE).astype(np.uint8)
     vendor = files("gsmerge.pages").joinpath("vendor")
     licences = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
     notice, engine = "\n\n".join(licences).encode(), VIEWER.read_bytes()
@@ -63,6 +69,7 @@ def site_contents(
         inside={} if apart else {NAMES[name]: base64_text(contents[NAMES[name]]) for name in ("engine", "scene")},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",
+        support=base64_text(pack_support(support[file_order(gaussians)])) if (support == 0).any() else None,
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(middle),
             "views": [

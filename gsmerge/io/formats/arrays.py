@@ -115,11 +115,16 @@ class Columns:
 
     def along_curve(self) -> Columns:
         """Sort the rows along a space-filling curve, so that neighbours in space are near in the file."""
-        return self.take(np.argsort(morton_codes(self.means), kind="stable"))
+        return self.take(curve_order(self.means))
 
     def take(self, rows: np.ndarray) -> Columns:
         """Return the rows with the given indices, in that order."""
         return Columns(*(column[rows] for column in vars(self).values()))
+
+
+def curve_order(means: np.ndarray) -> np.ndarray:
+    """Return the order of centres ``[n,3]`` along a space-filling curve."""
+    return np.argsort(morton_codes(means), kind="stable")
 
 
 def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:

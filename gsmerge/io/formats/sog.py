@@ -238,6 +238,11 @@ def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     return content.getvalue()
 
 
+def file_order(gaussians: Gaussians) -> np.ndarray:
+    """Return the rows ``[n]`` of Gaussians in the order in which :func:`sog_bytes` stores them."""
+    return arrays.curve_order(arrays.to_columns(gaussians, MAX_DEGREE).means)
+
+
 def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]:
     """Encode the files of a ``.sog`` by name: textures with the rows in their order, then ``meta.json``."""
     count = len(columns)
