@@ -62,7 +62,7 @@ class BeforeAfter:
 
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """Read the scenes BEFORE (``files``) and AFTER, and the views of ``--targets``; place views if there are none."""
-    from gsmerge.facts.place_cameras import add_views
+    from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
     from gsmerge.runtime.record import record_run
     from gsmerge.scene.files import result_cameras
@@ -77,7 +77,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     if not scene.aligned:
         with record_run() as record:
             scene = add_views(scene, shown=True)
-        notes = record.notes
+        notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     cameras, moved = own_cameras(args.after, scene)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *adapted, *notes, *moved])

@@ -62,7 +62,7 @@ def evaluate(args: opt.Args) -> None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
     args.views, args.masks = own.views, None if own.masks is None else opt.named_or_none(own.masks)
     files, outputs = args.files(args.before), args.output or []
-    if args.quiet and not (outputs or args.json):
+    if args.quiet and not (outputs or args.json or args.maps):
         raise UsageError("--quiet: expected -o or --json with it, since nothing would be shown")
     _check_files(args, outputs, own, input_files(files))
     if args.maps is not None:
@@ -78,8 +78,7 @@ def evaluate(args: opt.Args) -> None:
     if args.maps is not None:
         from gsmerge.measure.error_maps import require_photos
 
-        with opt.usage_errors():
-            require_photos(pair.scene)
+        require_photos(pair.scene, pair.load.files.ply)
     notes = [*pair.notes, *missing]
     if pair.plys and len(pair.scene) < len(pair.load.scene):
         notes.append(
@@ -95,8 +94,11 @@ def evaluate(args: opt.Args) -> None:
         facts = _facts(pair, options, own, dict(zip(pair.plys, seconds, strict=False)))
     document = evaluation_document(evaluation, facts, notes)
     _write(outputs, document, pair, evaluation, stills)
-    document["maps"] = [] if args.maps is None else [str(path) for path in _write_maps(args.maps, pair)]
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
+    document["maps"] = []
+    if args.maps is not None:
+        document["maps"] = [str(path) for path in _write_maps(args.maps, pair, context=options.context)]
+        lines.append(f"maps: {len(document['maps'])} pictures in {args.maps}")
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     say_notes(evaluation.notes, quiet=args.silent)
 
@@ -174,7 +176,7 @@ def _write(
     write_texts(texts, overwrite=True)
 
 
-def _write_maps(folder: Path, pair: BeforeAfter) -> list[Path]:
+def _write_maps(folder: Path, pair: BeforeAfter, *, context: bool) -> list[Path]:
     """Write the sheet of each result and view into a folder, named after both; return their paths."""
     from gsmerge.measure.drawings import picture_stems
     from gsmerge.measure.error_maps import draw_sheets
@@ -186,7 +188,7 @@ def _write_maps(folder: Path, pair: BeforeAfter) -> list[Path]:
     stems = dict(
         zip(results, picture_stems([Path(name).with_suffix(".png").as_posix() for name in results]), strict=True)
     )
-    sheets = draw_sheets(pair.scene, results, pair.held_out, pair.cameras)
+    sheets = draw_sheets(pair.scene, results, pair.held_out, pair.cameras, context=context)
     for name, view, sheet in sheets:
         paths.append(folder / f"{stems[name]}.{views[view]}.map.png")
         folder.mkdir(parents=True, exist_ok=True)

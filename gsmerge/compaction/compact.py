@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
@@ -173,18 +173,12 @@ def _to_clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Any, ...]
     return fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave
 
 
-def _note_clean(counts: Mapping[str, Any], left: int, count: int | None, prepared: Prepared) -> None:
+def _note_clean(counts: dict[str, int], left: int, count: int | None, prepared: Prepared) -> None:
     """Record what clean-up left out, and whether fewer than ``count`` are left."""
+    from gsmerge.stages.clean import describe_counts
+
     choose(clean=counts)
-    words = {
-        "cropped": "outside of the crop",
-        "sky": "sky",
-        "floaters": "floater(s)",
-        "transparent": "transparent",
-        "unseen": f"that no {'placed camera' if prepared.reference.placed else 'view'} shows",
-        "surplus": "more than the budget",
-    }
-    parts = ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
+    parts = describe_counts(counts, placed=prepared.reference.placed)
     note(f"left out by clean-up: {parts}")
     if counts.get("cropped") or counts.get("sky"):
         note("PSNR of the input views counts what is left out as errors")

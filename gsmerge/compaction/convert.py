@@ -19,7 +19,7 @@ from gsmerge.compaction.placement import (
     place,
 )
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.place_cameras import place_cameras
+from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
@@ -36,11 +36,11 @@ from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.files import named_path, result_cameras, scene_title
+from gsmerge.scene.files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.settings.placement import PlacementOptions
-from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.clean import clean
+from gsmerge.stages.clean import clean, describe_counts
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 
 NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
@@ -96,8 +96,8 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     named = [f"{path.name}: " if len(files) > 1 else "" for path in options.inputs]
     notes = [name + text for name, info in zip(named, infos, strict=True) for text in file_notes(info)]
     notes += unread
-    if "unseen" in options.clean.drops and stored is None:
-        notes.append("drop unseen: without cameras, views placed around and inside the scene count; name --cameras")
+    if "unseen" in options.clean.drops:
+        notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
     grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
@@ -110,17 +110,35 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     num_bytes, beside = _write(options, ending, gaussians, moved, photos, names, comments)
     facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
-    document = document_head() | {"inputs": read, "left_out": left_out, "output": facts, "viewer_cameras": beside}
-    return document | {"notes": notes}
+    named_cameras = None if stored is None else str(stored.path)
+    old = viewer_cameras_path(options.output)
+    if beside is None and ending not in (COLMAP.ending, HTML.ending) and old.is_file():
+        notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
+    document = document_head() | {"inputs": read, "cameras": named_cameras, "left_out": left_out, "output": facts}
+    return document | {"viewer_cameras": beside, "notes": notes}
 
 
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe a conversion in one line of text."""
     before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
     kept = "" if after["num_gaussians"] == before and not document["left_out"] else f" of {before:,}"
+    reasons = describe_counts(document["left_out"], placed=document["cameras"] is None)
+    why = f" (left out: {reasons})" if reasons else ""
     beside = document["viewer_cameras"]
     cameras = f"; cameras in {Path(beside).name}" if beside else ""
-    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians, {human_bytes(after['bytes'])}{cameras}"
+    return f"{after['path']}: {after['num_gaussians']:,}{kept} Gaussians{why}, {human_bytes(after['bytes'])}{cameras}"
+
+
+def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
+    """Note whose views counted where nobody named them, or where they see less than half of the Gaussians."""
+    if cameras is None:
+        beside = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
+        remedy = "" if options.cameras == NONE else f"; name them with --cameras {beside or 'FILE'}"
+        return [f"drop unseen: without cameras, views placed around and inside the scene count{remedy}"]
+    if 2 * unseen > count:
+        share = f"{100 * unseen / count:.0f} % of the Gaussians"
+        return [f"drop unseen: the cameras in {cameras} do not show {share}; are they those of this scene?"]
+    return []
 
 
 def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
@@ -164,7 +182,7 @@ def _clean(
         cameras = to_cameras(stored, (images.shape[2], images.shape[1]))
     elif stored is not None:
         cameras = to_cameras(stored)
-    placed = place_cameras(gaussians) if cameras is None else cameras
+    placed = place_viewpoints(gaussians) if cameras is None else cameras
     frame = scene_frame(Scene(gaussians, placed, None, None, tuple(map(str, range(len(placed))))))
     canonical = frame.enter(replace(gaussians, means=gaussians.means.astype(np.float64)))
     left, counts = clean(canonical, options.clean, frame.enter_cameras(placed), images, frame.leave)

@@ -17,6 +17,7 @@ from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import unlike_captures
+from gsmerge.facts.support import count_views_in_world
 from gsmerge.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes
 from gsmerge.io.formats.arrays import read_new_views
@@ -78,7 +79,8 @@ def inspect(
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. Of the views: ``cameras``, ``camera_format``, ``images``, ``num_views``,
         ``width``, ``height``, ``per_pixel``, ``num_missing`` (pixels without a Gaussian), ``rows`` (their order),
-        ``alignment`` or ``alignment_problem``, ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
+        ``alignment`` or ``alignment_problem``, ``num_unseen`` (Gaussians of a result that no view shows),
+        ``sight``, ``coverage``, ``num_sky_views``, ``agreement``:
         shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
         ``contradicted``, ``alone``), ``new_views``: ``before``, ``after``, ``low``, ``high`` of a result, see the
         report of a run. ``compact``: the estimate of a run, None where it would refuse the scene; ``auto``: ``share``,
@@ -147,7 +149,17 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "notes": file_notes(ply.info),
         **dict.fromkeys(("num_views", "width", "height", "per_pixel", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(
-            ("camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement")
+            (
+                "camera_format",
+                "rows",
+                "alignment",
+                "alignment_problem",
+                "sight",
+                "compact",
+                "auto",
+                "agreement",
+                "num_unseen",
+            )
         ),
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
@@ -170,6 +182,9 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     facts |= {"notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene)], "num_views": len(load.views.used)}
     facts |= {"camera_format": load.cameras and load.cameras.source}
     facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
+    if is_result and len(scene):
+        shown = count_views_in_world(scene.finite_gaussians, scene.cameras)
+        facts["num_unseen"] = int((shown == 0).sum())
     facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
     agreement = _measure_agreement(scene)
     facts |= {"auto": _describe_auto(scene, agreement), "agreement": agreement and agreement.to_dict()}
@@ -208,6 +223,9 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"extent     {low}  to  {high}  (1 % to 99 %); {100 * size['share_outliers']:.3g} % beyond ten times that box",
         f"floaters   about {round(size['share_floaters'] * scene['count']):,}: isolated, or beyond that;"
         " compact --drop floaters leaves them out",
+        f"unseen     {scene['num_unseen']:,}: no view shows them; --drop unseen leaves them out"
+        if scene["num_unseen"]
+        else "",
         f"sky        in {scene['num_sky_views']} photos; compact --drop sky leaves it out"
         if scene["num_sky_views"]
         else "",
@@ -280,7 +298,7 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     each = f"{high} % of the {what} in every view"
     if low != high:
         each = f"{low} to {high} % of the {what} per view, least in {views[shares.index(min(shares))]['name']}"
-    return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians seen{colors}"]
+    return [f"coverage   {each}; {100 * seen['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
 
 
 def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:

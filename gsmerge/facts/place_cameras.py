@@ -45,8 +45,9 @@ OUTSIDE, MOST_OUTSIDE = 0.5, 24  # of their number look from outside, at most
 NEAREST, FARTHEST = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
 
+PLACED_VIEWS = "no cameras: views are placed around and inside the scene"
 NO_VIEWS = (
-    "no cameras: views are placed around and inside the scene, and the result cannot be better than its input;"
+    f"{PLACED_VIEWS}, and the result cannot be better than its input;"
     " with cameras and photos it is fitted to them (--cameras, --images)"
 )
 

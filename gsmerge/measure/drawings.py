@@ -49,6 +49,7 @@ SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
 GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
+PLACED = "no cameras: views are placed"
 HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
 
 
@@ -72,6 +73,11 @@ class DrawOptions:
     def choose(self, count: int, most: int | None = None) -> list[int]:
         """Choose ids of ``count`` views: as many as the option ``views``, or else ``most``; None: all."""
         return pick_views(count, self.views or most or count)
+
+    @property
+    def legend(self) -> str:
+        """Words for the colours of an overlay, behind a name."""
+        return "" if self.overlay is None else " (yellow: one view shows it, red: none)"
 
     @property
     def fps(self) -> float:
@@ -150,7 +156,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     ids = options.choose(len(used), PANEL_VIEWS)
 
     def draw(_: int) -> Iterator[Picture]:
-        parts = [(path.name, gaussians) for path, gaussians in group.scenes]
+        parts = [(f"{path.name}{options.legend}", gaussians) for path, gaussians in group.scenes]
         shown = [photos[used[i]] for i in ids] if len(photos) else None
         if shown and options.size:
             shown = [fill_photo(photo, *options.size) for photo in shown]
@@ -168,7 +174,7 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     group = _read(options, photos=False)
     ids = options.choose(len(group.load.views.cameras))
     views, stems = options.resize(group.load.views.cameras[ids]), picture_stems(group.load.views.names)
-    names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
+    names = [f"{path.name}{options.legend}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[Picture]:
         for drawn in group.draw(views, options, threads):
@@ -267,6 +273,8 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     same_file = like.ply == files.ply
     rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
     load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos), inside=photos)
+    if options.overlay is not None and any(note.startswith(PLACED) for note in load.notes):
+        load = replace(load, notes=(*load.notes, "overlay: these views count, so it says nothing of photos"))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     named = [f"{path}: {note}" for path, texts in zip(paths, notes, strict=True) for note in texts]
@@ -285,7 +293,7 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
     notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
-    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
+    placed = f"{PLACED} {'around and inside' if inside else 'around'} the scene"
     return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
 
 
@@ -338,4 +346,5 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         less_played = document["encoding"] != H264 and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
         return f"{line}, {document['encoding']}{hint}"
-    return f"{len(document['pictures'])} picture(s) of {len(document['views'])} views"
+    count = len(document["pictures"])
+    return f"{count} picture{'' if count == 1 else 's'} of {len(document['views'])} views"

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
+from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
 from gsmerge.geometry import project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
-from gsmerge.measure.sizes import shrink_cameras, shrink_views
+from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.raster import render
 from gsmerge.raster.photos import NEAR
 from gsmerge.types import Cameras, Gaussians, Scene, Views
@@ -41,6 +43,7 @@ class Witnesses:
 
     gaussians: Gaussians
     views: Views  # canonical cameras, photos of at most SIDE pixels
+    masks: np.ndarray | None  # [v,h,w] bool, where these count; None: everywhere
     depths: dict[int, np.ndarray] = field(default_factory=dict)  # [h,w] camera z of a view; 0: nothing
 
     def depth(self, view: int) -> np.ndarray:
@@ -50,9 +53,11 @@ class Witnesses:
         return self.depths[view]
 
 
-def call_witnesses(gaussians: Gaussians, views: Views) -> Witnesses:
-    """Take the photos of canonical ``views`` for witnesses of canonical ``gaussians``."""
-    return Witnesses(gaussians, shrink_views(views, SIDE))
+def call_witnesses(gaussians: Gaussians, views: Views, masks: np.ndarray | None = None) -> Witnesses:
+    """Take the photos of canonical ``views``, where ``masks [v,h,w]`` let them, for witnesses of a canonical scene."""
+    small = shrink_views(views, SIDE)
+    size = small.cameras.width, small.cameras.height
+    return Witnesses(gaussians, small, None if masks is None else np.stack([resize_mask(one, *size) for one in masks]))
 
 
 def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = None) -> np.ndarray:
@@ -74,7 +79,8 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
         ((pixels,), (z,)), size = project(points, cameras), np.array([cameras.width, cameras.height])
         seen = np.flatnonzero((counts < COUNTED) & (z > 0) & ((pixels >= 0) & (pixels < size)).all(1))
         column, row = pixels[seen].astype(np.int64).T
-        seen = seen[z[seen] < BEHIND * witnesses.depth(other)[row, column]]
+        shown = z[seen] < BEHIND * witnesses.depth(other)[row, column]
+        seen = seen[shown if witnesses.masks is None else shown & witnesses.masks[other, row, column]]
         there = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5))
         sums[seen] += np.abs(there - image[y[seen], x[seen]]).mean(1)
         counts[seen] += 1
@@ -107,38 +113,47 @@ def _nearest(cameras: Cameras, camera: Cameras, own: int | None) -> list[int]:
     return order[:NEIGHBORS]
 
 
-def require_photos(scene: Scene) -> None:
-    """Raise ValueError unless a scene has two photos or more."""
+def require_photos(scene: Scene, path: Path) -> None:
+    """Raise SceneError with the ``path`` of a scene unless two of its views or more have a photo."""
     count = 0 if scene.images is None else len(scene)
+    if scene.images is not None and scene.masks is not None:  # a view without a photo has an empty mask
+        count = int(scene.masks.any((1, 2)).sum())
     if count < NEEDED:
-        raise ValueError(
-            f"photos: expected those of {NEEDED} views or more, which say how far off others are; got {count}"
-        )
+        problem = f"expected photos of {NEEDED} views or more for maps, which compare each with others; found {count}"
+        raise SceneError(path, problem, "name their folder with --images")
 
 
 def draw_sheets(
-    scene: Scene, results: Mapping[str, Gaussians], targets: Views | None, cameras: Mapping[str, Cameras]
+    scene: Scene,
+    results: Mapping[str, Gaussians],
+    targets: Views | None,
+    cameras: Mapping[str, Cameras],
+    *,
+    context: bool = True,
 ) -> Iterator[tuple[str, int, Picture]]:
     """Draw the photo, the picture and the map of each result and view, side by side.
 
     Yields (result, number of the view among all, the input views first, sheet). ``cameras`` are those of the input
-    views by name of a result that was made with others. ValueError unless the scene has two photos or more.
+    views by name of a result that was made with others; without ``context`` held-out views alone are drawn. The
+    scene has photos, see :func:`require_photos`.
     """
-    require_photos(scene)
     assert scene.images is not None
     frame = scene_frame(scene)
     for name, gaussians in results.items():
         placed = frame.enter_cameras(cameras.get(name, scene.cameras))
-        witnesses = call_witnesses(frame.enter(gaussians), Views(placed, scene.images, scene.names))
+        witnesses = call_witnesses(frame.enter(gaussians), Views(placed, scene.images, scene.names), scene.masks)
         views: list[tuple[Views, int, int | None]] = [(witnesses.views, view, view) for view in range(len(placed))]
         if targets is not None:
             held_out = shrink_views(replace(targets, cameras=frame.enter_cameras(targets.cameras)), SIDE)
             views += [(held_out, view, None) for view in range(len(held_out))]
         for number, (of, view, own) in enumerate(views):
+            if own is not None and not (context and (scene.masks is None or scene.masks[view].any())):
+                continue
             camera = of.cameras[[view]]
             drawn, errors = _look(witnesses.gaussians, camera)[0], expected_errors(witnesses, camera, own)
             pictures = to_picture(of.images[view]), to_picture(drawn), draw_errors(errors)
             known = errors[~np.isnan(errors)]
-            said = f"likely error: {known.mean():.3f}" if len(known) else "no other photo looks there"
-            texts = f"{of.names[view]}{'' if own is not None else ', held out'}", name, said
+            mean = f"error {known.mean():.3f}, " if len(known) else ""
+            said = f"{mean}yellow {MOST}; teal, {100 * (1 - len(known) / errors.size):.0f} %, unknown"
+            texts = f"view {number}: {of.names[view]}{'' if own is not None else ', held out'}", name, said
             yield name, number, contact_sheet([list(zip(texts, pictures, strict=True))])

@@ -167,7 +167,8 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[Table]:
             for name, mean in means if sizes
         ]  # fmt: skip
     outside = [(result["name"], *(_number(result[name]) for name in OUTSIDE)) for result in results]
-    yield "Seen from outside, against the input", ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
+    heading = "Seen from outside, where the input is not so: shares of the picture, less is better"
+    yield heading, ("", *OUTSIDE.values()), [row for row in outside if any(row[1:])]
     yield (
         "Render time",
         ("", "threads", "pixels", "ms/frame", "faster by", "earned back after"),

@@ -206,7 +206,7 @@ def page_data(
     shown, num_superpixels = with_outlines(_shown(views), pictures)
     moved = {name: frame.enter_cameras(own.numpy()) for name, own in (cameras or {}).items()}
     witnesses = {
-        name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names))
+        name: call_witnesses(entered[name], Views(moved.get(name, placed), pictures, scene.names), scene.masks)
         for name in (looked_at if len(pictures) > 1 else ())
     }
     *drawn, outside = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Literal
 
 from gsmerge.settings.budget import AUTO, parse_share
@@ -172,9 +173,12 @@ class CleanOptions(Settings):
         super().__post_init__()
         if self.crop is not None:
             parse_crop(self.crop)
-        unknown = [name for name in self.drops if name not in DROPS]
-        if unknown or len(set(self.drops)) < len(self.drops):
-            raise ValueError(f"drop: expected some of {', '.join(DROPS)}, with commas between, got {self.drop!r}")
+        for number, name in enumerate(self.drops):
+            if name in self.drops[:number]:
+                raise ValueError(f"drop: expected {name} once, got {self.drop!r}")
+            if name not in DROPS:
+                near = "".join(f"; perhaps {word}" for word in get_close_matches(name, DROPS, 1))
+                raise ValueError(f"drop: expected some of {', '.join(DROPS)}, with commas between, got {name!r}{near}")
 
     @property
     def drops(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gsmerge.facts.place_cameras import place_cameras
+from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.support import count_views
 from gsmerge.geometry import turn_by
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
@@ -111,7 +111,7 @@ def clean(
     """
     counts = {}
     if "unseen" in options.drops:  # before others go that hide it
-        placed = place_cameras(gaussians) if cameras is None and len(gaussians) else cameras
+        placed = place_viewpoints(gaussians) if cameras is None and len(gaussians) else cameras
         shown = np.zeros(0, bool) if placed is None else count_views(gaussians, placed) > 0
         gaussians, counts["unseen"] = gaussians[shown], int((~shown).sum())
     if options.crop is not None:
@@ -129,6 +129,19 @@ def clean(
         isolated = floaters(gaussians)
         gaussians, counts["floaters"] = gaussians[~isolated], int(isolated.sum())
     return gaussians, counts
+
+
+def describe_counts(counts: Counts, *, placed: bool) -> str:
+    """Say how many Gaussians :func:`clean` removed for each reason; ``placed``: no camera of the scene is known."""
+    words = {
+        "cropped": "outside of the crop",
+        "sky": "sky",
+        "floaters": "floaters",
+        "transparent": "transparent",
+        "unseen": f"that no {'placed camera' if placed else 'view'} shows",
+        "surplus": "more than the budget",
+    }
+    return ", ".join(f"{number:,} {words[name]}" for name, number in counts.items())
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:

@@ -224,10 +224,12 @@ def test_what_no_view_shows_is_left_out(result: Path, tmp_path: Path) -> None:
     cameras = viewer_cameras_path(result)
     document = convert_files(ConvertOptions([tmp_path / "both.ply"], tmp_path / "a.ply", cameras=cameras, clean=clean))
     assert document["left_out"]["unseen"] >= 400
-    assert not document["notes"]
+    assert noted(document["notes"], "in.cameras.json", "those of this scene")  # more than half
     bare = convert_files(ConvertOptions([result], tmp_path / "b.ply", cameras="none", clean=clean))
     assert bare["output"]["num_gaussians"] == 400 - bare["left_out"]["unseen"] > 200
     assert any("placed" in note for note in bare["notes"])
+    again = convert_files(ConvertOptions([result], tmp_path / "a.ply", cameras="none", overwrite=True))
+    assert noted(again["notes"], "a.cameras.json", "of an earlier file")
 
 
 def test_harmonics_are_left_out_and_results_stay_results(result: Path, tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_step_back_shows_the_side_without_photos(opened: tuple[Browser, Any]) ->
         tab.run("id('message').style.opacity = 0")
         assert psnr(picture(tab), drawn) > (33 if solid == "''" else 28)  # the result, which is on the other side
         tab.run("id('message').style.opacity = ''")
-        assert tab.run("id('overlay-share').title") == "No photo is outside"
+        assert tab.run("id('overlay-share').title") == "From a photo's camera only"
     tab.run("set('left', 1)")
     tab.press("ArrowUp")
     assert tab.run("view().outside") is False
@@ -285,7 +285,7 @@ def test_a_map_of_likely_errors_lies_over_a_result(opened: tuple[Browser, Any]) 
     tab.press("b")
     assert tab.run(f"[{layer}.hidden, document.querySelector('[data-set=maps]').title]") == [
         True,
-        "No photo is outside",
+        "From a photo's camera only",
     ]
     tab.press("b")
     tab.press("m")

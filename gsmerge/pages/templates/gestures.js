@@ -42,9 +42,14 @@ function paneAt({ clientX, clientY }) {
   return { source: pane.source, place: [(x - left) / width, (y - top) / height], width: width * stageBox.width, height: height * stageBox.height };
 }
 
+const isGrey = (name, value) => [...document.querySelectorAll(`[data-set="${name}"]`)].some((one) => one.dataset.value === value && one.disabled);
+
 function toggle(name) {
   const inSolidOnly = name === "shape" || name === "frustums";
-  if (name === "solid" ? solid : !inSolidOnly || state.solid) set(name, TOGGLED[name][(TOGGLED[name].indexOf(state[name]) + 1) % TOGGLED[name].length]);
+  const values = TOGGLED[name];
+  const after = values.map((_, i) => values[(values.indexOf(state[name]) + 1 + i) % values.length]);
+  const next = after.find((value) => value === "" || !isGrey(name, value)); // off is always possible
+  if (name === "solid" ? solid : !inSolidOnly || state.solid) set(name, next === undefined ? state[name] : next);
 }
 
 function nearer(factor) {

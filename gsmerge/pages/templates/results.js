@@ -66,27 +66,28 @@ function measureSpeed() {
   showSpeed(before / after, `Medians of frames on this device: ${before.toFixed(1)} and ${after.toFixed(1)} ms`);
 }
 
-// How much would be dropped of what the right side shows, or else the left one.
-function showLegend() {
-  if (!id("legend")) return;
-  const source = [state.right, state.left].find((one) => Object.keys(data.sources[one].dropped).length);
-  id("legend").hidden = !state.drops || source === undefined;
-  if (id("legend").hidden) return;
-  const { dropped, count } = data.sources[source];
-  const parts = Object.entries(dropped).map(([word, number]) => make("span", `${word}: ${number.toLocaleString("en")}`, { className: word }));
-  id("legend").replaceChildren(...parts, ` of ${count.toLocaleString("en")} Gaussians`);
+// How much would be dropped of what the sides show, and what few views show of it; not where that has no effect.
+function showLegend(reason) {
+  legend("legend", "dropped", Boolean(state.drops) && !reason, (word) => word, true);
 }
 
-// What few views show of the same side.
-function showSeen() {
-  if (!id("seen-legend")) return;
-  const source = [state.right, state.left].find((one) => Object.keys(data.sources[one].seen).length);
-  id("seen-legend").hidden = !state.seen || source === undefined;
-  if (id("seen-legend").hidden) return;
-  const { seen: counts, count } = data.sources[source];
+function showSeen(reason) {
   const words = { none: "no view", one: "one view" };
-  const parts = Object.entries(counts).map(([word, number]) => make("span", `${words[word]}: ${number.toLocaleString("en")}`, { className: word }));
-  id("seen-legend").replaceChildren(...parts, ` of ${count.toLocaleString("en")} Gaussians`);
+  legend("seen-legend", "seen", Boolean(state.seen) && !reason, (word) => words[word], state.seen === "color");
+}
+
+// A line for each side that has counts: coloured squares as in the picture, words and numbers.
+function legend(name, counts, isShown, wordOf, isColored) {
+  if (!id(name)) return;
+  const sources = [...new Set([state.left, state.right])].filter((one) => Object.keys(data.sources[one][counts]).length);
+  id(name).hidden = !isShown || !sources.length;
+  if (id(name).hidden) return;
+  id(name).replaceChildren(...sources.flatMap((source) => {
+    const { name: title, count } = data.sources[source];
+    const parts = Object.entries(data.sources[source][counts]).map(([word, number]) =>
+      make("span", `${wordOf(word)}: ${number.toLocaleString("en")}`, { className: isColored ? word : "bare" }));
+    return [sources.length > 1 ? `${title}: ` : "", ...parts, ` of ${count.toLocaleString("en")} Gaussians`, make("br", "")];
+  }));
 }
 
 function markResult() {

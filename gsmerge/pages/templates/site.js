@@ -89,9 +89,18 @@ class SiteView extends SplatView {
     }
     const distance = () => column(this.camera.matrix, 3).distanceTo(this.target);
     const before = distance();
-    this.dolly(1 / factor);
+    this.dolly(factor < 1 ? Math.min(1 / factor, this.farthest()) : 1 / factor);
     if (factor > 1) this.lens = Math.min(MOST_LENS, Math.max(this.lens, (this.lens * factor * distance()) / before));
     this.fit();
+  }
+
+  // Times the distance from the target at which the way back leaves the hull; beyond, it would be pulled to the side.
+  farthest() {
+    if (data.free) return Infinity;
+    const place = column(this.camera.matrix, 3);
+    const back = place.clone().sub(this.target);
+    const steps = this.places.map(([along, most]) => (back.dot(along) > 0 ? (most - place.dot(along)) / back.dot(along) : Infinity));
+    return 1 + Math.max(0, Math.min(...steps));
   }
 
   request() {

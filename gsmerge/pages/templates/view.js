@@ -153,9 +153,6 @@ function show() {
     button.setAttribute("aria-pressed", String(String(state[button.dataset.set]) === button.dataset.value));
   }
   id("outside").setAttribute("aria-pressed", String(view().outside));
-  showLegend();
-  showSeen();
-  if (id("map-legend")) id("map-legend").hidden = !state.maps;
   showLimits();
   if (solid && state.solid) {
     [left, right].filter(inSolid).forEach((source) => solid.mark(source, state.seen));
@@ -165,20 +162,28 @@ function show() {
 
 // Greys out what has no effect now, and says why; what is about 3D alone is there with it.
 function showLimits() {
-  const away = !state.atCamera ? "From the photo's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
+  const away = !state.atCamera ? "From a view's camera only: press R" : state.mode === "difference" ? "Not over a difference" : "";
   const none = solid ? "" : id("status").textContent || "3D is not there yet";
-  const unseen = [state.left, state.right].some(dropsOf) ? "" : "Nothing of it is seen here";
-  const outside = view().outside ? "No photo is outside" : "";
+  const shown = [state.left, state.right];
+  const examined = (counts) => shown.some((source) => Object.keys(data.sources[source][counts]).length) ? "" : "Results alone are examined: choose one";
+  const unseen = shown.some(dropsOf) ? "" : "Nothing of it is in this picture";
+  const outside = view().outside ? "From a photo's camera only" : "";
   const bare = outlines[state.view] ? "" : outside || (view().held_out ? "Held-out photos have no superpixels" : "Not there yet");
-  const unmapped = view().outside ? outside : [state.left, state.right].some(mapOf) ? "" : "Of results alone";
-  const unknown = [state.left, state.right].some((source) => Object.keys(data.sources[source].seen).length) ? "" : "Nothing of it is seen here";
-  const reasons = { outlines: bare || away, drops: away || unseen, seen: unknown || (state.solid ? "" : away), maps: away || unmapped };
+  const mapped = maps.some((one) => one.some(Boolean));
+  const unmapped = outside || (shown.some(mapOf) ? "" : mapped ? "Results alone have one: choose one" : "It takes photos of two views");
+  const reasons = {
+    outlines: bare || away, drops: away || examined("dropped") || unseen, maps: away || unmapped,
+    seen: examined("seen") || (state.solid ? "" : away),
+  };
   for (const field of document.querySelectorAll(".in-3d")) field.hidden = !state.solid;
   for (const button of document.querySelectorAll("[data-set]")) {
     const { set: name, value } = button.dataset;
-    const still = name === "seen" && value === "fade" && !state.solid && !view().outside ? "Photos show nothing of it: step back" : "";
+    const still = name === "seen" && value === "fade" && !state.solid && !view().outside ? "No view shows any of it: step back" : "";
     grey(button, name === "solid" && value ? none : reasons[name] || still);
   }
+  showLegend(reasons.drops);
+  showSeen(reasons.seen);
+  if (id("map-legend")) id("map-legend").hidden = !state.maps || Boolean(reasons.maps);
   if (id("overlay-share")) grey(id("overlay-share"), outside || away);
   id("full").hidden = !document.fullscreenEnabled;
 }
