@@ -1,4 +1,4 @@
-"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted."""
+"""The arrows: scene -> groups -> feature gaussians -> merged -> refined -> decoded -> fitted -> filled."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.holes import fill_between
 from gsmerge.facts.place_cameras import placed_views
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
@@ -18,6 +17,7 @@ from gsmerge.runtime.record import choose, note, stage
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged, keep_all
 from gsmerge.stages.encode import correct, encode, make_corrector
+from gsmerge.stages.fill import fill_between
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge
 from gsmerge.stages.pair_merge import POWERS, merge_neighbors
@@ -36,12 +36,17 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     if plan.merges_pairs:
         return build_from_pairs(prepared, plan, plan.limits.default if count is None else count)
     decoded = start(prepared, plan, count)
-    if decoded.gaussians is prepared.scene.gaussians and prepared.reference.name == RENDERS:
-        return Fitted(decoded.gaussians, prepared.scene.cameras, None)  # they show these pictures as they are
+    if decoded.kept and prepared.reference.name == RENDERS:  # they show these pictures as they are
+        return Fitted(decoded.gaussians, prepared.scene.cameras, None)
     fitted = fit_scene(decoded, prepared.scene, prepared.reference.fit_views, plan.fit, plan.seed)
-    long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
-    whole = prepared.scene.empty is None
-    if not long or not whole or not prepared.reference.of_views:  # what placed views see is all there is
+    return fill(fitted, prepared, plan)
+
+
+def fill(fitted: Fitted, prepared: Prepared, plan: Plan) -> Fitted:
+    """Fill what lies between the views, after a long fit that was accepted and where all that they show is wanted."""
+    is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted
+    is_whole = prepared.scene.empty is None and prepared.reference.of_views  # what placed views see is all there is
+    if not (is_long and is_whole):
         return fitted
     return replace(fitted, gaussians=fill_between(fitted.gaussians, fitted.cameras, fitted.outside))
 

@@ -1,35 +1,28 @@
-"""Gaussians where cameras show none: in the views themselves, and in what lies between and beside them.
+"""Gaussians where views show none: exports have gaps.
 
 Exporters drop borders, far regions and faint rows, and voxels leave gaps. Each view is drawn from its own camera; a
 pixel that stays empty gets a Gaussian of its picture's colour. Its depth is that of the surface beside it or one beyond
 the view's farthest surface: the depth at which the pictures of the nearest other views agree best.
-
-New views uncover what no photo shows. So the result of a fit is drawn from cameras between the views and just beside
-them, and what is empty there continues the farther side of the surfaces around, where no view contradicts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from gsmerge.facts.photo_change import PhotoChange, change_large
-from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.row_colors import fill_gaps
-from gsmerge.fit.outside import Outside
-from gsmerge.geometry import nearest_views, project, rgb_to_sh0
+from gsmerge.geometry import nearest_views, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import Splats, TiledView, prepare, tile_view
-from gsmerge.raster.composite import blend, blend_depths, view_colors
+from gsmerge.raster import TiledView
+from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
-from gsmerge.raster.photos import NEAR
-from gsmerge.runtime.record import note, stage
-from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, PicturedScene, grid_ids
+from gsmerge.runtime.record import note
+from gsmerge.types import Gaussians, PicturedScene, grid_ids
 
 # Chosen on exports of eight captures as Depth Anything 3 writes them, and the same with shuffled and with merged rows.
 EMPTY = 0.75  # opacity of the drawing below which a pixel is empty
@@ -47,20 +40,7 @@ OTHERS = 3  # nearest views that a picture is compared with
 BLUR = 3.0  # standard deviation of the window over which differences are averaged, pixels
 LEAST = 1e-3  # weight in that window of the pixels that other views see
 SIZE, OPACITY = 0.75, 0.9  # of a new Gaussian: standard deviation in pixels
-
-# What lies between views, chosen on seven training captures
-FAINT = 0.02  # opacity of Gaussians that make room: a fit leaves every tenth like that
-SHARE = 0.03  # of the Gaussians, at most, that fill what no view shows
-LEVEL = 8  # times a view's pixel is theirs: what no photo shows is blurred anyway
-BESIDE = -0.1  # of the way to the nearest view: a camera just outside
-MARGIN = 0.05  # of the sides, by which these cameras see more on each side
-CLEAR, SOLID = 0.1, 0.05  # transmittance above which a pixel is to be filled, below which it shows a surface
-WINDOW, NEARER = 0.08, 0.85  # of the width around a pixel: what is nearer than this share of the farthest depth there
-SOFT = 2.0  # standard deviation, pixels, by which colours and inverse depths are blurred into what is empty
-MOST_VIEWS = 64  # of a scene that is filled: time grows with their square
-DEEPER = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # times the depth: the first one that no view contradicts is taken
-REACH = 2  # pixels: standing so far beside a picture, a Gaussian still reaches into it
-FRONT = 0.98  # of the depth of a surface, in front of which a camera would see a Gaussian
+BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 
 
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
@@ -71,7 +51,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     pixels are empty: the scene may be a part of what the photos show. Large connected parts of a view without
     Gaussians stay empty, unless ``everywhere``: the scene was cut out, or its model left out the sky.
     """
-    bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > FAINT) if scene.aligned else ~shown
+    bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > BARE) if scene.aligned else ~shown
     bare, free = ~bare, shown & ~scene.valid if scene.aligned else shown
     cut = [] if everywhere or not scene.aligned else bare
     if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
@@ -160,10 +140,10 @@ def _fill_view(
     tried = np.concatenate([beside[None], np.maximum(beyond, beside)])
     depth = _agreeing(scene, view, holes, rays, tried)
     eye, size = cameras.centres[view], SIZE / cameras.Ks[view, 0, 0]
-    return _make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
+    return make_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
 
 
-def _make_gaussians(
+def make_gaussians(
     eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
 ) -> Gaussians:
     """Make round Gaussians at ``depths [n]`` along ``rays [n,3]``, ``size`` large at depth 1, of ``colors [n,3]``."""
@@ -209,134 +189,3 @@ def _agreeing(scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarr
         better = cost < least
         chosen[better], least[better] = depth[better], cost[better]
     return chosen
-
-
-@stage("fill")
-def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -> Gaussians:
-    """Put Gaussians where cameras between and just beside those of the photos see nothing; faint ones make room.
-
-    At most ``SHARE`` of the Gaussians are replaced, for what half-way cameras see first. The new ones continue the
-    farther side of the surfaces around, and stand where no camera sees into, so no photo says anything against them,
-    nor does a view from ``outside``.
-    Scenes of more than ``MOST_VIEWS`` views stay as they are: photos show nearly all that lies between them.
-    """
-    if not 1 < len(cameras) <= MOST_VIEWS:
-        return fitted
-    cameras = _small_cameras(cameras)
-    between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
-    if len(between) == 0:  # all look elsewhere
-        return fitted
-    splats = prepare(fitted)
-    most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
-    looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
-    depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
-    seen = _see(cameras, depths), _see(between, [look[:2] for look in looks]).where_covered()
-
-    def continue_surfaces(view: int) -> Gaussians:
-        return _continue_surfaces(looks[view], between[[view]], seen, outside, fitted.shN.shape[1])
-
-    added = fitted[:0]
-    for view, more in enumerate(parallel_map(continue_surfaces, range(len(between) if most else 0))):
-        more = more[~_on_same_pixels(more, added, between[[view]])]
-        added = Gaussians.concat([added, more[: most - len(added)]])
-    return Gaussians.concat([fitted[np.sort(order[len(added) :])], added])
-
-
-def _on_same_pixels(some: Gaussians, others: Gaussians, camera: Cameras) -> np.ndarray:
-    """Mark ``some`` Gaussians ``[n]`` whose pixel in a camera is one of the four around one of the ``others``."""
-    covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
-    (around,), (depths,) = project(others.means, camera)
-    corners = around[depths > 0, None] + np.array([(0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)])
-    x, y = np.clip(np.floor(corners), 0, last).astype(np.int64).reshape(-1, 2).T
-    covered[y, x] = True
-    covered[[0, -1]] = covered[:, [0, -1]] = False  # the rim has what stands outside
-    x, y = np.clip(np.floor(project(some.means, camera)[0][0] + 1), 0, last).astype(np.int64).T
-    return covered[y, x]
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """Surfaces and gaps that c cameras of one size see of a scene."""
-
-    cameras: Cameras
-    farthest: np.ndarray  # [c,h,w] mean camera z, the farthest around, as far as new Gaussians reach
-    clear: np.ndarray  # [c,h,w] bool, where little is
-
-    def where_covered(self) -> Seen:
-        """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
-        return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
-
-    def contradict(self, points: np.ndarray) -> np.ndarray:
-        """Return a mask ``[n]`` of the points ``[n,3]`` that stand before a surface, or where a camera sees nothing."""
-        (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
-        inside = (z > 0) & ((pixels >= -REACH) & (pixels < size + REACH)).all(2)
-        camera, point = np.nonzero(inside)
-        column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
-        wrong = self.clear[camera, row, column] | (z[inside] < FRONT * self.farthest[camera, row, column])
-        return np.bincount(point[wrong], minlength=len(points)) > 0
-
-
-def _small_cameras(cameras: Cameras) -> Cameras:
-    """Return the cameras with pixels ``LEVEL`` times as large."""
-    width, height = (max(LEVEL, round(side / LEVEL)) for side in (cameras.width, cameras.height))
-    scales = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
-    return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
-
-
-def _wider(cameras: Cameras) -> Cameras:
-    """Return the cameras with a margin on each side."""
-    right, down = (round(MARGIN * side) for side in (cameras.width, cameras.height))
-    Ks = cameras.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
-    return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
-
-
-def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
-    """Tile Gaussians in one of the cameras."""
-    return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR)
-
-
-def _look(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw the mean depths ``[h,w]``, transmittance ``[h,w]`` and colours ``[h,w,3]`` that a camera sees."""
-    tiled = _tile(splats, cameras, view)
-    return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
-
-
-def _see(cameras: Cameras, looks: Sequence[tuple[np.ndarray, np.ndarray]]) -> Seen:
-    """Find surfaces and gaps from the mean depths ``[h,w]`` and transmittance ``[h,w]`` of each camera."""
-    around = np.ones((2 * REACH + 1,) * 2, np.uint8)
-    farthest = np.stack([cv2.dilate(depths, around) for depths, _ in looks])
-    return Seen(cameras, farthest, np.stack([left > CLEAR for _, left in looks]))
-
-
-def _continue_surfaces(
-    look: tuple[np.ndarray, np.ndarray, np.ndarray],
-    camera: Cameras,
-    seen: tuple[Seen, Seen],
-    outside: Outside | None,
-    num_higher: int,
-) -> Gaussians:
-    """Make Gaussians for the clear pixels of a ``camera`` that continue the farther side of the surfaces beside.
-
-    Each stands at the first of ``DEEPER`` times that depth which nothing ``seen`` contradicts; none where all are.
-    """
-    depths, left, image = look
-    solid, clear = left < SOLID, left > CLEAR
-    around = np.ones((2 * round(WINDOW * camera.width) + 1,) * 2, np.uint8)
-    known = solid & (depths >= NEARER * cv2.dilate(np.where(solid, depths, np.float32(0)), around))
-    clear &= cv2.dilate(known.astype(np.uint8), around) > 0
-    image = image / np.maximum(1 - left, 1e-6)[..., None]
-    values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
-    sums = blur(fill_gaps(values, known) * (clear | known)[..., None], SOFT)[clear]
-    y, x = np.nonzero(clear)
-    pixels, viewmat, K = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), camera.viewmats[0], camera.Ks[0]
-    eye, rays = camera.centres[0], matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])  # to depth 1
-    tried = np.array(DEEPER)[:, None] * (sums[:, 4] / sums[:, 0]).astype(np.float64)
-    points = (eye + tried[..., None] * rays).reshape(-1, 3)
-    wrong = np.logical_or(*(some.contradict(points) for some in seen))
-    if outside is not None:
-        wrong[~wrong] = outside.contradict(points[~wrong], FRONT)
-    hidden = ~wrong.reshape(tried.shape)
-    rows = np.flatnonzero(hidden.any(0))
-    chosen = tried[hidden.argmax(0)[rows], rows]
-    colors = sums[rows, 1:4] / sums[rows, 4:]
-    return _make_gaussians(eye, rays[rows], chosen, SIZE / K[0, 0], colors, num_higher)
