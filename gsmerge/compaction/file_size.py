@@ -16,7 +16,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
-NEAR, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
+NEAR_SHARE, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of the Gaussians that are left out, at most
 ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
 TRIES, MAX_REBUILDS = 8, 2
@@ -47,7 +47,7 @@ def meet_bytes(candidate: Candidate, rebuild: Rebuild, prepared: Prepared, plan:
     def choose_next(built: Sequence[Candidate]) -> int | None:
         size, count = measure_bytes(built[-1].gaussians, file, built[-1].cameras), len(built[-1].gaussians)
         room = min(int(SURPLUS * count * (most - rest) / max(size - rest, 1)), plan.limits.most)
-        fits = room >= (1 - MOST_DROPPED) * count and (size >= NEAR * most or room <= SURPLUS * count)
+        fits = room >= (1 - MOST_DROPPED) * count and (size >= NEAR_SHARE * most or room <= SURPLUS * count)
         return None if fits or len(built) > MAX_REBUILDS else room
 
     candidate = meet(rebuild, candidate, choose_next)[-1]

@@ -13,7 +13,7 @@ from gsmerge.facts.row_colors import PHOTOS
 from gsmerge.facts.views import pick_views, subset
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan, make_plan
-from gsmerge.raster.photos import NEAR, Photos, scene_photos, score_photos
+from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
@@ -102,5 +102,5 @@ def file_rows(scene: PicturedScene) -> Gaussians:
 
 def cover(rest: PicturedScene, views: PicturedScene) -> np.ndarray:
     """Mark the pixels ``[v,h,w]`` of views that surfaces which views of the ``rest`` see cover."""
-    points = file_rows(rest).means.astype(np.float64) if rest.aligned else context_points(rest, NEAR)
-    return visible_pixels(points, views.cameras, NEAR, rest.cameras)
+    points = file_rows(rest).means.astype(np.float64) if rest.aligned else context_points(rest, NEAR_PLANE)
+    return visible_pixels(points, views.cameras, NEAR_PLANE, rest.cameras)

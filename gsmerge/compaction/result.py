@@ -22,7 +22,7 @@ from gsmerge.io.formats.rounding import as_written
 from gsmerge.plan import Plan
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_distance, describe_loss
-from gsmerge.raster.photos import NEAR, WHOLE, PhotoScore, scene_photos, score_photos
+from gsmerge.raster.photos import NEAR_PLANE, WHOLE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import Record, choose, current_record, note, record_part, stage
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, to_float32
@@ -213,7 +213,7 @@ def _score_photos(
 ) -> PhotoScore:
     """Score Gaussians in the stage ``name`` on the scored photos: a quarter of each, or all if a quality is sought."""
     with stage(name):
-        near, quarter = NEAR * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_input
+        near, quarter = NEAR_PLANE * prepared.frame.unit, plan.target_psnr is None and not plan.keeps_input
         photos = scene_photos(views)
         return score_photos(gaussians, photos, plan.scored_views, quarter=quarter, near=near, covered=covered)
 

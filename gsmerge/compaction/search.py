@@ -48,14 +48,14 @@ SSIM_DB = 40.0  # dB that count as much as 1 of SSIM: where 1 % of the Gaussians
 KNEE = 0.15  # dB of that mixture per doubling of the count: below it, more Gaussians are not worth it
 SLOPE, RENDERS_SLOPE = 1.0, 3.0  # dB per doubling of the count, of photos and of renders, until two were tried
 CLOSE = 1.15  # counts this near to each other are one
-NEAR = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
-PHOTOS_NEAR = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
+NEAR_DB = 0.6  # dB above a target for renders at which a count is near enough: with their slope it is CLOSE
+PHOTOS_NEAR_DB = 0.2  # the same for photos that decide the default: below KEPT_LOSS, as all of the input lose nothing
 MAX_RUNS = 6
 # Of photos that are left out: builds, beside the one that is written; dB per doubling until two were tried, the mean
 # below the usual count of eleven captures; dB above a target at which a count is near enough, half of that
 MAX_TRIED, NEW_SLOPE, NEW_NEAR = 3, 0.3, 0.15
 MAX_FACTOR = 4  # times the usual count is the most that a quality target may take where photos judge it
-FAR = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
+FAR_DB = 6.0  # dB above a target from which on a count says little about the slope there: all of the input lose nothing
 MOSTLY = 0.5  # share of the input's Gaussians from which on a scene is compact already
 
 
@@ -105,7 +105,7 @@ class CountSearch:
         usual = keeps and not self.plan.auto_count
         least = min(limits.default, limits.max_count) if usual else limits.min_count
         most = limits.max_count if keeps or self.rendered else min(limits.max_count, MAX_FACTOR * limits.default)
-        steps = (RENDERS_SLOPE, NEAR) if self.rendered else (SLOPE, PHOTOS_NEAR if keeps else 0.0)
+        steps = (RENDERS_SLOPE, NEAR_DB) if self.rendered else (SLOPE, PHOTOS_NEAR_DB if keeps else 0.0)
         if self.left_out is not None:
             most, steps = min(most, self.most or most), (NEW_SLOPE, NEW_NEAR)
         tried = psnr_by_count(candidates)
@@ -366,7 +366,7 @@ def next_count(
         if above <= below * CLOSE:
             return above
         inner = float(log(above / below))
-        rise = (min(tried[above], target + FAR) - tried[below]) / inner
+        rise = (min(tried[above], target + FAR_DB) - tried[below]) / inner
         step = (target - tried[below]) / rise if rise > 0 else inner / 2
         return round(below * float(exp(min(max(step + 0.1 * inner, 0.15 * inner), 0.85 * inner))))
     if above is None and len(tried) > 1:

@@ -19,7 +19,7 @@ PART, REACH = 32, 12  # pixels of the side of a part, and how far around its pla
 AROUND = 30  # pixels of the square whose mean contrast is taken from
 TAPS = 64  # of the Fourier transforms, at least PART + 2 REACH
 SAME = 1  # pixels to which a place is one: those of a correlation's peak
-NEAR = 3  # pixels to which parts moved alike: what different depths leave of a motion
+NEAR_PIXELS = 3  # pixels to which parts moved alike: what different depths leave of a motion
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def find_places(shown: Shown, view: int, photo: np.ndarray) -> Places | None:
     decided = scores.max(1) - middle > MARGIN * noise
     moves = np.stack(np.divmod(scores[decided].argmax(1), 2 * REACH + 1), 1) - REACH
     moves = moves[np.abs(moves).max(1) > SAME]
-    together = (np.abs(moves[:, None] - moves).max(2) <= NEAR).sum(1).max(initial=0)
+    together = (np.abs(moves[:, None] - moves).max(2) <= NEAR_PIXELS).sum(1).max(initial=0)
     alike = float(scores[:, scores.shape[1] // 2].mean())
     return Places(int(decided.sum()) - len(moves), len(moves), int(together), alike)
 

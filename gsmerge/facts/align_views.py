@@ -19,7 +19,7 @@ from gsmerge.geometry import camera_depths, motion_matrices, motion_vectors, mov
 from gsmerge.kernels.compare_views import COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster.photos import NEAR, photos_of
+from gsmerge.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
@@ -105,7 +105,11 @@ def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     for view in views:
         xyz = means[view, ::step][scene.valid[view].reshape(-1)[::step]]
         pixels, z = project(xyz, cameras)
-        seen = ((z > NEAR) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1) if len(xyz) else np.zeros(len(z))
+        seen = (
+            ((z > NEAR_PLANE) & (pixels > 0).all(-1) & (pixels < size).all(-1)).mean(1)
+            if len(xyz)
+            else np.zeros(len(z))
+        )
         overlap = seen * matmul(cameras.viewmats[:, 2, :3], cameras.viewmats[view, 2, :3]).clip(0)
         ranked = [int(other) for other in np.argsort(-overlap, kind="stable") if other != view and other in chosen]
         for other in ranked[:NEIGHBOURS]:
@@ -128,7 +132,7 @@ def _level_of(scene: PicturedScene, pairs: np.ndarray, level: float, samples: in
         grey = blur(photos.images[view].mean(-1, dtype=np.float32), BLUR)
         down, right = np.gradient(grey)
         depth = camera_depths(means[view][near], scene.cameras.viewmats[view])
-        depth = np.where(scene.valid[view][near] & (depth > NEAR), depth, np.nan)
+        depth = np.where(scene.valid[view][near] & (depth > NEAR_PLANE), depth, np.nan)
         score = np.where(np.isfinite(depth), np.sqrt(right * right + down * down) * spread, 0).ravel()
         chosen = np.argsort(-score, kind="stable")[:samples]
         chosen = chosen[score[chosen] > 0]
@@ -179,7 +183,7 @@ def _compare(level: _Level, viewmats: np.ndarray) -> _Evidence:
     def some(first: int) -> None:
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.start, level.Ks, level.pictures,
-            level.depths, NEAR, BORDER, level.scale, first, min(first + TOGETHER, count),
+            level.depths, NEAR_PLANE, BORDER, level.scale, first, min(first + TOGETHER, count),
             np.empty((COLUMNS, most)), np.empty(most, np.int64), *vars(now).values(),
         )  # fmt: skip
 

@@ -25,7 +25,7 @@ from gsmerge.geometry import camera_centres, correlation, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve_symmetric
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
@@ -168,7 +168,14 @@ class _Pixels:
         """Find which of the pixels ``rows`` of a view have the same surface in another view, and its pixels."""
         poses = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
         return find_surfaces(
-            self.means[view], rows, self.means[other], self.valid[other], *poses, self.cameras.width, NEAR, SAME_DEPTH
+            self.means[view],
+            rows,
+            self.means[other],
+            self.valid[other],
+            *poses,
+            self.cameras.width,
+            NEAR_PLANE,
+            SAME_DEPTH,
         )
 
 

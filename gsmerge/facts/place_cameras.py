@@ -27,7 +27,7 @@ SAMPLES = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
 ABOVE = -0.25  # height of the ring of cameras to look from, in its radii: y points down
-FAR, NEAR = 2.0, 1.2  # distance of cameras around the scene, in its radii
+FAR_RADII, NEAR_RADII = 2.0, 1.2  # distance of cameras around the scene, in its radii
 INSIDE = (0.0, -0.5, 0.5)  # places of cameras inside, per axis, as a share of half the extent
 WALKED = 0.6  # share of the longest half axis, on both sides of the median, that a walk leads along
 GOLDEN = np.pi * (1 + math.sqrt(5))  # turn after which directions spread evenly
@@ -70,7 +70,7 @@ def place_viewpoints(gaussians: Gaussians) -> Cameras:
     centre, half = _extent(thin_out(gaussians, SAMPLES).means.astype(np.float64))
     turns = 2 * np.pi * np.arange(len(inside)) / len(inside)
     ring = np.stack([sin(turns), np.full(len(turns), ABOVE), -cos(turns)], 1)  # the first where most models look from
-    around = replace(inside, viewmats=_around(centre, half, FAR, normalize(ring)))
+    around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
     return concat_cameras(around, inside)
 
 
@@ -112,7 +112,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
     """
     means = thin_out(scene.gaussians, SAMPLES).means.astype(np.float64)
     centre, half = _extent(means)
-    outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR, NEAR)]
+    outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
     within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
     viewmats = np.concatenate([*outside, *within])
     more = replace(scene.cameras, viewmats=viewmats, Ks=np.repeat(scene.cameras.Ks[:1], len(viewmats), 0))
@@ -216,7 +216,7 @@ def _candidates(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrices ``[c,4,4]`` of all candidates."""
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     inside = [_look(centre + place * half, direction) for place in grid for direction in _sphere(LOOKS)]
-    return np.concatenate([_around(centre, half, FAR, _sphere(AROUND)), inside])
+    return np.concatenate([_around(centre, half, FAR_RADII, _sphere(AROUND)), inside])
 
 
 def _around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from gsmerge.fit.schedule import FitRun
 from gsmerge.geometry import project
 from gsmerge.raster import contributions, prepare, tile_view
 from gsmerge.raster.composite import survey
-from gsmerge.raster.photos import NEAR, Photos, photo_errors, render_photos
+from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
@@ -74,7 +74,7 @@ def choose_looks(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Choose the photos of a survey: those that judge, and others of which much would be looked at in too few."""
     means = gaussians.means[:: max(1, len(gaussians) // SAMPLES)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
-    inside = (depths > NEAR) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
+    inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
     chosen = judging_views(len(photos))
     looks = inside[chosen].sum(0)
     for view in spread_views(len(photos)):

@@ -33,7 +33,7 @@ from gsmerge.measure.clip import (
 from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.raster import render_in_turn
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -247,7 +247,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
             cameras = sample_path(path, cameras, depth, count)
         except ValueError as error:
             raise UsageError(str(error)) from error
-    return group, cameras, NEAR * depth, ids
+    return group, cameras, NEAR_PLANE * depth, ids
 
 
 def _place_file(file: Path, load: Loaded) -> Cameras:

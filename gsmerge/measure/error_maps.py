@@ -21,7 +21,7 @@ from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.raster import render
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 SIDE = 320  # pixels, at most, of the longer side of a map
@@ -100,7 +100,7 @@ def draw_errors(errors: np.ndarray) -> Picture:
 
 def _look(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Draw the picture ``[h,w,3]`` and the depth ``[h,w]``, 0 where nothing is opaque, of a camera."""
-    drawn = render(gaussians, camera, near=NEAR, with_depths=True)
+    drawn = render(gaussians, camera, near=NEAR_PLANE, with_depths=True)
     assert drawn.depths is not None
     (depth,), (alpha,) = drawn.depths[..., 0], drawn.alphas[..., 0]
     return drawn.images[0].clip(0, 1), np.where(alpha > OPAQUE, depth, np.float32(0))

@@ -21,7 +21,7 @@ from gsmerge.measure.sizes import resize_mask, resize_photo, shrink_cameras, shr
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr, ssim
-from gsmerge.raster.photos import COVERED, NEAR, WHOLE
+from gsmerge.raster.photos import COVERED, NEAR_PLANE, WHOLE
 from gsmerge.report import html_table
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
@@ -257,7 +257,7 @@ def _name_reference(splits: Mapping[str, _Split]) -> str:
 
 def near_plane(scene: Scene) -> float:
     """Choose the near plane, world units, for comparing a scene with its results."""
-    return NEAR * scene_frame(scene).unit
+    return NEAR_PLANE * scene_frame(scene).unit
 
 
 def _notes(splits: Mapping[str, _Split], scores: Sequence[ResultScores], *, mended: bool) -> Iterator[str]:

@@ -30,7 +30,7 @@ ALL = "all"  # kind of all these cameras together
 SIDE = 480  # pixels, at most, of the longer side of the pictures
 EMPTY, SOLID, OPEN = 0.05, 0.9, 0.5  # opacities: input below, input above, result below
 MARGIN = 17  # pixels per side of the square that erodes what is empty
-FAR = 0.1  # of the width: distance from what the input shows from which fog is far
+FAR_SHARE = 0.1  # of the width: distance from what the input shows from which fog is far
 VEIL = 0.7  # of the input's depth: what a result shows nearer than that is a veil
 VEILED = 0.08  # worst veil above which a result gets a note
 # Spikes are Gaussians so many times as long as their second axis, and longer (3 sigma) than a share of the width; they
@@ -139,7 +139,7 @@ def look(splats: Splats, camera: Cameras, near: float, nearest: float) -> Sight:
 def count_pixels(expected: Sight, actual: Sight) -> np.ndarray:
     """Return (sum, number of pixels) ``[4,2]`` of near fog, far fog, holes and veil in a picture of a result."""
     empty, solid = (expected.opacities < EMPTY).astype(np.uint8), expected.opacities > SOLID
-    sides = MARGIN, max(MARGIN, 2 * round(FAR * empty.shape[1]) + 1)
+    sides = MARGIN, max(MARGIN, 2 * round(FAR_SHARE * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
     fog = [(float(actual.opacities[mask].sum(dtype=np.float64)), float(mask.sum())) for mask in masks]
     covered = expected.beyond > SOLID

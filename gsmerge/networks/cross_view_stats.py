@@ -14,7 +14,7 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras
 
 NUM_STATS = COLUMNS + 1
-NEAR = 0.03  # largest difference of the logarithms of two depths on the same surface
+NEAR_LOG = 0.03  # largest difference of the logarithms of two depths on the same surface
 FAR = 0.3  # larger differences of the logarithms of depths are clipped to this
 MIN_OPACITY = 1 / 255  # more transparent Gaussians show no surface
 ROWS = 8192  # points per task
@@ -38,7 +38,7 @@ def cross_view_stats(
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR, FAR, MIN_OPACITY)
+    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR, MIN_OPACITY)
     sums, m = np.zeros((len(points), COLUMNS)), members
 
     def add(first: int) -> None:

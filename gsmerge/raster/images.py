@@ -19,8 +19,8 @@ from gsmerge.raster.composite import (
     prepare_views,
     view_colors,
 )
-from gsmerge.raster.photos import NEAR
-from gsmerge.raster.tiled_view import FAR, TiledView, prepare, tile_view
+from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, prepare, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, Scene, like
 
@@ -42,7 +42,7 @@ def render(
     *,
     antialiased: bool = False,
     near: float = 0.01,
-    far: float = FAR,
+    far: float = FAR_PLANE,
     with_depths: bool = False,
 ) -> Rendering:
     """Render Gaussians into every camera.
@@ -154,7 +154,7 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None]) -> None:
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> None:
-        use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR))
+        use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
 
     if len(splats) <= ONE_AT_A_TIME:
         parallel_map(one_view, range(len(scene)))
@@ -165,7 +165,7 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None]) -> None:
 
 def seen_depths(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Render the mean depth ``[v,h,w]`` of every pixel, and a mask ``[v,h,w]`` of mostly opaque pixels."""
-    drawn = render(scene.gaussians, scene.cameras, near=NEAR, with_depths=True)
+    drawn = render(scene.gaussians, scene.cameras, near=NEAR_PLANE, with_depths=True)
     assert drawn.depths is not None
     return drawn.depths[..., 0], drawn.alphas[..., 0] > MIN_ALPHA
 

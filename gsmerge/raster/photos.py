@@ -21,7 +21,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Score = TypeVar("Score")
 
-NEAR = 0.01  # near plane of every render that is scored, in canonical units
+NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
 ONE_AT_A_TIME = 400_000  # Gaussians; a tiled view is as large as they are, so threads share one view instead
 BLOCK = 2  # tiles per side of the blocks that scored_tiles chooses among
 MASKED = np.float32(0.1)  # weight of pixels outside masks, which show the Gaussians' colours: none would let them drift
@@ -164,7 +164,7 @@ def photo_errors(
     score: Callable[[int, np.ndarray, np.ndarray], Score],
     views: Iterable[int] | None = None,
     *,
-    near: float = NEAR,
+    near: float = NEAR_PLANE,
     colors: np.ndarray | None = None,
     keep: Callable[[int], np.ndarray] | None = None,
     tiles: Callable[[int], np.ndarray | None] | None = None,

@@ -22,7 +22,7 @@ Array = NDArray[Any]
 PIECE = 1 << 13  # Gaussians or intersections that are worth handing to another thread
 MANY, MANY_EACH = 1 << 24, 16  # intersections of a view, and of each Gaussian on average: above both, most are hidden
 EPS2D = 0.3  # dilation of Gaussians in the image, pixels squared
-NEAR, FAR = 0.01, math.inf  # depths, world units
+NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def tile_ranges(tiled: TiledView, threads: int, least: int = PIECE) -> list[tupl
 
 def camera_numbers(
     viewmat: Array, K: Array, width: int, height: int, eps2d: float, antialiased: bool,
-    near: float = NEAR, far: float = FAR,
+    near: float = NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
     """Return the numbers of a camera in the kernels' order."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -239,8 +239,8 @@ def tile_view(
     *,
     eps2d: float = EPS2D,
     antialiased: bool = False,
-    near: float = NEAR,
-    far: float = FAR,
+    near: float = NEAR_PLANE,
+    far: float = FAR_PLANE,
     opacities: Array | None = None,
     keep: Array | None = None,
     tiles: Array | None = None,

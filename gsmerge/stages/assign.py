@@ -17,7 +17,7 @@ from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.pooling import Members, pool_members, scene_members, unaligned_members
 from gsmerge.raster import TiledView
 from gsmerge.raster.images import ONE_AT_A_TIME, tile_views
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import in_turn, parallel_map
 from gsmerge.settings.stages import DecodeOptions
@@ -67,7 +67,7 @@ def find_pixels(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     most, pixels = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
 
     def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return weigh_centres(means, scales, opacities, viewmats[view], Ks[view], NEAR, fronts[view])
+        return weigh_centres(means, scales, opacities, viewmats[view], Ks[view], NEAR_PLANE, fronts[view])
 
     of_views = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
     for view, (ids, places, weights) in enumerate(of_views):

@@ -21,7 +21,7 @@ from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster import Splats, TiledView, prepare, tile_view
 from gsmerge.raster.composite import blend, blend_depths, view_colors
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
@@ -122,7 +122,7 @@ def _wider(cameras: Cameras) -> Cameras:
 
 def _tile(splats: Splats, cameras: Cameras, view: int) -> TiledView:
     """Tile Gaussians in one of the cameras."""
-    return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR)
+    return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR_PLANE)
 
 
 def _look(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.geometry import correlation, project
 from gsmerge.kernels.pictures import blur, sobel
 from gsmerge.raster import prepare, tile_view
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
@@ -65,7 +65,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
         viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-        weights = view_weights(tile_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR))
+        weights = view_weights(tile_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR_PLANE))
         sums = apply_transposed(weights, np.stack([region, np.ones_like(region)], 2).astype(np.float32))
         inside[weights.ids] += sums[:, 0]
         total[weights.ids] += sums[:, 1]

@@ -28,7 +28,7 @@ from gsmerge.io.tensor_file import read_tensors
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, as_array
 
-SCHEMA = 3  # of the whole file; those before were states of 0.1 and 0.2
+SCHEMA = 3  # of the whole file; those before were states of 0.3.0 and before
 HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; the second of 0.1
 SCENE, FEATURES = "scene", "features"  # kinds
 REMEDY = "run extend again with all batches"
@@ -121,7 +121,10 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     if schema != SCHEMA:
         newer = isinstance(schema, int) and schema > SCHEMA
         remedy = f"update gsmerge, this is {__version__}" if newer else REMEDY
-        raise SceneError(path, f"expected a .gsm of schema {SCHEMA}, found schema {schema!r:.40}", remedy)
+        by = header.get("gsmerge") if isinstance(header, dict) else None
+        writer = f" of gsmerge {by!s:.20}" if by else ""
+        problem = f"expected a .gsm of schema {SCHEMA}, which gsmerge {__version__} reads, found schema {schema!r:.40}"
+        raise SceneError(path, f"{problem}{writer}", remedy)
     for name, entry in ENTRIES.items():
         if type(header.get(name)) is not entry:
             raise SceneError(path, f"expected {name} in the header, found {header.get(name)!r:.40}", REMEDY)

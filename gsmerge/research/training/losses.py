@@ -22,7 +22,7 @@ from gsmerge.measure.lpips import EPSILON, SCALE, SHIFT, Layer, min_size, read_l
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.pooling import Members, pool_members, to_gaussians
 from gsmerge.raster.autograd import render_tensors
-from gsmerge.raster.photos import NEAR
+from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions
@@ -102,7 +102,7 @@ def draw_window(gaussians: Gaussians, window: Window, background: np.ndarray) ->
     """Render a window ``[h,w,3]``, differentiable in the Gaussians."""
     eps2d = window.crop.example.photos.eps2d
     camera = window.camera.to("cpu")
-    return render_tensors(gaussians, camera, background, with_depths=False, eps2d=eps2d, near=NEAR).images[0]
+    return render_tensors(gaussians, camera, background, with_depths=False, eps2d=eps2d, near=NEAR_PLANE).images[0]
 
 
 def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:

@@ -13,7 +13,7 @@ from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pooling import Members, scene_members
 from gsmerge.raster import composite, prepare, tile_view
-from gsmerge.raster.photos import NEAR, Photos, scene_photos
+from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
 
@@ -73,9 +73,9 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
     def one_view(view: int) -> np.ndarray:
         part = subset(scene, [view])
         splats = prepare(part.gaussians, np.zeros(3))
-        views = (tile_view(splats, **photos.camera(photo), near=NEAR) for photo in range(len(photos)))
+        views = (tile_view(splats, **photos.camera(photo), near=NEAR_PLANE) for photo in range(len(photos)))
         opacities = np.stack([1 - composite(tiled)[1] for tiled in views])
-        seen = visible_pixels(context_points(part, NEAR), cameras, NEAR, scene.cameras)
+        seen = visible_pixels(context_points(part, NEAR_PLANE), cameras, NEAR_PLANE, scene.cameras)
         seen[view] = True
         return np.where(seen, np.round(255 * opacities), 0).astype(np.uint8)
 

@@ -11,7 +11,7 @@ from scenes import arc, make_scene, room
 from gsmerge.geometry import project
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.cross_view import sum_cross_view
-from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR, cross_view_stats
+from gsmerge.networks.cross_view_stats import FAR, MIN_OPACITY, NEAR_LOG, cross_view_stats
 from gsmerge.pooling import Members, scene_members
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Cameras, Scene
@@ -33,8 +33,8 @@ def slowly(means: np.ndarray, sh0: np.ndarray, views: np.ndarray, members: Membe
             if not (there > 0 and members.opacities[j] > MIN_OPACITY):
                 continue
             ratio, seen = float(elementary.log(depths[v, i] / there)), seen + 1
-            kinds[0 if abs(ratio) < NEAR else 1 if ratio < 0 else 2] += 1
-            if abs(ratio) < NEAR:
+            kinds[0 if abs(ratio) < NEAR_LOG else 1 if ratio < 0 else 2] += 1
+            if abs(ratio) < NEAR_LOG:
                 color += float(np.abs(SH_C0 * (sh0[i, 0] - members.sh0[j, 0])).mean())
             ratios += float(np.clip(ratio, -FAR, FAR))
         shares = [kind / max(seen, 1) for kind in kinds]

@@ -8,7 +8,7 @@ import scenes
 
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
-from gsmerge.raster.photos import NEAR, scene_photos, score_photos, scored_tiles
+from gsmerge.raster.photos import NEAR_PLANE, scene_photos, score_photos, scored_tiles
 from gsmerge.raster.tiled_view import prepare, tile_view
 
 
@@ -53,7 +53,7 @@ def test_odd_sizes_have_about_a_quarter(width: int, height: int) -> None:
 def test_quarter_is_near_the_whole(scene: Scene) -> None:
     photos, views = scene_photos(scene), range(len(scene))
     whole, quarter = (
-        score_photos(scene.gaussians, photos, views, near=NEAR, quarter=part).psnr for part in (False, True)
+        score_photos(scene.gaussians, photos, views, near=NEAR_PLANE, quarter=part).psnr for part in (False, True)
     )
     assert quarter == pytest.approx(whole, abs=0.5)
     assert quarter != whole
