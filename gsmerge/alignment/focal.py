@@ -26,7 +26,7 @@ from gsmerge.alignment.unaligned import CameraCheck, check_cameras
 from gsmerge.geometry import project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import CameraFile, make_pinhole
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import Photos, PhotoTransform, Size, as_floats, photo_size, resize_to
+from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, as_floats, photo_size, resize_to
 from gsmerge.kernels.matrices import transform
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
@@ -69,7 +69,7 @@ class _Pictures:
         return Cameras(viewmats[self.views], np.tile(K, (len(self.views), 1, 1)), width, height)
 
 
-def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile | None:
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArrays) -> CameraFile | None:
     """Estimate the intrinsics of cameras that have only poses; return cameras and a note, or None if that fails.
 
     ``camera_file`` has only poses; ``photos`` are c pictures ``[h,w,3]`` uint8, or empty.
@@ -150,7 +150,7 @@ def _solve_intrinsics(pairs: Correspondences, viewmats: np.ndarray) -> tuple[flo
 
 
 def _intrinsics_of_colors(
-    ply: GaussianFile, readings: list[np.ndarray], photos: Photos, size: Size
+    ply: GaussianFile, readings: list[np.ndarray], photos: PhotoArrays, size: Size
 ) -> np.ndarray | None:
     """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
     pictures = _small_pictures(photos, size)
@@ -174,7 +174,7 @@ def _sample(ply: GaussianFile, count: int) -> Gaussians:
     return ply.gaussians[rows[:: max(1, len(rows) // count)]]
 
 
-def _small_pictures(photos: Photos, size: Size) -> _Pictures:
+def _small_pictures(photos: PhotoArrays, size: Size) -> _Pictures:
     """Reduce the size of a selection of photos."""
     count = len(photos)
     places = np.linspace(0, count - 1, min(count, _MAX_VIEWS))

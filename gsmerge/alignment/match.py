@@ -36,7 +36,7 @@ from gsmerge.alignment.score import (
 from gsmerge.geometry import IDENTITY, camera_centres
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import NO_IMAGES, Photos, Size, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, Size, as_floats, photo_size
 from gsmerge.types import Cameras
 
 # pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
@@ -47,12 +47,12 @@ Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
 
 
 @dataclass(frozen=True)
-class Source:
+class RowSource:
     """The Gaussians, the cameras, the photos and the known facts about the rows."""
 
     ply: GaussianFile
     camera_file: CameraFile
-    photos: Photos
+    photos: PhotoArrays
     order: str
     scale: float | None
     depths: Callable[[], np.ndarray | None]
@@ -95,7 +95,7 @@ class Source:
         return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
 
 
-def match_views(source: Source, places: Sequence[Place]) -> list[Fit]:
+def match_views(source: RowSource, places: Sequence[Place]) -> list[Fit]:
     """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
     errors = [_projective_error(source, *place) for place in places]
     far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)
@@ -110,7 +110,7 @@ def match_views(source: Source, places: Sequence[Place]) -> list[Fit]:
     return fits
 
 
-def _projective_error(source: Source, grid: Grid, layout: Layout) -> float:
+def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
     """Measure how far rows are from their pixels under a camera of any pose and lens; inf where none shows them.
 
     Of the first, the middle and the last view, one that a camera shows counts.
@@ -125,7 +125,7 @@ def _projective_error(source: Source, grid: Grid, layout: Layout) -> float:
     return math.inf
 
 
-def _fit_views(source: Source, grid: Grid, layout: Layout) -> list[Fit]:
+def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[Fit]:
     """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
@@ -201,7 +201,7 @@ def read_views(
     return next(near, replace(bound, alignment=replace(least, ok=False)))
 
 
-def refine(source: Source, fit: Fit) -> Fit:
+def refine(source: RowSource, fit: Fit) -> Fit:
     """Score a fit again, with its frame solved again, on more Gaussians."""
     inputs = source.inputs(fit.grid, photos=False)
     pairs = inputs.pairs(sample_layout(fit.reading.layout, SAMPLES))

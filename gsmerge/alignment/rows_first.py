@@ -44,13 +44,13 @@ from gsmerge.alignment.layouts import (
     subsample,
     view_orders,
 )
-from gsmerge.alignment.match import Place, Source, match_views, refine
+from gsmerge.alignment.match import Place, RowSource, match_views, refine
 from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.photo_files import Photos, PhotoTransform, photo_size
+from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
@@ -93,7 +93,7 @@ class AlignmentResult:
 def align(
     ply: GaussianFile,
     camera_file: CameraFile,
-    photos: Photos = (),
+    photos: PhotoArrays = (),
     *,
     order: str = "auto",
     scale: float | None = None,
@@ -118,7 +118,7 @@ def align(
             or other cameras would make pixels of the rows.
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
-    source = Source(ply, camera_file, photos, order, scale, depths)
+    source = RowSource(ply, camera_file, photos, order, scale, depths)
     grids, problem = file_grids(camera_file, source.size), None
     try:
         grids.insert(0, photo_grid(camera_file, source.size))
@@ -133,7 +133,7 @@ def align(
     return _choose_cameras(source, cropped or grids[0], frames)
 
 
-def _read_in_order(source: Source, grids: Sequence[Grid]) -> Recovery | None:
+def _read_in_order(source: RowSource, grids: Sequence[Grid]) -> Recovery | None:
     """Read the rows in order with the stored cameras, which fits most files; None in doubt, for a longer search.
 
     Or read them by the pixels that they showed when their cameras were estimated.
@@ -155,7 +155,7 @@ def _read_in_order(source: Source, grids: Sequence[Grid]) -> Recovery | None:
     return judge(fits, source.inputs, lambda fit: fit) if fits else None
 
 
-def _has_enough(source: Source) -> bool:
+def _has_enough(source: RowSource) -> bool:
     """Return whether enough rows are finite to find their pixels."""
     finite = int(source.ply.valid.sum())
     return finite >= _ENOUGH or finite >= _FEW * len(source.ply.gaussians)
@@ -164,7 +164,7 @@ def _has_enough(source: Source) -> bool:
 # Rows show their grid
 
 
-def _find_pixels(source: Source, named: Sequence[Grid]) -> Recovery | None:
+def _find_pixels(source: RowSource, named: Sequence[Grid]) -> Recovery | None:
     """Find the grid that the rows are the pixels of, and which of the cameras are those of its views; None if neither.
 
     ``named``: the grids of sizes that files name.
@@ -183,7 +183,7 @@ def _find_pixels(source: Source, named: Sequence[Grid]) -> Recovery | None:
     return found
 
 
-def _rounds(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
+def _rounds(source: RowSource, named: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
     from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
@@ -203,7 +203,7 @@ def _rounds(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
     yield from _lacking_places(source, named)
 
 
-def _lacking_places(source: Source, named: Sequence[Grid]) -> Iterator[list[Place]]:
+def _lacking_places(source: RowSource, named: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
     from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
 
@@ -219,7 +219,7 @@ def _lacking_places(source: Source, named: Sequence[Grid]) -> Iterator[list[Plac
         yield [(g, place) for g in grids for place in _moved_layouts(source, g, layout, own)]
 
 
-def _layouts(source: Source, grid: Grid) -> list[Layout]:
+def _layouts(source: RowSource, grid: Grid) -> list[Layout]:
     """List the layouts in a grid that the number of rows allows, or the depth maps next to the cameras."""
     views, (width, height), count = len(grid.cameras), grid.size, len(source.ply.gaussians)
     layouts = list(exact_layouts(count, views, width, height))
@@ -237,14 +237,14 @@ def _are_same(layout: Layout, shown: Sequence[Layout]) -> bool:
     return any(what == (other.width, other.height, other.order, other.per_pixel) for other in shown)
 
 
-def _may_lack_pixels(source: Source, grids: Sequence[Grid]) -> bool:
+def _may_lack_pixels(source: RowSource, grids: Sequence[Grid]) -> bool:
     """Return whether rows may be pixels of some of the grids, of which many are missing."""
     most = max((len(grid.cameras) * math.prod(grid.size) for grid in grids), default=0)
     enough = _PER_VIEW * len(source.camera_file) <= int(source.ply.valid.sum())
     return enough and len(source.ply.gaussians) < most
 
 
-def _follow_cameras(source: Source, grids: Sequence[Grid]) -> Iterator[list[Place]]:
+def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[Place]]:
     """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
 
     Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.
@@ -265,7 +265,7 @@ def _follow_cameras(source: Source, grids: Sequence[Grid]) -> Iterator[list[Plac
                 yield [(grid, layout)]
 
 
-def _moved_layouts(source: Source, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
+def _moved_layouts(source: RowSource, grid: Grid, layout: Layout, own: Cameras) -> list[Layout]:
     """List the places in a grid of rows that lack pixels, which show a ``layout`` and cameras of their ``own``."""
     cameras = grid.cameras
     margins = cameras.width - layout.width, cameras.height - layout.height
@@ -287,7 +287,7 @@ def _moved_layouts(source: Source, grid: Grid, layout: Layout, own: Cameras) -> 
 # Cameras that are off
 
 
-def _move_cameras(source: Source, grid: Grid) -> Recovery | None:
+def _move_cameras(source: RowSource, grid: Grid) -> Recovery | None:
     """Fit rows of every pixel by slightly moved cameras; None if that does not fit.
 
     Also None if the colours of the photos disagree: views in the wrong order look the same.
@@ -315,7 +315,7 @@ def _move_cameras(source: Source, grid: Grid) -> Recovery | None:
 # Rows without pixels, and results
 
 
-def _cropped_grid(source: Source, grids: Sequence[Grid]) -> Grid | None:
+def _cropped_grid(source: RowSource, grids: Sequence[Grid]) -> Grid | None:
     """Return the one of the grids whose photos show the colours of rows best; None if none do."""
     from gsmerge.alignment.unaligned import check_cameras
 
@@ -328,7 +328,7 @@ def _cropped_grid(source: Source, grids: Sequence[Grid]) -> Grid | None:
     return best
 
 
-def _choose_cameras(source: Source, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
+def _choose_cameras(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
     """Choose cameras that see rows without pixels; SceneError if none do, or if the rows should have pixels."""
     from gsmerge.alignment.explain import explain_count
     from gsmerge.alignment.unaligned import choose_cameras
@@ -349,7 +349,7 @@ def _choose_cameras(source: Source, grid: Grid, frames: Callable[[], Sequence[Si
     )
 
 
-def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> AlignmentResult:
+def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> AlignmentResult:
     """Find pixels or cameras of rows that an exporter centred, rescaled and turned; SceneError if that fails."""
     from gsmerge.alignment.upright import solve_upright, upright_error
 
@@ -375,7 +375,7 @@ def _place_upright(source: Source, grid: Grid, rotation: Similarity) -> Alignmen
     )
 
 
-def _make_result(source: Source, recovery: Recovery) -> AlignmentResult:
+def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
     grid, best = recovery.fit.grid, recovery.best
     inputs = source.inputs(grid)

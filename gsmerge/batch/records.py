@@ -20,7 +20,7 @@ SKIPPED = "skipped"  # of what is done already, which is not recorded again
 
 
 @dataclass(frozen=True)
-class Result:
+class DoneResult:
     """A result that a record says is done."""
 
     key: str  # of the scene's files, the settings and the version; "" where making it again failed
@@ -48,7 +48,7 @@ class RecordIndex:
 
     folder: Path
     end: int = 0  # byte up to which the records are read
-    results: dict[str, Result] = field(default_factory=dict)  # by name
+    results: dict[str, DoneResult] = field(default_factory=dict)  # by name
 
     def read_on(self) -> RecordIndex:
         """Read the records that this or another process has added since the last call; pass over damaged lines."""
@@ -72,10 +72,10 @@ class RecordIndex:
                     yield os.path.realpath(self.folder / file["path"])
 
 
-def _read_result(line: Mapping[str, Any], end: int) -> Result:
+def _read_result(line: Mapping[str, Any], end: int) -> DoneResult:
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts = line["report"].get("worse"), line["report"].get("input", {}).get("left_out")
-    return Result(_text(line["key"]), files, end, *(None if doubt is None else _text(doubt) for doubt in doubts))
+    return DoneResult(_text(line["key"]), files, end, *(None if doubt is None else _text(doubt) for doubt in doubts))
 
 
 def _text(value: Any) -> str:

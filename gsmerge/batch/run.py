@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.batch.jobs import BatchOptions, Job
-from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, RecordIndex, Result, check_folder, record
+from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, check_folder, record
 from gsmerge.errors import SceneError, UsageError, error_line
 from gsmerge.io.atomic import remove_stale
 from gsmerge.io.jsonl import append_line
@@ -84,7 +84,7 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
     return pending
 
 
-def refusal(job: Job, folder: Path, known: Result | None, key: str, *, begun: bool = False) -> str | None:
+def refusal(job: Job, folder: Path, known: DoneResult | None, key: str, *, begun: bool = False) -> str | None:
     """Return why a result is not replaced without being asked; ``begun``: what is there may be of a run that ended."""
     names = () if known is None else [file["path"] for file in known.files]
     foreign = [name for name in job.outputs if os.path.lexists(folder / name) and name not in names]

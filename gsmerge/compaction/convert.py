@@ -30,7 +30,7 @@ from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.streamed import remove_unused_chunks
 from gsmerge.io.formats.table import COLMAP, DEPTHS, HTML, INDEX, input_format
-from gsmerge.io.formats.write import Photos, output_notes
+from gsmerge.io.formats.write import NamedPhotos, output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
@@ -194,7 +194,7 @@ def _write(
     ending: str,
     gaussians: Gaussians,
     cameras: Cameras,
-    photos: Photos,
+    photos: NamedPhotos,
     names: Sequence[str],
     comments: Sequence[str],
 ) -> tuple[int, str | None]:

@@ -19,7 +19,7 @@ from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.cameras.read import read_cameras
 from gsmerge.io.formats.streamed import add_levels
 from gsmerge.io.formats.table import COLMAP, HTML, INDEX, MODEL_NAMES
-from gsmerge.io.formats.write import Photos, photo_folder
+from gsmerge.io.formats.write import NamedPhotos, photo_folder
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.measure.visibility import front_rows
@@ -116,7 +116,7 @@ def add_result(
     first: Path,
     levels: Sequence[Gaussians],
     comments: Sequence[str],
-    views: tuple[Cameras, Photos, str],
+    views: tuple[Cameras, NamedPhotos, str],
     *,
     normals: bool,
     site: bool,
@@ -153,7 +153,7 @@ def level_output(output: Path, level: int) -> Path:
 
 
 def add_colmap(
-    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, photos: Photos
+    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, photos: NamedPhotos
 ) -> list[Path]:
     """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
 
@@ -172,7 +172,7 @@ def add_colmap(
     return files
 
 
-def name_photos(photos: Path | None, names: Sequence[str]) -> Photos:
+def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:
     """Name views by their files in a folder of photos, as COLMAP does; otherwise by their names in the camera file.
 
     Returns each name and its photo, None where that is in no folder.

@@ -80,7 +80,7 @@ class PhotoReader:
         return PhotoReader(len(ids), self.size, lambda photo: self[ids[photo]])
 
 
-Photos = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB; empty where there are none
+PhotoArrays = Sequence[np.ndarray] | np.ndarray | PhotoReader  # c of [h,w,3], uint8 sRGB; empty where there are none
 NO_IMAGES = np.empty((0, 1, 1, 3), np.float32)  # photos as floats, where there are none
 
 
@@ -95,7 +95,7 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
     return as_floats(decode_images(match_images(source, names)))
 
 
-def decode_images(paths: Sequence[Path]) -> Photos:
+def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     """Decode image files of one size to ``[h,w,3]`` uint8 each; if they are large, they are decoded at each use.
 
     A file that several of ``paths`` name is decoded once. SceneError if an image cannot be read, two differ in size, or
@@ -125,7 +125,7 @@ def _check_together(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
         raise SceneError(paths[0].parent, f"{problem}, {found}", "make them smaller, or leave some out")
 
 
-def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> Photos:
+def decode_views(paths: Sequence[Path | None], turns: Sequence[int], size: Size) -> PhotoArrays:
     """Decode the photo of each view to ``[h,w,3]`` uint8, turned, and resized to one ``size``; black without a file.
 
     If they are large, they are decoded at each use. SceneError as :func:`decode_images`.
@@ -168,14 +168,16 @@ def decode_small(path: Path, side: int) -> np.ndarray:
     return np.multiply(photo, np.float32(1 / 255), dtype=np.float32)
 
 
-def change_photos(photos: Photos, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None) -> Photos:
+def change_photos(
+    photos: PhotoArrays, change: Callable[[int, np.ndarray], np.ndarray], size: Size | None = None
+) -> PhotoArrays:
     """Apply ``change(number, photo)`` to every photo, at each use for a reader; ``size``: of the new ones."""
     if isinstance(photos, PhotoReader):
         return PhotoReader(len(photos), size or photos.size, lambda photo: change(photo, photos[photo]))
     return parallel_map(lambda photo: change(photo, photos[photo]), range(len(photos)))
 
 
-def keep_photos(photos: Photos) -> Photos:
+def keep_photos(photos: PhotoArrays) -> PhotoArrays:
     """Decode photos into memory, for callers that use them more than once."""
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
@@ -188,7 +190,7 @@ def decode_image(path: Path, size: Size) -> np.ndarray:
     return _decode(path, data, size)
 
 
-def as_floats(images: Photos) -> np.ndarray:
+def as_floats(images: PhotoArrays) -> np.ndarray:
     """Convert c uint8 images of one size to ``[c,h,w,3]`` float32 in [0, 1]."""
     width, height = photo_size(images) or (1, 1)
     out = make_array((len(images), height, width, 3), np.float32)
@@ -201,7 +203,7 @@ def as_floats(images: Photos) -> np.ndarray:
     return out
 
 
-def photo_size(photos: Photos) -> Size | None:
+def photo_size(photos: PhotoArrays) -> Size | None:
     """Return (width, height) of the photos; None without any."""
     if isinstance(photos, PhotoReader):
         return photos.size
@@ -507,7 +509,7 @@ class PhotoTransform:
         matrix = [[self.scale_x, 0.0, -self.left], [0.0, self.scale_y, -self.top], [0.0, 0.0, 1.0]]
         return replace(cameras, Ks=matmul(matrix, cameras.Ks), width=self.width, height=self.height)
 
-    def photos(self, images: Photos) -> Photos:
+    def photos(self, images: PhotoArrays) -> PhotoArrays:
         """Transform c uint8 photos ``[h,w,3]``."""
 
         def one(_: int, image: np.ndarray) -> np.ndarray:

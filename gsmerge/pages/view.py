@@ -28,7 +28,7 @@ MOST_SOLID = 600_000  # Gaussians of a scene of which a page has the stills alon
 HEIGHT = 820  # pixels of a page in a notebook
 
 
-class Result(Protocol):
+class HasGaussians(Protocol):
     """What :func:`gsmerge.compact` returns, as far as a page needs it."""
 
     @property
@@ -63,7 +63,7 @@ class Page:
 
 def view(
     scene: Scene | StrPath,
-    results: Mapping[str, Result | Gaussians | StrPath] | Result | Gaussians | StrPath | None = None,
+    results: Mapping[str, HasGaussians | Gaussians | StrPath] | HasGaussians | Gaussians | StrPath | None = None,
     held_out: Views | None = None,
     *,
     light: bool | None = None,

@@ -22,10 +22,10 @@ from gsmerge.evidence.shown import Shown
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import list_images
-from gsmerge.io.photo_files import Photos, PhotoTransform, Size, image_size, resize_and_crop, resize_to
+from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, image_size, resize_and_crop, resize_to
 
 
-def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: Photos) -> CameraFile:
+def estimate_focal(ply: GaussianFile, camera_file: CameraFile, photos: PhotoArrays) -> CameraFile:
     """Estimate the focal length of cameras whose file has poses alone; SceneError if that fails."""
     estimated = alignment.estimate_focal(ply, camera_file, photos)
     if estimated is None:

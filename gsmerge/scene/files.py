@@ -13,8 +13,8 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
+from gsmerge.io.cameras.foreign import check_layout, find_unread
 from gsmerge.io.cameras.json_files import viewer_cameras_path
-from gsmerge.io.cameras.layouts import check_layout, find_unread
 from gsmerge.io.cameras.read import (
     CHUNK,
     find_cameras,

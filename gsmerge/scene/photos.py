@@ -27,7 +27,7 @@ from gsmerge.io.cameras.read import CHUNK, read_cameras
 from gsmerge.io.formats.table import is_frame
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_key, propose_images
 from gsmerge.io.photo_files import (
-    Photos,
+    PhotoArrays,
     Size,
     decode_image,
     decode_images,
@@ -57,7 +57,7 @@ SEEN_PLACE = "images_resized"  # where WorldMirror writes what it saw; into "ima
 class ScenePhotos:
     """The photos of c cameras, of one size, and their files."""
 
-    pictures: Photos = ()  # [h,w,3] uint8, black where a camera has none; empty where there are none
+    pictures: PhotoArrays = ()  # [h,w,3] uint8, black where a camera has none; empty where there are none
     paths: tuple[Path | None, ...] = ()  # None where no file shows a camera's view; empty where they are in no files
     turns: tuple[int, ...] = ()  # how each file is turned; see gsmerge.kernels.pictures.turn_picture
     notes: tuple[str, ...] = ()  # what was done for them, one sentence each
@@ -205,7 +205,7 @@ def images_beside(ply: Path) -> list[Path]:
     return sorted((path for path in named if path.is_file()), key=lambda path: natural_key(path.name))
 
 
-def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
+def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     """Read the photos of all cameras by their names, or from a file that holds them; empty where there are none.
 
     SceneError if one is missing or cannot be read, or two differ in size.
@@ -224,7 +224,7 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> Photos:
     return decode_images([proposal.pool[photo] for photo in proposal.named if photo is not None])
 
 
-def photos_inside(files: SceneFiles, camera_file: CameraFile) -> Photos:
+def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     """Read the photos that a file holds; empty without such a file."""
     if files.images is None or files.images.is_dir():
         return ()

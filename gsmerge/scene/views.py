@@ -15,7 +15,7 @@ from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import (
-    Photos,
+    PhotoArrays,
     PhotoTransform,
     Size,
     change_photos,
@@ -201,7 +201,7 @@ def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cam
     return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * shown).max() < 1))
 
 
-def cut_bars(photos: Photos, camera_file: CameraFile) -> tuple[Photos, list[str]]:
+def cut_bars(photos: PhotoArrays, camera_file: CameraFile) -> tuple[PhotoArrays, list[str]]:
     """Cut off bars around photos if the rest has the cameras' shape, with a note; otherwise change nothing."""
     size = photo_size(photos)
     shapes = sizes_of(camera_file)
@@ -222,7 +222,9 @@ def cut_bars(photos: Photos, camera_file: CameraFile) -> tuple[Photos, list[str]
     return keep_photos(change_photos(photos, cut, inner)), [note]
 
 
-def limit_photo_size(photos: Photos, rows: int, max_side: int, *, unaligned: bool) -> tuple[Photos, list[str]]:
+def limit_photo_size(
+    photos: PhotoArrays, rows: int, max_side: int, *, unaligned: bool
+) -> tuple[PhotoArrays, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side, with notes.
 
     Photos whose pixels may be the ``rows`` Gaussians of the file keep their size, unless they are known to be

@@ -12,7 +12,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
-from gsmerge.io.photo_files import PhotoReader, Photos, PhotoTransform, Size, change_photos, photo_size, same_shape
+from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
@@ -73,7 +73,7 @@ class CameraFile:
     names: tuple[str, ...]  # image names as the file gives them
     source: str  # the format's name
     convention: Convention = W2C_OPENCV  # how the format stores poses
-    images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
+    images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB where the file holds the images themselves
     order: str = "auto"  # order of the Gaussians' rows where the file names it, otherwise "auto"
     lenses: tuple[Lens | None, ...] = ()  # of each camera where one of them is no pinhole; empty where all are
     # how a focal length was estimated that the file lacks, one sentence; "" where it has one, None where that is to do
@@ -111,7 +111,7 @@ def make_camera_file(
     source: str,
     convention: Convention,
     views: Sequence[StoredView],
-    images: Photos = (),
+    images: PhotoArrays = (),
     order: str = "auto",
 ) -> CameraFile:
     """Make a camera file from poses in any convention: convert them to OpenCV world-to-camera, and check them.
@@ -312,7 +312,7 @@ def to_cameras(camera_file: CameraFile, size: tuple[int, int] | None = None) -> 
     return Cameras(camera_file.viewmats, Ks, *size)
 
 
-def as_pinholes(camera_file: CameraFile, photos: Photos) -> tuple[CameraFile, Photos, list[str]]:
+def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFile, PhotoArrays, list[str]]:
     """Undistort photos, and make their cameras pinholes with the same intrinsics; also return a note.
 
     SceneError if a lens is not a pinhole and photos are missing or of another shape, or if a lens shows next to nothing
@@ -347,7 +347,7 @@ def as_pinholes(camera_file: CameraFile, photos: Photos) -> tuple[CameraFile, Ph
     return pinholes, straight, [f"the photos are undistorted ({name}); the intrinsics stay"]
 
 
-def undistort_photos(photos: Photos, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> Photos:
+def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
     """Undistort photos to those of pinholes with the same intrinsics; borders repeat the nearest pixels.
 
     ``photos`` are uint8 ``[h,w,3]``; ``Ks [c,3,3]`` at their size, the top-left pixel's centre at (0.5, 0.5).

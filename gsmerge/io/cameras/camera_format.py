@@ -13,7 +13,7 @@ from plyfile import PlyData
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, StoredView, make_camera_file
 from gsmerge.io.formats.ply import open_ply
-from gsmerge.io.photo_files import Photos
+from gsmerge.io.photo_files import PhotoArrays
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class StoredCameras(NamedTuple):
     """Cameras as a file stores them, before conversion."""
 
     views: list[StoredView]
-    images: Photos = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
+    images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # of the Gaussians' rows
     convention: Convention | None = None  # where the numbers show another one than the format's
 

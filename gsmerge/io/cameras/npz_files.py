@@ -26,7 +26,7 @@ from gsmerge.io.bounds import check_file, check_pixels, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, ORDERS, StoredView, check_count
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.colmap import read_colmap
-from gsmerge.io.photo_files import Photos
+from gsmerge.io.photo_files import PhotoArrays
 
 _LYRA = ("recon_sampled", "da3", "da3_pred")  # ends of names in ``cameras.npz`` of Lyra 2, by its scripts
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
@@ -61,7 +61,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
     poses = poses[0] if poses.ndim == 4 and len(poses) == 1 else poses
     Ks = Ks[0] if Ks is not None and Ks.ndim == 4 and len(Ks) == 1 else Ks
     _check_poses(path, poses, Ks, ("extrinsics [c,3,4]", "intrinsics [c,3,3]"))
-    photos: Photos = ()
+    photos: PhotoArrays = ()
     grid = depths
     if images is not None:
         photos = grid = _as_images(path, images, len(poses))

@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError, refuse_without_torch
 from gsmerge.io.bounds import MAX_VIEWS, read_budget
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.photo_files import Photos, decode_embedded, photo_size
+from gsmerge.io.photo_files import PhotoArrays, decode_embedded, photo_size
 
 with refuse_without_torch():
     import torch
@@ -81,7 +81,7 @@ def _rows(path: Path, cameras: Any) -> np.ndarray:
     return cameras.detach().double().numpy()
 
 
-def _photos(path: Path, images: Any, names: list[str]) -> Photos:
+def _photos(path: Path, images: Any, names: list[str]) -> PhotoArrays:
     """Decode the photos ``[v,h,w,3]`` uint8; none where the chunk has none."""
     listed = isinstance(images, list | tuple)
     if images is None or (listed and not images):

@@ -12,6 +12,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import SHARP, read_sharp
+from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
 from gsmerge.io.cameras.json_files import (
     FFGS,
     VIEWER_CAMERAS,
@@ -23,7 +24,6 @@ from gsmerge.io.cameras.json_files import (
     read_transforms,
     read_world_mirror,
 )
-from gsmerge.io.cameras.layouts import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions

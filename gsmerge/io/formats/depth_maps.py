@@ -32,7 +32,7 @@ from gsmerge.io.cameras.pose_lines import list_frames, pose_of_frame
 from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_count, to_stored
 from gsmerge.io.formats.table import FRAMES as FRAMES
 from gsmerge.io.formats.table import POSES, is_frame
-from gsmerge.io.photo_files import PhotoReader, Photos, keep_photos
+from gsmerge.io.photo_files import PhotoArrays, PhotoReader, keep_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.runtime.threads import parallel_map
@@ -94,7 +94,7 @@ def read_frames(frames: Sequence[Path]) -> list[StoredRows]:
     return parallel_map(read_rows, frames)
 
 
-def read_images(frames: Sequence[Path]) -> Photos:
+def read_images(frames: Sequence[Path]) -> PhotoArrays:
     """Read the images of DA3-Streaming's frames; if there are many, they are read again at each use."""
     width, height = read_depth_frame(frames[0]).size
 

@@ -10,7 +10,7 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import COLMAP, PLY, output_format
 from gsmerge.types import Gaussians, StrPath
 
-Photos = Sequence[tuple[str, Path | None]]  # names of views below a model's folder of photos, and their files if known
+NamedPhotos = Sequence[tuple[str, Path | None]]  # names below a model's folder of photos, and files if known
 
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
@@ -30,7 +30,7 @@ def photo_folder(points: Path) -> Path:
     return points.parent.parent.parent / "images"
 
 
-def output_notes(out: Path, sh_degree: int, photos: Photos) -> list[str]:
+def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
     """Describe what an output lacks: harmonics that are not written, and the ``photos`` of a COLMAP model."""
     lost, place = lost_harmonics(out, sh_degree), photo_folder(out)
     notes = [lost] if lost else []

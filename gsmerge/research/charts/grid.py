@@ -31,7 +31,7 @@ MAX_NAME = 100  # characters of a run in names of files
 
 
 @dataclass(frozen=True)
-class Grid(Settings):
+class SettingsGrid(Settings):
     """Lists of values for settings; every combination is run. What has no list is as usual, or as a recipe says."""
 
     method: tuple[str, ...] = setting((OURS,), "Methods: gsmerge and baselines.", filled=True, unique=True)
@@ -54,12 +54,12 @@ class Grid(Settings):
                 raise UsageError(f"--set {name}: expected another setting, use --grid {name}=A,B")
 
 
-def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> Grid:
-    """Make a grid of pairs NAME=A,B, the names those of :class:`Grid`; UsageError for impossible values."""
+def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> SettingsGrid:
+    """Make a grid of pairs NAME=A,B, the names those of :class:`SettingsGrid`; UsageError for impossible values."""
     values: dict[str, tuple[Any, ...]] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
-        names = settings_of(Grid)
+        names = settings_of(SettingsGrid)
         if name not in names:
             raise UsageError(f"--grid {name}: expected {join_words(names)} before =, and values with commas between")
         if name in values:
@@ -69,12 +69,12 @@ def parse_grid(pairs: Sequence[str], fixed: Mapping[str, Any] | None = None) -> 
             raise UsageError(f"--grid {name}: expected at least one value, got none")
         values[name] = tuple(int(part) if name in NUMBERS and part.isdecimal() else part for part in parts)
     try:
-        return Grid(**values, fixed=fixed or {})
+        return SettingsGrid(**values, fixed=fixed or {})
     except ValueError as error:
         raise UsageError(str(error)) from error
 
 
-def list_settings(grid: Grid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
+def list_settings(grid: SettingsGrid) -> tuple[list[tuple[str, dict[str, Any]]], list[str]]:
     """List (method, settings) of every run on one scene, the unmerged input first; also notes on combinations left out.
 
     Only settings that differ from the defaults are set; for ours these are a fixed recipe's, and the lists go before.
@@ -113,7 +113,7 @@ def _options_of(method: str, settings: Mapping[str, Any], seed: int) -> CompactO
 
 
 @dataclass(frozen=True)
-class Source:
+class ChartScene:
     """A scene to run, before it is read."""
 
     path: Path  # the ``.ply``, or the folder that it is in
@@ -126,7 +126,7 @@ class Source:
 
 def find_sources(
     arguments: Sequence[str], out: Path, targets: str | None = None, target_images: str | None = None
-) -> list[Source]:
+) -> list[ChartScene]:
     """Find scenes as ``gsmerge batch`` does, and hash all files of each.
 
     ``targets``, cameras of held-out views, and ``target_images``, the folder of their photos, are one path for all or a
@@ -149,7 +149,7 @@ def find_sources(
         scene_cameras = None if files.cameras is None else cameras_of(files.cameras, files.ply.stem)
         num_views = None if scene_cameras is None else len(scene_cameras)
         sha256 = content_hash(list(dict.fromkeys(read)))
-        sources.append(Source(scene, name, cameras, photos, num_views, sha256))
+        sources.append(ChartScene(scene, name, cameras, photos, num_views, sha256))
     return sources
 
 
@@ -164,7 +164,7 @@ def scene_names(scenes: Sequence[Path]) -> list[str]:
 
 
 def make_jobs(
-    sources: Sequence[Source], grid: Grid, measured: EvaluateOptions, *, seed: int = 0, command: str = ""
+    sources: Sequence[ChartScene], grid: SettingsGrid, measured: EvaluateOptions, *, seed: int = 0, command: str = ""
 ) -> tuple[list[Job], list[str]]:
     """Make the jobs of a grid, scene by scene, and notes on combinations left out.
 

@@ -33,7 +33,7 @@ from gsmerge.research.training.backbones import Backbone, bind_backbone
 from gsmerge.research.training.examples import Example, draw_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
-from gsmerge.research.training.shards import ExampleStreams, Shard, Source, open_streams, read_example
+from gsmerge.research.training.shards import ExampleStreams, Shard, TrainingSource, open_streams, read_example
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window, sample_window, whole_photo
 from gsmerge.runtime.threads import parallel_map, use_threads
@@ -46,7 +46,7 @@ FORMAT = "gsmerge-training"
 REMEDY = "choose another --output, or remove it to start again"
 
 
-def validate(networks: Networks, shards: Sequence[Source], options: TrainOptions, out: Path) -> Row:
+def validate(networks: Networks, shards: Sequence[TrainingSource], options: TrainOptions, out: Path) -> Row:
     """Measure the PSNR of renders with and without networks, and the share of merged Feature Gaussians.
 
     For each scene ``validation-NAME.png`` shows a photo, its analytic and its learned render.
@@ -56,7 +56,9 @@ def validate(networks: Networks, shards: Sequence[Source], options: TrainOptions
     return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
-def _score(networks: Networks, shards: Sequence[Source], number: int, options: TrainOptions, out: Path) -> Scores:
+def _score(
+    networks: Networks, shards: Sequence[TrainingSource], number: int, options: TrainOptions, out: Path
+) -> Scores:
     """Score one of the shards, and write its picture if it is the first of its scene."""
     rng = np.random.default_rng([options.seed, VALIDATION, number])
     example = read_example(shards[number], options, rng)
@@ -173,8 +175,8 @@ def choose_device(name: str) -> str:
 
 def _train(
     options: TrainOptions,
-    shards: Sequence[Source],
-    validation: Sequence[Source],
+    shards: Sequence[TrainingSource],
+    validation: Sequence[TrainingSource],
     out: Path,
     device: str,
     progress: Progress | None,

@@ -196,10 +196,12 @@ def _read(path: Path, prefix: str = "") -> tuple[dict[str, np.ndarray], dict[str
         raise SceneError(path, "expected an example, found a damaged file or none", REMEDY) from error
 
 
-Source = Shard | PredictedCapture
+TrainingSource = Shard | PredictedCapture
 
 
-def read_example(source: Source, options: TrainOptions, rng: np.random.Generator, *, check: bool = True) -> Example:
+def read_example(
+    source: TrainingSource, options: TrainOptions, rng: np.random.Generator, *, check: bool = True
+) -> Example:
     """Read the example of a shard as :func:`read_shard`, or draw one of a capture."""
     if isinstance(source, Shard):
         return read_shard(source, check=check)
@@ -209,7 +211,7 @@ def read_example(source: Source, options: TrainOptions, rng: np.random.Generator
 class ExampleStreams:
     """Streams of examples, one stream for each crop of a step."""
 
-    def __init__(self, shards: Sequence[Source], options: TrainOptions) -> None:
+    def __init__(self, shards: Sequence[TrainingSource], options: TrainOptions) -> None:
         self.shards, self.options = shards, options
         self.pool = ThreadPoolExecutor(options.workers, "gsmerge-read", initializer=work_alone)
         # Those in memory, or being read, by number of the shard; of a capture also by place in the order, else 0
@@ -251,7 +253,7 @@ class ExampleStreams:
 
 
 @contextmanager
-def open_streams(shards: Sequence[Source], options: TrainOptions) -> Iterator[ExampleStreams]:
+def open_streams(shards: Sequence[TrainingSource], options: TrainOptions) -> Iterator[ExampleStreams]:
     """Open streams of examples; their threads end with the block."""
     streams = ExampleStreams(shards, options)
     try:

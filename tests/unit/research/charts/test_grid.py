@@ -10,12 +10,12 @@ from messages import noted, refuses
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.research.charts.grid import Grid, find_sources, list_settings, make_jobs, parse_grid, scene_names
+from gsmerge.research.charts.grid import SettingsGrid, find_sources, list_settings, make_jobs, parse_grid, scene_names
 from gsmerge.settings.compact import CompactOptions
 
 
 def test_the_smallest_grid_is_the_input_and_the_defaults() -> None:
-    assert list_settings(Grid()) == ([("input", {}), ("gsmerge", {})], [])
+    assert list_settings(SettingsGrid()) == ([("input", {}), ("gsmerge", {})], [])
 
 
 def test_the_product() -> None:
@@ -36,13 +36,13 @@ def test_every_label_is_a_result_of_its_own(fixed: dict[str, str]) -> None:
     asked = {(one.fit.fit, one.match.match) for one in options}
     assert asked == {("full", "overlap"), ("full", "aabb"), ("none", "overlap"), ("none", "aabb")}
     assert notes == []
-    (_, (_, alone)), _ = list_settings(Grid(fixed=fixed))
+    (_, (_, alone)), _ = list_settings(SettingsGrid(fixed=fixed))
     assert CompactOptions().with_settings(alone) == CompactOptions().with_settings(fixed)
 
 
 def test_baselines_run_once_per_size() -> None:
     combinations, notes = list_settings(
-        Grid(method=("gsmerge", "voxel"), k=(1, 2), budget=("1%",), superpixels=("10%",), fit=("full", "none"))
+        SettingsGrid(method=("gsmerge", "voxel"), k=(1, 2), budget=("1%",), superpixels=("10%",), fit=("full", "none"))
     )
     assert [settings for method, settings in combinations if method == "voxel"] == [
         {"budget": "1%"},
@@ -53,7 +53,9 @@ def test_baselines_run_once_per_size() -> None:
 
 
 def test_methods_that_keep_all_run_once_and_fits_once_per_effort() -> None:
-    grid = Grid(method=("unmerged", "unmerged-fit"), budget=("1%", "2%"), effort=("fast", "default"), fit=("none",))
+    grid = SettingsGrid(
+        method=("unmerged", "unmerged-fit"), budget=("1%", "2%"), effort=("fast", "default"), fit=("none",)
+    )
     combinations, notes = list_settings(grid)
     assert combinations == [("input", {}), ("unmerged", {}), ("unmerged-fit", {"effort": "fast"}), ("unmerged-fit", {})]
     assert noted(notes, "5 combination(s)")
@@ -73,7 +75,7 @@ def test_settings_that_the_library_refuses() -> None:
 
 
 def test_fixed_settings_are_those_of_ours_alone() -> None:
-    grid = Grid(method=("gsmerge", "random"), budget=("1%",), fixed={"robust": False, "match": "none"})
+    grid = SettingsGrid(method=("gsmerge", "random"), budget=("1%",), fixed={"robust": False, "match": "none"})
     combinations, _ = list_settings(grid)
     assert combinations[1:] == [
         ("gsmerge", {"budget": "1%", "robust": False, "match": "none"}),
@@ -97,7 +99,7 @@ def test_lists_that_are_none() -> None:
 def test_a_program_that_is_missing_is_told_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSMERGE_SPLAT_TRANSFORM", "/nowhere/splat-transform")
     with refuses(UsageError, "splat-transform", "/nowhere/splat-transform", "@playcanvas/splat-transform@3.7"):
-        make_jobs([], Grid(method=("gsmerge", "splat-transform"), budget=("1%",)), EvaluateOptions(()))
+        make_jobs([], SettingsGrid(method=("gsmerge", "splat-transform"), budget=("1%",)), EvaluateOptions(()))
 
 
 def test_names_are_as_short_as_can_be() -> None:
@@ -172,7 +174,7 @@ def test_a_copy_has_the_same_hash(scene_copy: Path, made_scene: Path) -> None:
 
 def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -> None:
     fixed = {"checkpoint": "a/b.safetensors", "min_opacity": 0.1}
-    grid = Grid(method=("gsmerge", "random"), budget=("1%",), views=(2, 5, 9, "all"), fixed=fixed)
+    grid = SettingsGrid(method=("gsmerge", "random"), budget=("1%",), views=(2, 5, 9, "all"), fixed=fixed)
     jobs, notes = make_jobs(sources(made_scene), grid, EvaluateOptions(()))
     assert len({job.output for job in jobs}) == len(jobs) == 2 * 3
     assert noted(notes, made_scene.name, "6 run(s)")  # of nine views, and of five, which are all
@@ -183,12 +185,12 @@ def test_jobs_are_runs_of_each_scene_with_files_of_their_own(made_scene: Path) -
 
 def test_keys_depend_on_what_changes_measurements(made_scene: Path) -> None:
     def key(**more: Any) -> str:
-        given = sources(made_scene), more.pop("grid", Grid()), more.pop("measured", EvaluateOptions(()))
+        given = sources(made_scene), more.pop("grid", SettingsGrid()), more.pop("measured", EvaluateOptions(()))
         (_, job), _ = make_jobs(*given, **more)
         return job.call.key(job.find_files())
 
     assert key() == key(command="another")
     others = [key(measured=EvaluateOptions(("vgg",))), key(seed=1)]
-    others += [key(grid=Grid(budget=("1%",)))]
+    others += [key(grid=SettingsGrid(budget=("1%",)))]
     others += [key(measured=EvaluateOptions((), photo_side=476))]
     assert len({key(), *others}) == 5

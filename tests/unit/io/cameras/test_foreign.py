@@ -11,7 +11,7 @@ from tiny_scene import Tiny, write_colmap_text, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, write_gaussians
-from gsmerge.io.cameras.layouts import LAYOUTS, find_unread
+from gsmerge.io.cameras.foreign import LAYOUTS, find_unread
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 from gsmerge.scene.files import find_scene_files
 

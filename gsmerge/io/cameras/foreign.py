@@ -13,7 +13,7 @@ from gsmerge.io.formats.ply import header_content
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 
 
-class Layout(NamedTuple):
+class Foreign(NamedTuple):
     """Patterns of a program's files, the export of it that is read if they are not, and what they start with."""
 
     files: str
@@ -44,38 +44,40 @@ CAMERA_PLACES = (
 # Of those that are read the first that exists wins; a COLMAP model directly in the folder comes last, because Depth
 # Anything 3 puts one there at the photos' own size. The others matter where none of them is there.
 LAYOUTS = (
-    *map(Layout, CAMERA_PLACES),
-    Layout("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Layout("*.rcproj *.rsproj", *_REALITY),
-    Layout("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
-    Layout("*.xml", "ContextCapture or DJI Terra", _OPENMVS.format("InterfaceMetashape and "), "<BlocksExchange"),
-    Layout("*calibrated_*camera_parameters*.txt *.p4d *.p4m *.opf", "Pix4D", _OPF),
-    Layout("*.out", "Bundler", _KAPTURE.format("bundler"), "# Bundle file"),
-    Layout("*.nvm", "VisualSFM", _KAPTURE.format("nvm")), Layout("*.pose.txt", "7-Scenes", _KAPTURE.format("7scenes")),
-    Layout("sensors/*.txt", "kapture", "kapture_export_colmap.py makes a COLMAP model of it", "kapture"),
-    Layout("*.json", *_OPENMVG, '"sfm_data_version"'), Layout("sfm_data.bin", *_OPENMVG),
-    Layout("*.sfm *.mg", "Meshroom", "its node ExportColmap, or aliceVision_exportColmap, makes a COLMAP model of it"),
-    Layout("*.mvs", "OpenMVS", _OPENMVS.format("")),
-    Layout("*.theia reconstruction-[0-9]", "Theia", "export_colmap_files of Theia makes a COLMAP model of it"),
-    Layout("cameras.json", *_ODM, '"projection_type"'), Layout("odm_report/shots.geojson", *_ODM),
-    Layout("*.db project.ini", "COLMAP's database", "name the sparse/0 of `colmap mapper`", "SQLite|database_path"),
-    Layout("poses_bounds.npy", "LLFF", "name the COLMAP model sparse/0 from which imgs2poses.py made it"),
-    Layout("*_cam.txt", "MVSNet", _MODEL, "extrinsic"),
-    Layout("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
-    Layout("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
-    Layout("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
-    Layout("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
-    Layout("*.traj", "ARKitScenes", _OWN), Layout("*.jgz", "CO3D", _OWN),
-    Layout("*.json", "Open3D", _OWN, '"PinholeCamera'), Layout("*.json", "3D Scanner App", _OWN, '"cameraPoseARFrame"'),
-    Layout("camera/*.json", "Nerfies", _OWN, '"(orientation|principal_point)"'),
-    Layout("*_par.txt *.conf", "Middlebury or Matterport", _OWN, r"^\s*\d+\s|^dataset"),
-    Layout("*.out *.mve/meta.ini", "MVE", _OWN, "drews|MVE view"),
-    Layout("*.csv", "EuRoC's body", _OWN, "#(timestamp|time)"),
-    Layout("camera/*.npz poses.npz", "CUT3R or Spann3R", _OWN, "pose"),
-    Layout("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _OWN),
-    Layout("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
+    *map(Foreign, CAMERA_PLACES),
+    Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
+    Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
+    Foreign("*.xml", "ContextCapture or DJI Terra", _OPENMVS.format("InterfaceMetashape and "), "<BlocksExchange"),
+    Foreign("*calibrated_*camera_parameters*.txt *.p4d *.p4m *.opf", "Pix4D", _OPF),
+    Foreign("*.out", "Bundler", _KAPTURE.format("bundler"), "# Bundle file"),
+    Foreign("*.nvm", "VisualSFM", _KAPTURE.format("nvm")),
+    Foreign("*.pose.txt", "7-Scenes", _KAPTURE.format("7scenes")),
+    Foreign("sensors/*.txt", "kapture", "kapture_export_colmap.py makes a COLMAP model of it", "kapture"),
+    Foreign("*.json", *_OPENMVG, '"sfm_data_version"'), Foreign("sfm_data.bin", *_OPENMVG),
+    Foreign("*.sfm *.mg", "Meshroom", "its node ExportColmap, or aliceVision_exportColmap, makes a COLMAP model of it"),
+    Foreign("*.mvs", "OpenMVS", _OPENMVS.format("")),
+    Foreign("*.theia reconstruction-[0-9]", "Theia", "export_colmap_files of Theia makes a COLMAP model of it"),
+    Foreign("cameras.json", *_ODM, '"projection_type"'), Foreign("odm_report/shots.geojson", *_ODM),
+    Foreign("*.db project.ini", "COLMAP's database", "name the sparse/0 of `colmap mapper`", "SQLite|database_path"),
+    Foreign("poses_bounds.npy", "LLFF", "name the COLMAP model sparse/0 from which imgs2poses.py made it"),
+    Foreign("*_cam.txt", "MVSNet", _MODEL, "extrinsic"),
+    Foreign("cameras*.npz", "IDR, NeuS or DTU", _MODEL, "(world|scale|camera)_mat"),
+    Foreign("metadata.json *.r3d", "Record3D", _NERFSTUDIO.format("record3d"), '^PK|"(poses|perFrameIntrinsicCoeffs)"'),
+    Foreign("*.vrs *_loop_trajectory.csv", "Project Aria", _NERFSTUDIO.format("aria")),
+    Foreign("*.sens", "ScanNet", "its SensReader exports poses and intrinsics, which are read"),
+    Foreign("*.traj", "ARKitScenes", _OWN), Foreign("*.jgz", "CO3D", _OWN),
+    Foreign("*.json", "Open3D", _OWN, '"PinholeCamera'),
+    Foreign("*.json", "3D Scanner App", _OWN, '"cameraPoseARFrame"'),
+    Foreign("camera/*.json", "Nerfies", _OWN, '"(orientation|principal_point)"'),
+    Foreign("*_par.txt *.conf", "Middlebury or Matterport", _OWN, r"^\s*\d+\s|^dataset"),
+    Foreign("*.out *.mve/meta.ini", "MVE", _OWN, "drews|MVE view"),
+    Foreign("*.csv", "EuRoC's body", _OWN, "#(timestamp|time)"),
+    Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _OWN, "pose"),
+    Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _OWN),
+    Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
            r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
-    Layout("*.psht", "Postshot", "name the cameras that were loaded into it"),
-    Layout("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
+    Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),
+    Foreign("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip
 
 # Words of places, turns and matrices, by which a text file that nothing reads shows that it has poses
@@ -115,6 +117,6 @@ def find_unread(place: Path) -> Path | None:
     return next((path for layout in LAYOUTS for path in others if _is_of(path, layout)), None)
 
 
-def _is_of(path: Path, layout: Layout) -> bool:
+def _is_of(path: Path, layout: Foreign) -> bool:
     named = layout.remedy and any(map(path.match, layout.files.split())) and path.is_file()
     return bool(named) and re.search(layout.start, read_start(path).decode("latin-1")) is not None
