@@ -304,12 +304,7 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 
 def _whole_needed(options: CompactOptions) -> list[str]:
     """Name the settings in use that prevent cutting a scene into blocks."""
-    whole = {
-        "budget auto": options.budget.auto,
-        "poses free": options.prepare.poses == "free",
-        "exposure per-photo": options.prepare.exposure == "per-photo",
-    }
-    return [*options.whole_only, *(name for name, holds in whole.items() if holds)]
+    return [*options.whole_only, *options.uncut]
 
 
 def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:

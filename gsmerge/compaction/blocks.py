@@ -43,6 +43,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.setting import part_settings
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
@@ -314,7 +315,7 @@ def block_options(
     so each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
     ``superpixels`` and K give.
     """
-    settings: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "budget": None}
+    settings: dict[str, Any] = {**part_settings(CompactOptions), "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part

@@ -15,16 +15,12 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan, make_plan
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.setting import part_settings
 from gsmerge.types import Gaussians, PicturedScene
 
 LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
 PART, MOST = 6, 3  # one of so many views is left out at a time, at most so many
 LEAST_SEEN = 0.02  # share of a left-out photo that the others must cover
-# What a run of these settings decides by work on the whole scene, or leaves out of the result
-LEFT_TO_RUN: dict[str, Any] = {
-    "budget": None, "quality": None, "levels": 1, "crop": None, "drop": None, "time_budget": None, "photo_scale": 1.0,
-    "poses": "fixed", "exposure": "fixed", "blocks": "none", "recipe": None, "new_views": False,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +53,7 @@ class LeftOut:
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
         """Plan a run on the rest: as ``plan``, but for what is decided by the whole scene, and for ``settings``."""
-        settings = plan.settings | LEFT_TO_RUN | settings
+        settings = plan.settings | part_settings(CompactOptions, trial=True) | settings
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
         return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
 

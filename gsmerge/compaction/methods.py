@@ -17,12 +17,12 @@ from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.setting import names_of
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Gaussians, Scene
 
 Need = Literal["photos", "pixels"]
-COUNTS = ("budget", "superpixels", "k")  # settings that decide how many
-COMMON_SETTINGS = {"method", "seed", "threads", "crop", "drop"}  # that every method uses
+COUNTS = names_of(CompactOptions, lambda one: one.counts)  # settings that decide how many
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
-    default, used = CompactOptions().to_dict(), {*method.uses, *COMMON_SETTINGS}
+    default, used = CompactOptions().to_dict(), {*method.uses, *names_of(CompactOptions, lambda one: one.common)}
     unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 

@@ -28,7 +28,7 @@ class BudgetOptions(Settings):
         "scene needs.",
         "A size is that of the output's file, a `.ply` in Python, and never exceeded. No more is taken than new views "
         "gain from, unless `fill` is true.",
-        metavar="40000|2%|5MB|DEVICE|auto")  # fmt: skip
+        metavar="40000|2%|5MB|DEVICE|auto", counts=True, uncut=(AUTO,), in_trial=None)  # fmt: skip
     fill: bool = setting(False, "Whether shares, sizes and devices are filled.")
     most: int | None = setting(None, "Gaussians from which on new views gain nothing, where that is known.",
         internal=True)  # fmt: skip
@@ -37,13 +37,13 @@ class BudgetOptions(Settings):
         "These are photos that are left out, of four or more, or those of the input. Where rows belong to no pixels "
         "and no number is asked for, the result keeps the input: its renders at 32.5 dB without photos, the photos "
         "within 0.3 dB with them.",
-        metavar="30dB|-0.2dB")  # fmt: skip
+        metavar="30dB|-0.2dB", whole="value", in_trial=None)  # fmt: skip
     output: str = setting(
         "", "Name of the file that is written and whose bytes a size counts, with its ending.", internal=True
     )
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
-        "Each is fitted by itself.", least=1, most=8)  # fmt: skip
+        "Each is fitted by itself.", least=1, most=8, whole="name", in_trial=1)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -60,7 +60,8 @@ class CompactOptions(Settings):
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
     method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel or contribution.",
-        "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME")  # fmt: skip
+        "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME", common=True,
+        whole="value")  # fmt: skip
     effort: str = setting("default", "Quality for time: best is sharper and takes three times as "
         "long; fast and draft take less than half.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
@@ -69,15 +70,16 @@ class CompactOptions(Settings):
         "They do if no fit follows; a draft or a fast run uses only their decoder heads.",
         metavar="FILE|NAME")  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
-        "method, with networks that have absolute outputs.", choices=tuple(RECIPES))  # fmt: skip
+        "method, with networks that have absolute outputs.", choices=tuple(RECIPES), in_trial=None)  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
         "analytic stages.")  # fmt: skip
     new_views: bool | None = setting(None, "Estimate what a new viewpoint gains, from photos that a short fit leaves "
-        "out.", "By default where at least four views have photos, but not in a draft or without a fit.")  # fmt: skip
+        "out.", "By default where at least four views have photos, but not in a draft or without a fit.",
+        in_part=False)  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
-        "Runs with one seed are bit-identical.", least=0)  # fmt: skip
+        "Runs with one seed are bit-identical.", least=0, common=True)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
-        most=MOST_THREADS, shown="all processors")  # fmt: skip
+        most=MOST_THREADS, shown="all processors", common=True)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,11 +103,19 @@ class CompactOptions(Settings):
     @property
     def whole_only(self) -> list[str]:
         """Names of the settings in use that require the scene in one piece."""
-        budget = self.budget
-        asked = {f"method {self.method}": self.method != OURS, "levels": budget.levels > 1}
-        asked |= {f"quality {budget.quality}": budget.quality is not None, "crop": self.clean.crop is not None}
-        asked |= {f"drop {name}": True for name in self.clean.drops}
-        return [name for name, wanted in asked.items() if wanted]
+        values, names = self.to_dict(), list[str]()
+        for name, declared in flat_settings(CompactOptions).items():
+            if declared.whole == "value" and values[name] != declared.default:
+                names += [f"{name} {part.strip()}" for part in str(values[name]).split(",")]
+            elif declared.whole and values[name] != declared.default:
+                names.append(name)
+        return names
+
+    @property
+    def uncut(self) -> list[str]:
+        """Names of the settings in use with which a scene is not cut unless blocks are asked for."""
+        values, declared = self.to_dict(), flat_settings(CompactOptions)
+        return [f"{name} {values[name]}" for name, one in declared.items() if values[name] in one.uncut]
 
     @property
     def compact_only(self) -> list[str]:

@@ -80,10 +80,10 @@ class FitOptions(Settings):
         "By default 320, and by effort and numbers of views and Gaussians.", least=1)  # fmt: skip
     time_budget: float | None = setting(None, "Seconds after which the full fit stops.",
         "The result is then no longer the same on every machine. By default there is no limit.", above=0,
-        unit="seconds")  # fmt: skip
+        unit="seconds", in_trial=None)  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Times the views' size at which two of every five steps "
         "after those on half-size photos look at larger photos, as far as the photos are that large.",
-        "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf)  # fmt: skip
+        "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf, in_trial=1.0)  # fmt: skip
     dropout: float | None = setting(None, "Share of the Gaussians that a step leaves out.",
         "By default 0.1 for at most five views and at least 150 steps, 0.05 from 600 steps and 30 looks at each view "
         "on, otherwise 0.", least=0, below=1)  # fmt: skip

@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 T = TypeVar("T")
 MOST_THREADS = 1024  # each takes memory, even if it never has work
+KEPT = "as it is"  # of a value that a run of a part of a scene takes: the whole scene's
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
@@ -35,6 +36,16 @@ class Setting:
     unique: bool = False  # whether a list has no value twice
     filled: bool = False  # whether a list has at least one value
     internal: bool = False  # whether the program sets it, and no user by name
+    counts: bool = False  # whether it decides how many Gaussians there are
+    common: bool = False  # whether every method uses it, baselines too
+    # Whether a value other than the default needs the scene in one piece, and what messages call it: "name", or "value"
+    # for name and value; and values for which a scene is not cut unless blocks are asked for
+    whole: Literal["", "name", "value"] = ""
+    uncut: tuple[Any, ...] = ()
+    # The value in a run of a part of a scene: a block, a batch of views; and in one that tries settings on some views,
+    # where that is another one
+    in_part: Any = KEPT
+    in_trial: Any = KEPT
     shown: str | None = None  # the default in words, where the program chooses it
     metavar: str | None = None  # form of the values on the command line
     name: str = ""
@@ -181,6 +192,20 @@ def flat_settings(options: type) -> dict[str, Setting]:
         if not declared.internal:
             flat |= flat_settings(declared.kind) if declared.is_group else {name: declared}
     return flat
+
+
+def names_of(options: type, is_one: Callable[[Setting], Any]) -> tuple[str, ...]:
+    """Return the flat names of the settings whose declaration fulfils a condition."""
+    return tuple(name for name, declared in flat_settings(options).items() if is_one(declared))
+
+
+def part_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
+    """Return by flat name what settings are in a run of a part of a scene, or in a ``trial`` on some of its views."""
+    declared = flat_settings(options)
+    values = {
+        name: one.in_part if one.in_trial == KEPT or not trial else one.in_trial for name, one in declared.items()
+    }
+    return {name: value for name, value in values.items() if value is not KEPT}
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:

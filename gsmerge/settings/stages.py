@@ -38,10 +38,11 @@ class PrepareOptions(Settings):
 
     poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
         "`free`: views are moved to where their photos agree, and the fit moves the cameras on; `auto`: where some "
-        "view is more than 1.5 pixels off and agrees clearly better elsewhere.")  # fmt: skip
+        "view is more than 1.5 pixels off and agrees clearly better elsewhere.", uncut=("free",),
+        in_part="fixed")  # fmt: skip
     exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
         "they differ at random, never, or always.",
-        "The Gaussians of their pixels change with them.")  # fmt: skip
+        "The Gaussians of their pixels change with them.", uncut=("per-photo",), in_part="fixed")  # fmt: skip
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
         "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
         "others.")  # fmt: skip
@@ -57,7 +58,7 @@ class SegmentOptions(Settings):
 
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto: 4.4 to 7 %, the more the better the depths of the views agree.",
-        "A share is where `bass-adaptive` starts from.", metavar="NUMBER|SHARE|auto")  # fmt: skip
+        "A share is where `bass-adaptive` starts from.", metavar="NUMBER|SHARE|auto", counts=True)  # fmt: skip
     segmentation: str = setting("rdseg", "How superpixels are cut; `gsmerge.stages.superpixels` describes the methods.",
         choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: rectangles per superpixel that it begins with.",
@@ -129,7 +130,8 @@ class DecodeOptions(Settings):
 
     k: int | Literal["mixed", "auto"] = setting(AUTO, "More detail and a larger file: Gaussians for each superpixel; "
         "mixed: 1, 2 or 4, most where there is most to see; auto: 1, and 4 for one photo without a long fit.",
-        "`mixed` is of the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto")  # fmt: skip
+        "`mixed` is of the paper's supplement.", least=1, most=MAX_CHILDREN, metavar="1-8|mixed|auto",
+        counts=True)  # fmt: skip
     k_low: float = setting(50.0, "Percentile of `mixed` up to which groups become one Gaussian.",
         "The paper's are 33.3 and 66.7.", least=0, most=100)  # fmt: skip
     k_high: float = setting(85.0, "Percentile of `mixed` above which groups become four Gaussians.", least=0, most=100)
@@ -163,11 +165,11 @@ class CleanOptions(Settings):
     crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
         "scene's world units, or inside the shape that a .json or .toml file describes; a budget is met after it.",
         "Three more numbers of a box turn it about its middle: degrees about x, y and z. The command line alone reads "
-        "files.", metavar="SHAPE")  # fmt: skip
+        "files.", metavar="SHAPE", common=True, whole="name", in_trial=None)  # fmt: skip
     drop: str | None = setting(None, "Leave out floaters, sky, transparent or unseen Gaussians, with commas between.",
         "`floaters`: isolated, far beyond the scene, or hanging across it; `sky`: what is sky in the photos; "
         "`transparent`: of an opacity below 1/255; `unseen`: what no camera shows, without cameras no placed one.",
-        metavar="floaters,sky,...")  # fmt: skip
+        metavar="floaters,sky,...", common=True, whole="value", in_trial=None)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -240,5 +242,5 @@ class BlockOptions(Settings):
         "of hundreds of views; auto: beyond 20 million Gaussians, one for every 8 million, and for hundreds of views "
         "that see little of each other.",
         "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
-        metavar="auto|none|NUMBER")  # fmt: skip
+        metavar="auto|none|NUMBER", in_part="none")  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
