@@ -203,7 +203,7 @@ def part_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
     """Return by flat name what settings are in a run of a part of a scene, or in a ``trial`` on some of its views."""
     declared = flat_settings(options)
     values = {
-        name: one.in_part if one.in_trial == KEPT or not trial else one.in_trial for name, one in declared.items()
+        name: one.in_trial if trial and one.in_trial is not KEPT else one.in_part for name, one in declared.items()
     }
     return {name: value for name, value in values.items() if value is not KEPT}
 
