@@ -28,8 +28,7 @@ from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.streamed import remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, DEPTHS, HTML, INDEX, input_format
+from gsmerge.io.formats.table import DEPTHS, Format, input_format
 from gsmerge.io.formats.write import NamedPhotos, output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
@@ -69,7 +68,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     Returns the document of ``gsmerge convert``. SceneError if a file cannot be read or written, or nothing is left;
     UsageError for an ending that cannot be written, or for dropping the sky without photos.
     """
-    ending = output_format(options.output, levels=True, cameras=True).ending
+    chosen = output_format(options.output, levels=True, cameras=True)
     with use_threads():
         files, steps = list[GaussianFile](), len(options.inputs) + 1
         for path in options.inputs:
@@ -78,7 +77,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         gaussians = join_gaussians([file.gaussians[file.valid] for file in files])
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
-        if cameras is None and ending == COLMAP.ending:
+        if cameras is None and chosen.cameras == "needed":
             problem = "expected cameras beside it for a COLMAP model, found none"
             raise SceneError(options.inputs[0], problem, "name them with --cameras")
         count = len(gaussians)
@@ -107,12 +106,12 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if any(RESULT_COMMENT in info.comments for info in infos):
         comments.insert(0, RESULT_COMMENT)
     report_progress(f"convert: {options.output.name}", steps - 1, steps)
-    num_bytes, beside = _write(options, ending, gaussians, moved, photos, names, comments)
-    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": ending}
+    num_bytes, beside = _write(options, chosen, gaussians, moved, photos, names, comments)
+    facts = {"path": str(options.output), "bytes": num_bytes, "num_gaussians": len(gaussians), "format": chosen.ending}
     read = [{"path": str(info.path), "bytes": info.file_bytes, "num_gaussians": info.count} for info in infos]
     named_cameras = None if stored is None else str(stored.path)
     old = viewer_cameras_path(options.output)
-    if beside is None and ending not in (COLMAP.ending, HTML.ending) and old.is_file():
+    if beside is None and not chosen.cameras and old.is_file():
         notes.append(f"{old} is of an earlier file of that name, not of this one: delete it")
     document = document_head() | {"inputs": read, "cameras": named_cameras, "left_out": left_out, "output": facts}
     return document | {"viewer_cameras": beside, "notes": notes}
@@ -191,7 +190,7 @@ def _clean(
 
 def _write(
     options: ConvertOptions,
-    ending: str,
+    chosen: Format,
     gaussians: Gaussians,
     cameras: Cameras,
     photos: NamedPhotos,
@@ -205,10 +204,9 @@ def _write(
         written = add_result(
             add, out, add(out), [gaussians], comments, views, normals=options.normals, site=options.site
         )
-        if len(cameras) and ending not in (COLMAP.ending, HTML.ending):
+        if len(cameras) and not chosen.cameras:
             beside = viewer_cameras_path(out)
             add_views(add, beside, cameras, names, overwrite=options.overwrite)
         num_bytes = sum(path.stat().st_size for path in written[out])
-    if ending == INDEX:
-        remove_unused_chunks(out)
+    chosen.finish(out)
     return num_bytes, None if beside is None else str(beside)

@@ -20,8 +20,6 @@ from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.streamed import remove_unused_chunks
-from gsmerge.io.formats.table import COLMAP, INDEX
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, record_part
@@ -71,7 +69,7 @@ def compact_files(
     read or the result cannot be written, UsageError if the settings need what the scene does not have.
     """
     start, out, settings = perf_counter(), outputs.result, sized(settings, outputs)
-    ending = output_format(out, levels=True, cameras=True).ending
+    chosen = output_format(out, levels=True, cameras=True)
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         first = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
@@ -108,8 +106,7 @@ def compact_files(
             recognised=recognised, notes=[*load.notes, *notes], hashed=hashed,
             written_at=written, cameras_path=cameras_path,
         )  # fmt: skip
-    if ending == INDEX:
-        remove_unused_chunks(out)
+    chosen.finish(out)
     return document
 
 
@@ -164,7 +161,7 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 def check_colmap(scene: Scene, out: Path) -> None:
     """Raise UsageError if a COLMAP model is to be written and the scene has no cameras."""
-    if len(scene) == 0 and COLMAP.names(out):
+    if len(scene) == 0 and output_format(out, levels=True, cameras=True).cameras == "needed":
         raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 

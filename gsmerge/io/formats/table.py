@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -39,6 +40,9 @@ class Format:
     each: Sequence[float] = ()
     rest: Callable[[], int] = lambda: 0  # bytes of a file besides those of its Gaussians, at least
     round_means: Callable[[np.ndarray], np.ndarray] = lambda means: means  # as it holds them, but for float32
+    # Whether files hold the views' cameras, which others have beside them: "inside", or "needed" where they have to
+    cameras: Literal["", "inside", "needed"] = ""
+    finish: Callable[[Path], object] = lambda _: None  # called with the path once all files are in their places
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
 
     def names(self, path: StrPath) -> bool:
@@ -61,12 +65,13 @@ PLY = Format(
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
-    round_means=_lazy("sog.round_means"),
+    round_means=_lazy("sog.round_means"), finish=_lazy("streamed.remove_unused_chunks"),
 )  # fmt: skip
-COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0)
+COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0, cameras="needed")
 HTML = Format(
     ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means"),
     each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size) + PAGE,
+    cameras="inside",
 )  # fmt: skip
 SITE, SITE_SCENE = "index.html", "scene.sog"  # of a page that has its files beside it
 FILES = (  # of endings that end alike the longest first
