@@ -102,7 +102,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     hints = args.hints()
     from gsmerge.compaction.placement import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import INDEX, output_format
+    from gsmerge.io.formats.table import COLMAP, HTML, INDEX, output_format
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -114,16 +114,15 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     files = args.files(*args.scenes)
     default = default_output(files.base)
     out = output_file(args.output or default, default.name, site=writing.site)
-    chosen = output_format(out, levels=True, cameras=True)
-    streamed = out.name == INDEX
+    streamed, alone = out.name == INDEX, HTML.names(out) or COLMAP.names(out)
     if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if chosen.cameras and settings.budget.levels > 1:
+    if alone and settings.budget.levels > 1:
         raise UsageError(f"{out}: expected no --levels for a page or a COLMAP model")
-    if settings.budget.in_bytes and not chosen.each:
+    if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
         raise UsageError(f"{out}: expected a --budget in Gaussians for such files, got {settings.budget.budget}")
     levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not chosen.cameras else None
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not alone else None
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     inputs = (*input_files(files), *networks)
     beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
