@@ -26,7 +26,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.read import as_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.types import Scene, StrPath
+from gsmerge.types import Gaussians, Scene, StrPath
 
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
 
@@ -107,11 +107,9 @@ def clean_last(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
     """
     if not plan.cleans_last:
         return candidate
-    from gsmerge.stages.clean import clean
-
     _share_inside(prepared, plan)
     adopt(candidate.record)
-    gaussians, counts = clean(*_to_clean(candidate.fitted, prepared, plan))
+    gaussians, counts = _clean(candidate.fitted, prepared, plan)
     _note_clean(counts, len(gaussians), None, prepared)
     return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
@@ -139,14 +137,14 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     options = plan.clean
     if not options.asked:
         return build(prepared, plan, count)
-    from gsmerge.stages.clean import clean, faintest_dropped
+    from gsmerge.stages.clean import faintest_dropped
 
     share, most = _share_inside(prepared, plan), len(prepared.scene.finite_gaussians)
 
     def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
         with record_part() as record:
             fitted = build(prepared, plan, asked)
-            gaussians, counts = clean(*_to_clean(fitted, prepared, plan))
+            gaussians, counts = _clean(fitted, prepared, plan)
         add_seconds(record.seconds)
         return asked, replace(fitted, gaussians=gaussians), counts, record
 
@@ -167,10 +165,12 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
     return replace(fitted, gaussians=gaussians)
 
 
-def _to_clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Any, ...]:
-    """Return what :func:`gsmerge.stages.clean.clean` takes; placed cameras judge a scene, and do not show all of it."""
-    cameras = None if prepared.reference.placed else fitted.cameras
-    return fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave
+def _clean(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
+    """Clean up fitted Gaussians as :func:`gsmerge.stages.clean.clean`."""
+    from gsmerge.stages.clean import clean
+
+    cameras = None if prepared.reference.placed else fitted.cameras  # placed ones judge a scene, and do not show it all
+    return clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
 
 
 def _note_clean(counts: dict[str, int], left: int, count: int | None, prepared: Prepared) -> None:

@@ -49,7 +49,6 @@ SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
 GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
-PLACED = "no cameras: views are placed"
 HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
 
 
@@ -272,8 +271,9 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
     rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
-    load = _with_views(place_cameras_in_scene(rows, like, hints=options.hints, photos=photos), inside=photos)
-    if options.overlay is not None and any(note.startswith(PLACED) for note in load.notes):
+    own = place_cameras_in_scene(rows, like, hints=options.hints, photos=photos)
+    load = _with_views(own, inside=photos)
+    if options.overlay is not None and load is not own:
         load = replace(load, notes=(*load.notes, "overlay: these views count, so it says nothing of photos"))
     scenes = [load.scene.file_gaussians if same_file else first.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
@@ -293,7 +293,7 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     views = SceneViews(scene.cameras, NO_IMAGES, scene.names, tuple(range(len(scene))))
     notes = [text for text in record.notes if text != NO_VIEWS]  # that is for results
-    placed = f"{PLACED} {'around and inside' if inside else 'around'} the scene"
+    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
     return replace(load, scene=scene, views=views, notes=(*load.notes, *notes, placed))
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.frame import scene_frame
 from gsmerge.geometry import project
-from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur, sample_bilinear
 from gsmerge.measure.preview import Picture, contact_sheet, to_picture
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
+from gsmerge.measure.visibility import lift_pixels
 from gsmerge.raster import render
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.types import Cameras, Gaussians, Scene, Views
@@ -44,13 +44,13 @@ class Witnesses:
     gaussians: Gaussians
     views: Views  # canonical cameras, photos of at most SIDE pixels
     masks: np.ndarray | None  # [v,h,w] bool, where these count; None: everywhere
-    depths: dict[int, np.ndarray] = field(default_factory=dict)  # [h,w] camera z of a view; 0: nothing
+    looks: dict[int, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)  # of views that were drawn
 
-    def depth(self, view: int) -> np.ndarray:
-        """Draw the depth ``[h,w]`` of a view, once."""
-        if view not in self.depths:
-            self.depths[view] = _look(self.gaussians, self.views.cameras[[view]])[1]
-        return self.depths[view]
+    def look(self, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the picture and the depth of a view as :func:`look_from`, once."""
+        if view not in self.looks:
+            self.looks[view] = look_from(self.gaussians, self.views.cameras[[view]])
+        return self.looks[view]
 
 
 def call_witnesses(gaussians: Gaussians, views: Views, masks: np.ndarray | None = None) -> Witnesses:
@@ -68,18 +68,16 @@ def expected_errors(witnesses: Witnesses, camera: Cameras, own: int | None = Non
     photo does not count.
     """
     camera = shrink_cameras(camera, SIDE)
-    image, depth = _look(witnesses.gaussians, camera)
+    image, depth = look_from(witnesses.gaussians, camera) if own is None else witnesses.look(own)
     y, x = np.nonzero(depth > 0)
-    rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
-    pose = invert(camera.viewmats[0].astype(np.float64))
-    points = matmul(rays * depth[y, x, None], pose[:3, :3].T) + pose[:3, 3]
+    points = lift_pixels(depth, depth > 0, camera)
     sums, counts = np.zeros((2, len(points)), np.float32)
     for other in _nearest(witnesses.views.cameras, camera, own):
         cameras = witnesses.views.cameras[[other]]
         ((pixels,), (z,)), size = project(points, cameras), np.array([cameras.width, cameras.height])
         seen = np.flatnonzero((counts < COUNTED) & (z > 0) & ((pixels >= 0) & (pixels < size)).all(1))
         column, row = pixels[seen].astype(np.int64).T
-        shown = z[seen] < BEHIND * witnesses.depth(other)[row, column]
+        shown = z[seen] < BEHIND * witnesses.look(other)[1][row, column]
         seen = seen[shown if witnesses.masks is None else shown & witnesses.masks[other, row, column]]
         there = sample_bilinear(witnesses.views.images[other], *(pixels[seen].T - 0.5))
         sums[seen] += np.abs(there - image[y[seen], x[seen]]).mean(1)
@@ -98,7 +96,7 @@ def draw_errors(errors: np.ndarray) -> Picture:
     return np.where(np.isnan(errors)[..., None], UNKNOWN, np.stack(colors, 2)).round().astype(np.uint8)
 
 
-def _look(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
+def look_from(gaussians: Gaussians, camera: Cameras) -> tuple[np.ndarray, np.ndarray]:
     """Draw the picture ``[h,w,3]`` and the depth ``[h,w]``, 0 where nothing is opaque, of a camera."""
     drawn = render(gaussians, camera, near=NEAR_PLANE, with_depths=True)
     assert drawn.depths is not None
@@ -150,7 +148,8 @@ def draw_sheets(
             if own is not None and not (context and (scene.masks is None or scene.masks[view].any())):
                 continue
             camera = of.cameras[[view]]
-            drawn, errors = _look(witnesses.gaussians, camera)[0], expected_errors(witnesses, camera, own)
+            drawn, _ = look_from(witnesses.gaussians, camera) if own is None else witnesses.look(own)
+            errors = expected_errors(witnesses, camera, own)
             pictures = to_picture(of.images[view]), to_picture(drawn), draw_errors(errors)
             known = errors[~np.isnan(errors)]
             mean = f"error {known.mean():.3f}, " if len(known) else ""

@@ -37,11 +37,15 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
 def _rendered_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
-    depth, solid = drawn.depths[0].astype(np.float64), drawn.alphas[0] > _OPAQUE
-    y, x = np.nonzero(solid.reshape(depth.shape[:2]))
+    return lift_pixels(drawn.depths[0, ..., 0], drawn.alphas[0, ..., 0] > _OPAQUE, camera)
+
+
+def lift_pixels(depths: np.ndarray, shown: np.ndarray, camera: Cameras) -> Points:
+    """Return the points ``[n,3]``, world, at the ``depths [h,w]`` of the pixels ``shown [h,w]`` of a camera, by row."""
+    y, x = np.nonzero(shown)
     rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
     pose = invert(camera.viewmats[0].astype(np.float64))
-    return matmul(rays * depth.reshape(solid.shape[0], -1)[y, x, None], pose[:3, :3].T) + pose[:3, 3]
+    return matmul(rays * depths[y, x, None].astype(np.float64), pose[:3, :3].T) + pose[:3, 3]
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
