@@ -20,7 +20,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
-from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions
+from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
@@ -315,9 +315,8 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
-    asked = budget.quality is not None or budget.budget not in (None, AUTO, *DEVICES)
-    asked |= options.segment.superpixels != SHARE or options.decode.k != AUTO or options.method != OURS
-    asked |= options.checkpoint not in ("auto", "none")  # networks alone seldom come so near
+    # networks and other methods alone seldom come so near
+    asked = budget.quality is not None or options.decided(lambda one: one.counts or one.replaces)
     return not (asked or scene.aligned or (budget.auto and not scene.rendered))
 
 
@@ -337,15 +336,14 @@ def merges_pairs(scene: SceneSize, options: CompactOptions) -> bool:
 
     Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
     """
-    segment, decode = replace(options.segment, superpixels=SHARE), replace(options.decode, k=DecodeOptions().k)
-    usual = (segment, options.match, decode) == (SegmentOptions(), MatchOptions(), DecodeOptions())
+    usual = not options.changed(lambda one: one.acts_on == "superpixels" and not one.counts)
     ours = options.method == OURS and choose_networks(options, scene) == "none"
     return ours and (scene.num_views == 0 or (usual and scene.rendered))
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     """Return whether a scene is merged by positions and colours only: it has no views, and no option needs one."""
-    return len(scene) == 0 and options.method == OURS and options.checkpoint in ("auto", "none")
+    return len(scene) == 0 and not options.decided(lambda one: one.replaces)
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
@@ -467,11 +465,11 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     With K = 1, 4.4 % of the pixels of one photo are too few to show it; with more views each view has Gaussians of its
     own.
     """
-    decode, budget, segment = options.decode, options.budget, options.segment
+    decode = options.decode
     if decode.k != AUTO:
         return decode
-    asked = budget != BudgetOptions() or segment.superpixels != SHARE
-    other = options.method != OURS or options.recipe is not None or options.checkpoint not in ("auto", "none")
+    asked = options.budget.quality is not None or options.changed(lambda one: one.counts)
+    other = options.decided(lambda one: one.replaces)
     fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)

@@ -6,7 +6,7 @@ A package adds one by an entry point of the group ``gsmerge.methods`` that names
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from gsmerge.errors import UsageError
@@ -88,17 +88,13 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
-    default, used = CompactOptions().to_dict(), {*method.uses, *names_of(CompactOptions, lambda one: one.common)}
-    unused = [name for name, value in options.to_dict().items() if name not in used and value != default[name]]
+    unused = [name for name in options.changed(lambda one: not one.common) if name not in method.uses]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 
 
 def _unused_alone(options: CompactOptions) -> list[str]:
     """Note changed settings that have no effect on a scene without views."""
-    parts = (options.prepare, options.segment, options.match, options.decode)
-    names = {field.name for part in parts for field in fields(part)} - {*COUNTS}
-    default, given = CompactOptions().to_dict(), options.to_dict()
-    unused = [name for name in given if name in names and given[name] not in (default[name], "none")]
+    unused = options.decided(lambda one: one.acts_on and not one.counts)
     return [f"without cameras these are not used: {', '.join(unused)}"] if unused else []
 
 

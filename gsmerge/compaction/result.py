@@ -269,7 +269,7 @@ def make_result(
     before = None if input_score is None else input_score.psnr
     on_files = measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
     rendered = prepared.reference.name == RENDERS
-    comparable = prepared.reference.of_views and not plan.clean.hides
+    comparable = prepared.reference.of_views and not plan.clean.hiding
     pictures = OWN_PHOTOS if prepared.reference.name == PHOTOS else prepared.reference.name
     measured = [
         measure_besides(
@@ -295,7 +295,7 @@ def make_result(
             return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
         compared = (covered.before, covered.after) if covered else (before, shown)
         worse = describe_loss(name, *compared, pictures) if comparable else None
-        if rendered and candidate is best and not plan.clean.hides:  # coarser levels are meant to differ
+        if rendered and candidate is best and not plan.clean.hiding:  # coarser levels are meant to differ
             worse = describe_distance(candidate.psnr)
         return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
 

@@ -28,7 +28,8 @@ class BudgetOptions(Settings):
         "scene needs.",
         "A size is that of the output's file, a `.ply` in Python, and never exceeded. No more is taken than new views "
         "gain from, unless `fill` is true.",
-        metavar="40000|2%|5MB|DEVICE|auto", counts=True, uncut=(AUTO,), in_trial=None)  # fmt: skip
+        metavar="40000|2%|5MB|DEVICE|auto", counts=True, neutral=(AUTO, *DEVICES), uncut=(AUTO,),
+        in_trial=None)  # fmt: skip
     fill: bool = setting(False, "Whether shares, sizes and devices are filled.")
     most: int | None = setting(None, "Gaussians from which on new views gain nothing, where that is known.",
         internal=True)  # fmt: skip
@@ -43,7 +44,8 @@ class BudgetOptions(Settings):
     )
     levels: int = setting(1, "Levels of detail, each in a file of its own or all in a lod-meta.json, with a quarter of "
         "the Gaussians of the one before.",
-        "Each is fitted by itself.", least=1, most=8, whole="name", in_trial=1)  # fmt: skip
+        "Each is fitted by itself.", least=1, most=8, whole="name", in_trial=1,
+        in_batches=False)  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,6 +58,12 @@ class BudgetOptions(Settings):
             parse_budget(self.budget, sys.maxsize)
         if self.quality is not None:
             parse_quality(self.quality)
+
+    @property
+    def searching(self) -> list[str]:
+        """Names of what is asked for that takes several results, of which the scene says which."""
+        asked = {"budget auto": self.auto, "levels": self.levels > 1, f"quality {self.quality}": self.quality}
+        return [name for name, is_asked in asked.items() if is_asked]
 
     @property
     def auto(self) -> bool:

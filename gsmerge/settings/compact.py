@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
-from gsmerge.settings.setting import MOST_THREADS, Settings, change_settings, flat_settings, setting, settings_of
+from gsmerge.settings.setting import (
+    MOST_THREADS,
+    Setting,
+    Settings,
+    change_settings,
+    flat_settings,
+    setting,
+    settings_of,
+)
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -51,26 +59,29 @@ class CompactOptions(Settings):
         (2, 'draft')
     """
 
-    prepare: PrepareOptions = setting(PrepareOptions(), "What may be changed before anything is merged.")
-    segment: SegmentOptions = setting(SegmentOptions(), "Superpixels.")
-    match: MatchOptions = setting(MatchOptions(), "Merging across views.")
-    decode: DecodeOptions = setting(DecodeOptions(), "Gaussians per group.")
+    prepare: PrepareOptions = setting(
+        PrepareOptions(), "What may be changed before anything is merged.", acts_on="views"
+    )
+    segment: SegmentOptions = setting(SegmentOptions(), "Superpixels.", acts_on="superpixels")
+    match: MatchOptions = setting(MatchOptions(), "Merging across views.", acts_on="superpixels")
+    decode: DecodeOptions = setting(DecodeOptions(), "Gaussians per group.", acts_on="superpixels")
     fit: FitOptions = setting(FitOptions(), "Fit to the photos.")
     clean: CleanOptions = setting(CleanOptions(), "What is left out of the result.")
     budget: BudgetOptions = setting(BudgetOptions(), "What decides the number of Gaussians.")
     blocks: BlockOptions = setting(BlockOptions(), "Parts in which scenes of many views are compacted.")
     method: str = setting(OURS, "gsmerge, or a baseline to compare it with, such as voxel or contribution.",
         "All but `gsmerge` need a number of Gaussians.", choices=method_names, metavar="NAME", common=True,
-        whole="value")  # fmt: skip
+        whole="value", replaces=True)  # fmt: skip
     effort: str = setting("default", "Quality for time: best is sharper and takes three times as "
         "long; fast and draft take less than half.",
         "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",
         "They do if no fit follows; a draft or a fast run uses only their decoder heads.",
-        metavar="FILE|NAME")  # fmt: skip
+        metavar="FILE|NAME", neutral=("none",), replaces=True)  # fmt: skip
     recipe: str | None = setting(None, "Settings that belong together. paper: the superpixel merging paper's own "
-        "method, with networks that have absolute outputs.", choices=tuple(RECIPES), in_trial=None)  # fmt: skip
+        "method, with networks that have absolute outputs.", choices=tuple(RECIPES), in_trial=None,
+        replaces=True)  # fmt: skip
     require_checkpoint: bool = setting(False, "A checkpoint that cannot be used is an error, instead of a note and the "
         "analytic stages.")  # fmt: skip
     new_views: bool | None = setting(None, "Estimate what a new viewpoint gains, from photos that a short fit leaves "
@@ -87,28 +98,28 @@ class CompactOptions(Settings):
             raise ValueError(f'recipe paper: expected a checkpoint with absolute outputs, got "{self.checkpoint}"')
         if self.require_checkpoint and self.checkpoint == "none":
             raise ValueError('require_checkpoint: expected a checkpoint, got "none"')
-        for name, wanted in {"crop": self.clean.crop is not None, "drop sky": "sky" in self.clean.drops}.items():
-            if wanted and self.budget.target_psnr is not None:
-                quality = f"quality {self.budget.quality}"
-                raise ValueError(
-                    f"{name}: expected a budget or superpixels, got {quality}: photos show what it leaves out"
-                )
-        if self.method == OURS:
-            return
-        asked = {"budget auto": self.budget.auto, "levels": self.budget.levels > 1}
-        asked |= {f"quality {self.budget.quality}": self.budget.quality is not None}
-        for name in (name for name, wanted in asked.items() if wanted):
+        for name in self.clean.hiding if self.budget.target_psnr is not None else ():
+            quality = f"quality {self.budget.quality}"
+            raise ValueError(f"{name}: expected a budget or superpixels, got {quality}: photos show what it leaves out")
+        for name in self.budget.searching if self.method != OURS else ():
             raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
+
+    def changed(self, is_one: Callable[[Setting], Any]) -> list[str]:
+        """Return the flat names of settings with a declaration as asked for whose values are not the defaults."""
+        values, declared = self.to_dict(), flat_settings(CompactOptions)
+        return [name for name, one in declared.items() if is_one(one) and values[name] != one.default]
+
+    def decided(self, is_one: Callable[[Setting], Any]) -> list[str]:
+        """Return those of the changed settings whose values are not neutral: they leave less to the scene."""
+        values, declared = self.to_dict(), flat_settings(CompactOptions)
+        return [name for name in self.changed(is_one) if values[name] not in declared[name].neutral]
 
     @property
     def whole_only(self) -> list[str]:
         """Names of the settings in use that require the scene in one piece."""
-        values, names = self.to_dict(), list[str]()
-        for name, declared in flat_settings(CompactOptions).items():
-            if declared.whole == "value" and values[name] != declared.default:
-                names += [f"{name} {part.strip()}" for part in str(values[name]).split(",")]
-            elif declared.whole and values[name] != declared.default:
-                names.append(name)
+        values, names = self.to_dict(), self.changed(lambda one: one.whole == "name")
+        for name in self.changed(lambda one: one.whole == "value"):
+            names += [f"{name} {part.strip()}" for part in str(values[name]).split(",")]
         return names
 
     @property
@@ -119,9 +130,8 @@ class CompactOptions(Settings):
 
     @property
     def compact_only(self) -> list[str]:
-        """Names of the settings in use that ``extend`` cannot honour."""
-        asked = self.blocks.blocks
-        return [*self.whole_only, *([f"blocks {asked}"] if isinstance(asked, int) else [])]
+        """Names of the settings in use that Feature Gaussians of ``extend`` cannot honour."""
+        return [*self.whole_only, *self.blocks.asked]
 
     def to_dict(self) -> dict[str, Any]:
         """Return all settings by their flat names, as plain values."""

@@ -27,6 +27,6 @@ def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendO
     given = {"effort": "draft"} | dict(settings)
     extend_options = ExtendOptions(**{name: given.pop(name) for name in names if name in given})
     options = CompactOptions().with_settings(given)
-    if options.budget.levels > 1:
-        raise ValueError("levels: go with a whole scene, not with views that come one after the other; use compact")
+    for name in options.changed(lambda one: not one.in_batches):
+        raise ValueError(f"{name}: go with a whole scene, not with views that come one after the other; use compact")
     return options, extend_options

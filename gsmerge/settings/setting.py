@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from inspect import cleandoc
 from math import inf
 from numbers import Integral, Real
@@ -37,6 +38,11 @@ class Setting:
     filled: bool = False  # whether a list has at least one value
     internal: bool = False  # whether the program sets it, and no user by name
     counts: bool = False  # whether it decides how many Gaussians there are
+    neutral: tuple[Any, ...] = ()  # values besides the default with which it decides nothing itself
+    replaces: bool = False  # whether it puts something else in the place of the stages' closed formulas
+    in_batches: bool = True  # whether a batch of views can have a value other than the default
+    # Of a group: whether its settings say how views become superpixels, or what views are used for besides
+    acts_on: Literal["", "views", "superpixels"] = ""
     common: bool = False  # whether every method uses it, baselines too
     # Whether a value other than the default needs the scene in one piece, and what messages call it: "name", or "value"
     # for name and value; and values for which a scene is not cut unless blocks are asked for
@@ -185,12 +191,14 @@ def settings_of(options: type) -> dict[str, Setting]:
     return _declared[options]
 
 
+@cache
 def flat_settings(options: type) -> dict[str, Setting]:
     """Return all settings by flat name; the settings of a stage replace the stage."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
-            flat |= flat_settings(declared.kind) if declared.is_group else {name: declared}
+            inner = flat_settings(declared.kind) if declared.is_group else {name: declared}
+            flat |= {name: replace(one, acts_on=one.acts_on or declared.acts_on) for name, one in inner.items()}
     return flat
 
 

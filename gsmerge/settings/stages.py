@@ -104,7 +104,7 @@ class MatchOptions(Settings):
     match: Method | None = setting(None, "How Feature Gaussians of different views are merged.",
         "`overlap`: Bhattacharyya coefficient, similar colours, star clusters that cannot chain. `aabb`, as in the "
         "paper (section 4.4): box IoU, similar latents, connected components. By default `overlap`, but `none` in a "
-        "draft.")  # fmt: skip
+        "draft.", neutral=("none",))  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of `overlap`.", least=0, most=1)
     iou: float = setting(0.2, "Least IoU of the boxes of `aabb` (tau_g).", least=0, most=1)
     similarity: float = setting(0.8, "Least cosine of the latents of `aabb` (tau_f).",
@@ -193,9 +193,9 @@ class CleanOptions(Settings):
         return self.crop is not None or bool(self.drops)
 
     @property
-    def hides(self) -> bool:
-        """Whether the clean-up removes things that photos show."""
-        return self.crop is not None or "sky" in self.drops
+    def hiding(self) -> list[str]:
+        """Names of what is asked for that removes things which photos show."""
+        return [name for name, asked in {"crop": self.crop, "drop sky": "sky" in self.drops}.items() if asked]
 
 
 def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
@@ -244,3 +244,8 @@ class BlockOptions(Settings):
         "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
         metavar="auto|none|NUMBER", in_part="none")  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
+
+    @property
+    def asked(self) -> list[str]:
+        """What messages call a number of blocks; empty without one."""
+        return [f"blocks {self.blocks}"] if isinstance(self.blocks, int) else []
