@@ -378,9 +378,12 @@ def build_section(run: Run) -> str:
         text(
             "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
             f"Gaussians with the largest errors, until there are {len(fitted.gaussians):,}; of the pixel's Gaussian",
-            f"{len(children)} are made. Parts of every photo are kept from the fit as a test:",
+            f"{len(children)} are made. Patches of every photo stay out of the first steps, at half size, as a test:",
             f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
-            say("so the fit is accepted. Without a gain the start would be the result.", report.accepted),
+            say(
+                "so the fit is accepted. Otherwise colours alone would be fitted.",
+                report.accepted and report.method == "full",
+            ),
         ),
     ])  # fmt: skip
 
