@@ -1,0 +1,513 @@
+"""Writes docs/internals/one-run.md and its picture: a small scene, step by step through a run.
+
+python docs/one_run.py          # write the page and the picture where they differ from the program
+python docs/one_run.py --check  # name them, exit code 1 if there are any; write nothing
+
+Functions of the package are watched while `gsmerge.compact` works, so all values are those of one true run. There is
+one function for each section of the page, which has its prose beside its values. A sentence that not every run makes
+true goes through :func:`say` with its condition: where that no longer holds, the script stops and names the sentence.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+from skimage.segmentation import find_boundaries
+
+import gsmerge
+from gsmerge.geometry import covariances, project
+from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
+
+DOCS = Path(__file__).parent
+PAGE, PICTURE = DOCS / "internals" / "one-run.md", DOCS / "images" / "one-run.jpg"
+NOTICE = "<!-- Made by docs/one_run.py from a run: change the text there and run it again. -->"
+VIEWS, WIDTH, HEIGHT, SEED = 4, 96, 64, 2
+VIEW, X, Y = 1, 38, 28  # the pixel that the page follows
+ROW = (VIEW * HEIGHT + Y) * WIDTH + X
+LINE = 120  # characters of a line of the page
+WATCHED = {
+    "gsmerge.scene.read": ("align",),
+    "gsmerge.compaction.compact": ("make_plan", "make_result"),
+    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
+}
+ZOOM, STRIP, GAP = 4, 22, 6  # of the picture: its pixels for each of a photo, for a title, between panels
+DARK, BORDER = 0.45, (255, 255, 255)  # how much of the photo is left under ellipses; colours are RGB
+ALONE, SEVERAL, FOLLOWED = (255, 210, 60), (90, 230, 255), (255, 70, 200)
+JPEG = [cv2.IMWRITE_JPEG_QUALITY, 85]
+SAME = 1.0  # mean difference of two pictures, of 255, that versions of OpenCV may draw
+
+
+class UntrueError(Exception):
+    """A sentence of this script that the run does not make true."""
+
+
+def main() -> int:
+    """Write the page and the picture, or name what is stale."""
+    check = "--check" in sys.argv[1:]
+    try:
+        run = watch_run()
+        page, picture = make_page(run), draw_picture(run)
+    except UntrueError as error:
+        print(f"docs/one_run.py: no longer true, rewrite it: {error}")
+        return 1
+    stale = []
+    if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != page:
+        stale.append(PAGE)
+        if not check:
+            PAGE.write_text(page, encoding="utf-8")
+    if not is_same(picture):
+        stale.append(PICTURE)
+        if not check:
+            PICTURE.write_bytes(picture)
+    for path in stale:
+        print(path.relative_to(DOCS.parent))
+    return 1 if stale and check else 0
+
+
+def is_same(picture: bytes) -> bool:
+    """Return whether the stored picture shows the same below its titles, up to what versions of OpenCV differ in."""
+    if not PICTURE.is_file():
+        return False
+    new, stored = (cv2.imdecode(np.frombuffer(data, np.uint8), 1) for data in (picture, PICTURE.read_bytes()))
+    if stored is None or stored.shape != new.shape:
+        return False
+    drawn = np.arange(GAP, len(new) + GAP) % (STRIP + GAP + HEIGHT * ZOOM) >= STRIP + GAP
+    return float(np.abs(stored.astype(float) - new)[drawn].mean()) < SAME
+
+
+# The run
+
+
+@dataclass(frozen=True)
+class Run:
+    """Arguments and results of the first call of each watched function, by its name, and what `compact` returned."""
+
+    given: dict[str, tuple[Any, ...]]
+    made: dict[str, Any]
+    result: gsmerge.CompactResult
+
+    @property
+    def prepared(self) -> Any:
+        """What `prepare` made, as the plan gets it."""
+        return self.given["make_plan"][0]
+
+    @property
+    def label(self) -> int:
+        """The superpixel of the pixel that the page follows."""
+        return int(self.made["segment_scene"].groups.labels[VIEW, Y, X])
+
+    @property
+    def feature(self) -> int:
+        """The Feature Gaussian of that pixel."""
+        return holder(self.made["correct"])
+
+    @property
+    def merged(self) -> int:
+        """The same after merging across views."""
+        return holder(self.made["merge"])
+
+    @property
+    def fitted(self) -> np.ndarray:
+        """The Gaussians of the result that come from it."""
+        return np.flatnonzero(self.made["fit_scene"].report.origins == self.merged)
+
+
+def holder(features: Any) -> int:
+    """Return the Feature Gaussian that has the followed row as a member."""
+    at = int(np.flatnonzero(features.members == ROW)[0])
+    return int(np.searchsorted(features.starts, at, side="right")) - 1
+
+
+def watch_run() -> Run:
+    """Make the scene, compact it with the defaults, and keep what the watched functions got and returned."""
+    given: dict[str, tuple[Any, ...]] = {}
+    made: dict[str, Any] = {}
+
+    def watched(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            result = function(*args, **kwargs)
+            if name not in made:  # later calls are those of the trial that estimates new views
+                given[name], made[name] = args, result
+            return result
+
+        return call
+
+    with ExitStack() as stack:
+        folder = stack.enter_context(made_scene())
+        for module, names in WATCHED.items():
+            for name in names:
+                place = import_module(module)
+                stack.enter_context(mock.patch.object(place, name, watched(name, getattr(place, name))))
+        result = gsmerge.compact(folder)
+    return Run(given, made, result)
+
+
+@contextmanager
+def made_scene() -> Iterator[Path]:
+    """Write the scene into a folder that is removed in the end."""
+    export = NoiseOptions(sh_degrees=(0,), constant_opacity=0.0, unit=(1.0, 1.0))  # a usual export, in metres
+    options = GenerateOptions(views=VIEWS, width=WIDTH, height=HEIGHT, ranges=export)
+    with tempfile.TemporaryDirectory() as folder:
+        yield generate_scene(Path(folder) / "scene", options, seed=SEED)
+
+
+# The page
+
+
+def say(sentence: str, holds: bool) -> str:
+    """Return a sentence that the run makes true; UntrueError where it does not."""
+    if not holds:
+        raise UntrueError(sentence)
+    return sentence
+
+
+def text(*sentences: str) -> str:
+    """Join sentences to a paragraph, in lines of the page's length."""
+    return textwrap.fill(" ".join(sentences), LINE, break_long_words=False, break_on_hyphens=False)
+
+
+def entry(name: str, values: Any, row: Any = None, digits: int = 2) -> str:
+    """Return a line for an array, with its shape and one row of it; or for a value alone."""
+    if not isinstance(values, np.ndarray):
+        return f"- `{name}`: {values}"
+    shape = ", ".join(map(str, values.shape))
+    shown = np.asarray(values if row is None else values[row])
+    is_real = np.issubdtype(shown.dtype, np.floating)
+    cells = [f"{round(float(cell), digits) + 0.0:.{digits}f}" if is_real else f"{cell}" for cell in shown.flat]
+    return f"- `{name}` [{shape}] {values.dtype}: {', '.join(cells)}"
+
+
+def make_page(run: Run) -> str:
+    """Return the text of the page."""
+    sections = (head, align_section, prepare_section, plan_section, build_section, result_section)
+    return "\n\n".join(section(run) for section in sections) + "\n"
+
+
+def head(run: Run) -> str:
+    """Say which scene it is and what the picture shows."""
+    count = run.prepared.input_scene.num_gaussians
+    return "\n\n".join([
+        f"{NOTICE}\n\n# One run",
+        text(
+            f"This page follows a scene of {count:,} Gaussians through a run with the default settings,",
+            "`gsmerge.compact(folder)`. The [generator](lab.md) makes the scene:",
+            f"{VIEWS} photos of {WIDTH} x {HEIGHT} pixels of a room, their cameras, and a `scene.ply` with one",
+            "Gaussian per pixel, which has the errors of a depth that a network predicts.",
+            "[Architecture](architecture.md) names the rooms of the code, and",
+            "[conventions](../reference/conventions.md) explain names and words.",
+        ),
+        text(
+            "Every list gives arrays with shape and type, and the values of one row. The row is that of",
+            f"pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
+        ),
+        f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
+        text(
+            f"All panels show view {VIEW}. Ellipses are contours at one standard deviation. Yellow ones stand for",
+            "pixels of this view alone, blue ones for pixels of several views, and pink is what the pixel has become.",
+        ),
+    ])  # fmt: skip
+
+
+def align_section(run: Run) -> str:
+    """Say which row is which pixel."""
+    ply, camera_file = run.given["align"][:2]
+    made = run.made["align"]
+    recovery, best = made.recovery, made.recovery.best
+    return "\n\n".join([
+        "## 1. align: which row is which pixel",
+        text(
+            "[`alignment/rows_first.py`](../../gsmerge/alignment/rows_first.py) gets the rows, the cameras and the",
+            "photos, and returns the pixel of every row.",
+        ),
+        "\n".join([
+            entry("ply.gaussians.means", ply.gaussians.means, ROW),
+            entry("ply.gaussians.opacities", ply.gaussians.opacities, ROW),
+            entry("camera_file.viewmats", camera_file.viewmats, (VIEW, slice(3), 3)) + " (column 3 of view 1)",
+            entry("result.pixel_ids", made.pixel_ids, ROW),
+        ]),
+        text(
+            "A `.ply` does not say which pixel a row belongs to, and exporters differ. `align` assumes an order,",
+            "projects every Gaussian into the camera of its pixel, and measures the distance from the pixel's centre.",
+            say(
+                f'Here the first reading, "{best.description}", decides: the median distance is',
+                best.layout.is_plain and best.effort == 0,
+            ),
+            f"{best.alignment.middle_px:.2f} pixels, {recovery.margin:.0f} times less than with shuffled pixels.",
+            say(
+                f"So row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and the scene is aligned:",
+                int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.aligned,
+            ),
+            say(
+                "every pixel is stored and valid, none is missing.",
+                bool(run.prepared.input_scene.stored.all()) and run.prepared.input_scene.num_missing == 0,
+            ),
+        ),
+    ])  # fmt: skip
+
+
+def prepare_section(run: Run) -> str:
+    """Say what is known before the first choice."""
+    prepared = run.prepared
+    agreement, frame = prepared.agreement, prepared.frame
+    return "\n\n".join([
+        "## 2. prepare: what is known first",
+        text(
+            "[`facts/prepare.py`](../../gsmerge/facts/prepare.py) moves the scene into its canonical frame and",
+            "collects facts.",
+        ),
+        "\n".join([
+            entry("frame.origin", frame.origin),
+            entry("frame.unit", frame.unit),
+            entry("scene.gaussians.means", prepared.scene.gaussians.means, ROW),
+            entry("scene.images", prepared.scene.images, (VIEW, Y, X)),
+            entry("reference.name", prepared.reference.name),
+            entry("agreement.confirmed", f"{agreement.confirmed:.2f}"),
+            entry("moved", prepared.moved),
+        ]),
+        text(
+            "The frame has its origin in the middle of the scene. Its unit is a power of two near the median depth, so",
+            "thresholds mean the same in every scene, and scaling changes no bit.",
+            say(
+                "The photos show what the Gaussians show, so they are the reference of the fit and of all scores;",
+                prepared.reference.name == "photos" and prepared.reference.fit_views == tuple(range(VIEWS)),
+            ),
+            "otherwise colours of the rows, or renders, would stand in for them.",
+            f"Other views confirm the depth of {100 * agreement.confirmed:.0f} % of the pixels.",
+            say("No exposure is changed and no camera moves, because the photos agree as they are.",
+                not prepared.moved and prepared.reference.photo_files is None),
+        ),
+    ])  # fmt: skip
+
+
+def plan_section(run: Run) -> str:
+    """Say what is decided before anything is built."""
+    plan, pixels = run.made["make_plan"], WIDTH * HEIGHT
+    limits, first = plan.limits, int(plan.limits.per_view * plan.superpixels.start_share)
+    return "\n\n".join([
+        "## 3. make_plan: every decision",
+        text(
+            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`. No later step reads an option.",
+        ),
+        "\n".join([
+            entry("limits.per_view", limits.per_view),
+            entry("limits.default", f"{limits.default:,}"),
+            entry("superpixels.start_share", plan.superpixels.start_share),
+            entry("decode.k", plan.decode.k),
+            entry("match.match", plan.match.match),
+            entry("fit.steps", plan.fit.steps),
+            entry("checkpoint", plan.checkpoint),
+        ]),
+        text(
+            say(
+                f"No option asks for a number, and the scene is aligned, so {plan.settings['superpixels']} of the",
+                limits.exact is None and not plan.keeps_input and plan.target_psnr is None,
+            ),
+            f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",
+            f"{limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",
+            say(
+                f"{first} for each view, and adds the others where the photos show the largest errors.",
+                plan.fit.grows and not plan.merges_pairs,
+            ),
+            say(
+                "Networks stay out, since a fit to photos gains more than they do.",
+                plan.checkpoint is None and run.prepared.reference.of_views,
+            ),
+        ),
+    ])  # fmt: skip
+
+
+def build_section(run: Run) -> str:
+    """Say what each arrow makes."""
+    made, at = run.made, run.feature
+    groups, features, matches = made["segment_scene"].groups, made["correct"], made["match"]
+    merged, decoded, fitted = made["merge"], made["decode_merged"], made["fit_scene"]
+    plan, children = made["make_plan"], run.fitted
+    size = int(np.diff(features.starts)[at])
+    own = np.flatnonzero(matches.clusters == matches.clusters[at])
+    faint = int((features.gains < 1).sum())
+    report = fitted.report
+    return "\n\n".join([
+        "## 4. build: the arrows",
+        text(
+            "[`pipeline.py`](../../gsmerge/pipeline.py) calls one file of `stages/` after another, and then `fit/`.",
+            "The names of functions begin the lines.",
+        ),
+        "\n".join([
+            entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
+            entry("encode, correct: features.means", features.means, at),
+            entry("features.covars", features.covars, (at, [0, 1, 2], [0, 1, 2]), 4) + " (the diagonal)",
+            entry("features.gains", features.gains, at),
+            entry("match: clusters", matches.clusters, at),
+            entry("merge: features.means", merged.means, run.merged),
+            entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
+            entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
+        ]),
+        text(
+            "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
+            say(f"Each view has {groups.counts[0]};", len(set(groups.counts)) == 1),
+            f"the pixel belongs to number {run.label}, with {size} pixels.",
+            "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
+            "weighted by their opacities.",
+            f"**`correct`** lowers the gain of {faint} of the {len(features)}, because other views see through them",
+            say("and their depth is likely wrong.", plan.weakens and faint > 0),
+        ),
+        text(
+            "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and thus",
+            say(
+                f"show one surface. Those of views {', '.join(map(str, features.views[own][:-1]))} and"
+                f" {features.views[own][-1]} form the pixel's cluster.",
+                len(own) > 1 and plan.match.match == "overlap",
+            ),
+            f"**`merge`** turns {len(features)} into {len(merged)}, one for each cluster; `views` is",
+            say("-1 where several views were merged.", int(merged.views[run.merged]) == -1),
+            "**`decode_merged`** makes a Gaussian of each, with an opacity that keeps the optical depth of its",
+            "members.",
+            say("K is 1, so no superpixel gets more.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
+        ),
+        text(
+            "**`fit_scene`** compares renders with the photos and changes all parameters. Half way it splits the",
+            f"Gaussians with the largest errors, until there are {len(fitted.gaussians):,}; of the pixel's Gaussian",
+            f"{len(children)} are made. Patches of every photo stay out of the first steps, at half size, as a test:",
+            f"their PSNR rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
+            say(
+                "so the fit is accepted. Otherwise colours alone would be fitted.",
+                report.accepted and report.method == "full",
+            ),
+        ),
+    ])  # fmt: skip
+
+
+def result_section(run: Run) -> str:
+    """Say what comes out, and how good it is."""
+    result, new = run.result, run.result.report.new_views
+    gaussians, report, child = result.gaussians, result.report, run.fitted[0]
+    return "\n\n".join([
+        "## 5. make_result: what comes out",
+        text(
+            "[`compaction/result.py`](../../gsmerge/compaction/result.py) moves the Gaussians back into the world of",
+            "the file, and measures result and input alike.",
+        ),
+        "\n".join([
+            entry("result.gaussians.means", gaussians.means, child),
+            entry("result.gaussians.opacities", gaussians.opacities, child),
+            entry("report.psnr_before", f"{report.psnr_before:.2f}"),
+            entry("report.psnr_after", f"{report.psnr_after:.2f}"),
+            entry("report.new_views", f"{new.low:+.1f} to {new.high:+.1f} dB"),
+        ]),
+        text(
+            f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",
+            say(
+                "They show the photos better than the input does, whose depths are wrong here and there.",
+                report.psnr_after > report.psnr_before,
+            ),
+            "The fit has seen these photos, so the report also says how much PSNR views gain that no photo shows. It",
+            say(
+                "estimates this by runs that leave photos out. A warning would follow if the result were worse.",
+                report.worse is None and new.low > 0,
+            ),
+        ),
+    ])  # fmt: skip
+
+
+# The picture
+
+
+def draw_picture(run: Run) -> bytes:
+    """Draw six panels of one view as a JPEG: photo, superpixels, Feature Gaussians, merged, fitted, result."""
+    prepared, features, merged = run.prepared, run.made["correct"], run.made["merge"]
+    photo, labels = enlarge(prepared.scene.images[VIEW]), enlarge(run.made["segment_scene"].groups.labels[VIEW])
+    dark = to_bytes(DARK * photo)
+    cut = to_bytes(photo)
+    cut[find_boundaries(labels, mode="inner")] = BORDER
+    cut[(labels == run.label) & find_boundaries(labels == run.label, mode="inner")] = FOLLOWED
+    spot = to_bytes(photo)
+    cv2.rectangle(spot, (X * ZOOM - 1, Y * ZOOM - 1), ((X + 1) * ZOOM, (Y + 1) * ZOOM), FOLLOWED, 1)
+    fitted, cameras = run.made["fit_scene"], prepared.scene.cameras[[VIEW]]
+    own, kept = np.flatnonzero(features.views == VIEW), np.flatnonzero(has_members(merged))
+    children = np.flatnonzero(np.isin(fitted.report.origins, kept))
+    origins, after = fitted.report.origins[children], fitted.gaussians[children]
+    spread = covariances(after.quats.astype(float), after.scales.astype(float))
+    yellow = np.zeros(len(own), bool)
+    panels = [
+        ("photo", spot),
+        (f"{len(np.unique(labels))} superpixels", cut),
+        (
+            f"{len(own)} Feature Gaussians",
+            draw_ellipses(dark, features.means[own], features.covars[own], cameras, own == run.feature, yellow),
+        ),
+        (
+            f"{len(kept)} merged across views",
+            draw_ellipses(
+                dark, merged.means[kept], merged.covars[kept], cameras, kept == run.merged, merged.views[kept] < 0
+            ),
+        ),
+        (
+            f"{len(children)} fitted",
+            draw_ellipses(dark, after.means, spread, cameras, origins == run.merged, merged.views[origins] < 0),
+        ),
+        ("result, from all Gaussians", to_bytes(enlarge(gsmerge.render(fitted.gaussians, cameras).images[0]))),
+    ]
+    titled = [add_title(f"{number} {title}", panel) for number, (title, panel) in enumerate(panels, 1)]
+    rows = [np.concatenate(titled[first : first + 3], 1) for first in (0, 3)]
+    whole = np.concatenate(rows)[GAP:, GAP:]
+    return bytes(cv2.imencode(".jpg", whole[..., ::-1], JPEG)[1])
+
+
+def has_members(features: Any) -> np.ndarray:
+    """Return which Feature Gaussians have a pixel of the view among their members, ``[g]`` bool."""
+    of_view = features.members // (WIDTH * HEIGHT) == VIEW
+    return np.logical_or.reduceat(of_view, features.starts[:-1])
+
+
+def enlarge(image: np.ndarray) -> np.ndarray:
+    """Enlarge an image to the size of a panel."""
+    return image.repeat(ZOOM, 0).repeat(ZOOM, 1)
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Return an image in [0, 1] as bytes."""
+    return np.ascontiguousarray(np.round(image.clip(0, 1) * 255).astype(np.uint8))
+
+
+def draw_ellipses(
+    picture: np.ndarray, means: np.ndarray, covars: np.ndarray, cameras: Any, followed: np.ndarray, shared: np.ndarray
+) -> np.ndarray:
+    """Draw the contours at one standard deviation of Gaussians, far ones first and ``followed [g]`` ones last.
+
+    ``shared [g]``: those of several views.
+    """
+    picture, rotation, K = picture.copy(), cameras.viewmats[0, :3, :3].astype(float), cameras.Ks[0].astype(float)
+    (places,), (depths,) = project(means, cameras)
+    for i in np.lexsort((-depths, followed)).tolist():
+        x, y = (places[i] - K[:2, 2]) / (K[0, 0], K[1, 1])  # slopes of the ray
+        lens = np.array([[K[0, 0], 0, -K[0, 0] * x], [0, K[1, 1], -K[1, 1] * y]]) / depths[i]
+        flat = lens @ rotation @ covars[i].astype(float) @ rotation.T @ lens.T
+        variances, axes = np.linalg.eigh(flat)
+        angle = float(np.degrees(np.arctan2(axes[1, 1], axes[0, 1])))  # of the longer axis
+        sides = np.sqrt(variances[::-1].clip(0)) * ZOOM
+        numbers = (np.round(16 * values).astype(int).tolist() for values in (places[i] * ZOOM - 0.5, sides))
+        color = FOLLOWED if followed[i] else SEVERAL if shared[i] else ALONE
+        cv2.ellipse(picture, *numbers, angle, 0, 360, color, 1, cv2.LINE_AA, 4)  # in sixteenths of a pixel
+    return picture
+
+
+def add_title(title: str, panel: np.ndarray) -> np.ndarray:
+    """Put a title above a panel, and white around both."""
+    framed = np.pad(panel, ((STRIP + GAP, 0), (GAP, 0), (0, 0)), constant_values=255)
+    cv2.putText(framed, title, (GAP, STRIP), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
+    return framed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
