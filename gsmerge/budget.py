@@ -35,7 +35,7 @@ class FileSize:
     @property
     def packed(self) -> bool:
         """Whether the bytes depend on the content, so that only trials tell them."""
-        return self.file is not PLY
+        return self.file.count is None
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:

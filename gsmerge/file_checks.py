@@ -15,7 +15,7 @@ from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import CAMERA_ENDINGS, CHUNK, read_all_cameras
 from gsmerge.io.formats import ply, spz, streamed
 from gsmerge.io.formats.read import degree_notes
-from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, input_format, may_hold_gaussians
+from gsmerge.io.formats.table import META, SCENE_SUFFIXES, SEVERAL_USES, find_format, may_hold_gaussians
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.scene.exporters import AUTO
@@ -78,7 +78,7 @@ def holds_scene(path: Path) -> bool:
     if suffix == SUFFIX:
         return os.path.isfile(path) and not holds_features(path)
     if path.name == META:
-        return input_format(path).holds(path)
+        return find_format(path).holds(path)
     return suffix in SCENE_SUFFIXES or os.path.isdir(path)
 
 

@@ -206,6 +206,9 @@ class Cameras:
         return -(self.viewmats[:, :3, :3] * self.viewmats[:, :3, 3:]).sum(1)
 
 
+NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class LargePhotos:
     """Photos larger than the scene's views, read one at a time; their poses are those of the scene's cameras."""

@@ -13,10 +13,10 @@ from typing import Any, Protocol
 from gsmerge import __version__
 from gsmerge.batch.find import find_places, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
-from gsmerge.compaction.placement import level_output
 from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
+from gsmerge.io.formats.write import level_output
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.report import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.estimate import memory_bytes

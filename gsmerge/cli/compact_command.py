@@ -26,8 +26,8 @@ from gsmerge.cli.paths import (
     check_format,
     check_outputs,
     default_output,
+    files_beside,
     input_files,
-    model_files,
     output_file,
 )
 from gsmerge.errors import TargetError, UsageError
@@ -100,9 +100,9 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
         _decode(args, features, start)
         return
     hints = args.hints()
-    from gsmerge.compaction.placement import level_output
     from gsmerge.io.cameras.json_files import viewer_cameras_path
-    from gsmerge.io.formats.table import COLMAP, HTML, INDEX, output_format
+    from gsmerge.io.formats.table import find_format, output_format
+    from gsmerge.io.formats.write import level_output
 
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
@@ -114,19 +114,20 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     files = args.files(*args.scenes)
     default = default_output(files.base)
     out = output_file(args.output or default, default.name, site=writing.site)
-    streamed, alone = out.name == INDEX, HTML.names(out) or COLMAP.names(out)
-    if streamed and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
+    chosen = find_format(out)
+    if chosen.levels == "inside" and settings.method == "gsmerge" and "levels" not in args.values(CompactOptions):
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if alone and settings.budget.levels > 1:
-        raise UsageError(f"{out}: expected no --levels for a page or a COLMAP model")
+    if not chosen.levels and settings.budget.levels > 1:
+        raise UsageError(f"{out}: expected no --levels for {chosen.about.partition(':')[0]}, which holds one")
     if settings.budget.in_bytes and not output_format(out, levels=True, cameras=True).each:
         raise UsageError(f"{out}: expected a --budget in Gaussians for such files, got {settings.budget.budget}")
-    levels = [] if streamed else [level_output(out, level) for level in range(1, settings.budget.levels)]
-    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not alone else None
+    num_apart = settings.budget.levels if chosen.levels == "apart" else 1
+    levels = [level_output(out, level) for level in range(1, num_apart)]
+    cameras = viewer_cameras_path(out) if writing.viewer_cameras and not chosen.cameras else None
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     inputs = (*input_files(files), *networks)
     beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
-    named = (out, *model_files(out, site=writing.site), *levels, beside)
+    named = (out, *files_beside(out, site=writing.site), *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
     check_format(out, writing, levels=True, cameras=True)
     if writing.columns == "full" and settings.budget.in_bytes:
@@ -155,14 +156,14 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run; TargetError if a target is missed. Unless a page is ``shown``, say how to look."""
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
-    from gsmerge.io.formats.table import PLY, SITE
+    from gsmerge.io.formats.table import find_format
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
     say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)
     lines = [summary_line(document), *level_lines(document), *curve_lines(document)]
     if sys.stdout.isatty():
-        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if PLY.names(out) and not shown else []
-        look = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == SITE else look
+        look = ["gsmerge", "view", str(args.scenes[0]), str(out)] if out.suffix.lower() in VIEWED and not shown else []
+        look = ["python", "-m", "http.server", "-d", str(out.parent)] if out.name == find_format(out).site else look
         lines = result_table(document, shlex.join(look) or None, columns=terminal_columns(sys.stdout))
     print_document(document, lines, as_json=args.json, quiet=args.quiet, wrap=False)
     unchecked = document["psnr_input_views"]["before"] is None and "fidelity" not in document["choices"]

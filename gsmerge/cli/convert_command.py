@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
-from gsmerge.cli.paths import FileOptions, check_format, check_outputs, model_files, output_file
+from gsmerge.cli.paths import FileOptions, check_format, check_outputs, files_beside, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.placement import PlacementOptions
@@ -51,7 +51,7 @@ def convert(args: opt.Args) -> None:
     images = None if photos.images is None else opt.named_or_none(photos.images)
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
     output = output_file(output, inputs[0].name, site=writing.site)
-    check_outputs((output, *model_files(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
+    check_outputs((output, *files_beside(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
     check_format(output, writing, levels=True, cameras=True)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run

@@ -42,16 +42,17 @@ def default_output(ply: Path) -> Path:
 def output_file(output: Path, name: str, *, site: bool = False) -> Path:
     """Return the file that an output names: itself, or of a folder, which a new name without an ending is, its file.
 
-    That is the page of a ``site``, the points of a folder named ``colmap``, and otherwise ``name``.
+    That is the page of a ``site``, the main file of the format that the folder's name means, and otherwise ``name``.
     """
-    from gsmerge.io.formats.table import FOLDER, HTML, OUTPUT_FORMATS, PLACE, POINTS, SITE
+    from gsmerge.io.formats.table import FOLDERS, FORMATS, OUTPUT_FORMATS
 
     if site:
+        page = next(row for row in FORMATS if row.site)
         if output.suffix.lower() in OUTPUT_FORMATS:
             raise UsageError(f"site: expected a folder to write into, got {output}")
-        return output if HTML.names(output) else output / SITE
-    if output.name == FOLDER:
-        return output / PLACE / POINTS
+        return output if page.names(output) else output / page.site
+    if output.name in FOLDERS:
+        return output / FOLDERS[output.name].place / FOLDERS[output.name].ending
     is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
     return output / name if is_folder else output
 
@@ -69,19 +70,11 @@ def _start_of(path: Path) -> bytes:
         return b""
 
 
-def model_files(output: Path, *, site: bool = False) -> tuple[Path, ...]:
-    """List the other files of a ``site``, or of a COLMAP model, of which another program's is a SceneError."""
-    from gsmerge.io.formats.table import POINTS
+def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
+    """List the other files of an output whose names are known; SceneError if another program's are there."""
+    from gsmerge.io.formats.table import find_format
 
-    if site:
-        from gsmerge.pages.site import NAMES
-
-        return tuple(output.with_name(name) for name in NAMES.values())
-    if output.name != POINTS:
-        return ()
-    from gsmerge.io.cameras.colmap_model import files_beside
-
-    return files_beside(output)
+    return tuple(find_format(output).beside(output, site))
 
 
 def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:

@@ -9,15 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.placement import (
-    NUM_FULL,
-    add_result,
-    add_views,
-    find_placement,
-    name_photos,
-    pad_harmonics,
-    place,
-)
+from gsmerge.compaction.placement import NUM_FULL, add_views, find_placement, name_photos, pad_harmonics, place
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame
@@ -28,8 +20,8 @@ from gsmerge.io.cameras.read import holds_images
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.table import DEPTHS, Format, input_format
-from gsmerge.io.formats.write import NamedPhotos, output_notes
+from gsmerge.io.formats.table import DEPTHS, Contents, Format, NamedPhotos, find_format
+from gsmerge.io.formats.write import output_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.report import document_head
 from gsmerge.runtime.memory import human_bytes
@@ -40,9 +32,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.types import Cameras, Gaussians, Scene, StrPath
-
-NO_CAMERAS = Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1)
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Scene, StrPath
 
 
 @dataclass(frozen=True)
@@ -78,7 +68,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         if cameras is None and chosen.cameras == "needed":
-            problem = "expected cameras beside it for a COLMAP model, found none"
+            problem = f"expected cameras beside it for {chosen.about.partition(':')[0]}, found none"
             raise SceneError(options.inputs[0], problem, "name them with --cameras")
         count = len(gaussians)
         gaussians, left_out = _clean(gaussians, options, stored)
@@ -97,7 +87,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     notes += unread
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, left_out["unseen"], count, None if stored is None else stored.path)
-    grey = [path for path in options.inputs if input_format(path) is DEPTHS and not holds_images(path)]
+    grey = [path for path in options.inputs if find_format(path) is DEPTHS and not holds_images(path)]
     notes += [f"{path.name}: depth maps without images: all Gaussians are grey" for path in grey]
     names = () if stored is None else stored.names
     photos = name_photos(_photo_folder(options, stored), names)
@@ -200,10 +190,9 @@ def _write(
     """Write the Gaussians, and the cameras beside them; return the bytes and the path of the cameras."""
     out, beside = options.output, None
     with atomic_outputs(overwrite=options.overwrite) as add:
-        views = cameras, photos, scene_title(options.inputs[0])
-        written = add_result(
-            add, out, add(out), [gaussians], comments, views, normals=options.normals, site=options.site
-        )
+        title = scene_title(options.inputs[0])
+        contents = Contents([gaussians], comments, cameras, photos, title, normals=options.normals, apart=options.site)
+        written = chosen.write(add, out, add(out), contents)
         if len(cameras) and not chosen.cameras:
             beside = viewer_cameras_path(out)
             add_views(add, beside, cameras, names, overwrite=options.overwrite)

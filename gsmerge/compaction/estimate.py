@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.files import Outputs, check_colmap, sized
+from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.methods import check_method
 from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
@@ -19,7 +18,7 @@ from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.table import INDEX
+from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.plan import (
     KEPT_LOSS,
@@ -150,7 +149,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 def plan_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return as a document what :func:`compact_files` would make of a scene."""
     scene, out, settings = load.scene, outputs.result, sized(settings, outputs)
-    check_colmap(scene, out)
+    check_cameras(scene, out)
     _, unused = check_method(settings, scene)
     notes = [*load.notes, *unused, *missing_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
@@ -175,7 +174,8 @@ def plan_lines(document: Mapping[str, Any]) -> list[str]:
     """Write the document of :func:`plan_files` as lines for people."""
     scene, out = document["input"], document["output"]["path"]
     number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
-    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if Path(out).name == INDEX else ""
+    inside = find_format(out).levels == "inside"
+    levels = f", and {document['options']['levels']} level(s) in chunks beside it" if inside else ""
     return [
         f"would read {scene['ply']}: {f'{number} views of {size}' if number else 'no views'}",
         f"would write {out}{levels}",

@@ -9,8 +9,7 @@ from gsmerge.compaction.search import meet
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
-from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.formats.table import HTML, Format
+from gsmerge.io.formats.table import Format
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.stages.clean import faintest_dropped
@@ -20,7 +19,6 @@ NEAR_SHARE, MOST_DROPPED = 0.97, 0.08  # share of the size that is reached; of t
 ENOUGH = 0.985  # share of the size from which on no further one is put back
 SURPLUS = 1.02  # times the Gaussians that the size seems to have room for
 TRIES, MAX_REBUILDS = 8, 2
-LONGEST_TITLE = 255  # bytes of a page's title, which is a file's name, at most
 
 Rebuild = Callable[[int], Candidate]
 
@@ -28,12 +26,9 @@ Rebuild = Callable[[int], Candidate]
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras) -> int:
     """Count the bytes of a file with the given Gaussians; of a page, which shows ``cameras``, at most."""
     comments = RESULT_COMMENT, MIP_COMMENT
-    if file is HTML:
-        from gsmerge.pages.site import site_contents
-
-        return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
-    if file.encode is None:
-        return file_bytes(len(gaussians), gaussians.sh_degree)
+    if file.measure is not None:
+        return file.measure(gaussians, cameras, comments)
+    assert file.encode is not None  # others have a count for each size
     return len(file.encode(gaussians, comments))
 
 

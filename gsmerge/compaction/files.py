@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.placement import add_result, add_views, name_photos, named_cameras, other_cameras
+from gsmerge.compaction.placement import add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, UsageError
@@ -20,6 +20,7 @@ from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rounding import rounding_notes
+from gsmerge.io.formats.table import Contents, find_format
 from gsmerge.io.formats.write import output_notes
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import Progress, record_part
@@ -74,7 +75,7 @@ def compact_files(
         first = add(out)
         load = read_input(files, opacity=opacity, hints=hints)
         on_read(load)
-        check_colmap(load.scene, out)
+        check_cameras(load.scene, out)
         views = _views_once(load.scene)
         names = [load.scene.names[view] for view in views]
         cameras_path = outputs.viewer_cameras if len(load.scene) else None
@@ -90,10 +91,11 @@ def compact_files(
         comments, expected = [RESULT_COMMENT, *load.comments], result.report.new_views
         if expected is not None:
             comments.append(new_views_comment(expected))
-        views_named = result.cameras[views], name_photos(load.files.images, names), scene_title(files.ply)
-        notes = output_notes(out, result.gaussians.sh_degree, views_named[1]) + rounding_notes(out, result.gaussians)
-        levels = [level.gaussians for level in results]
-        written = add_result(add, out, first, levels, comments, views_named, normals=outputs.normals, site=outputs.site)
+        photos, title = name_photos(load.files.images, names), scene_title(files.ply)
+        notes = output_notes(out, result.gaussians.sh_degree, photos) + rounding_notes(out, result.gaussians)
+        levels, cameras = [level.gaussians for level in results], result.cameras[views]
+        contents = Contents(levels, comments, cameras, photos, title, normals=outputs.normals, apart=outputs.site)
+        written = chosen.write(add, out, first, contents)
         if cameras_path is not None:
             add_views(add, cameras_path, result.cameras[views], names, overwrite=outputs.overwrite)
         left_out = [load.left_out, *(note for note in result.report.notes if STRAY_PHOTOS in note)]
@@ -159,9 +161,9 @@ def read_input(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     return replace(loaded, notes=(*loaded.notes, *_compact_notes(loaded)))
 
 
-def check_colmap(scene: Scene, out: Path) -> None:
-    """Raise UsageError if a COLMAP model is to be written and the scene has no cameras."""
-    if len(scene) == 0 and output_format(out, levels=True, cameras=True).cameras == "needed":
+def check_cameras(scene: Scene, out: Path) -> None:
+    """Raise UsageError if the output cannot do without cameras and the scene has none."""
+    if len(scene) == 0 and find_format(out).cameras == "needed":
         raise UsageError(f"{out}: expected a scene with cameras, got none")
 
 

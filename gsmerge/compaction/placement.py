@@ -1,4 +1,4 @@
-"""Bring Gaussians and cameras into the frame and the files of an output: turned, cut to a degree, as a COLMAP model."""
+"""Bring Gaussians and cameras into the frame of an output: turned, and cut to a degree."""
 
 from __future__ import annotations
 
@@ -11,18 +11,13 @@ import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
-from gsmerge.io import output_format, write_gaussians
-from gsmerge.io.atomic import AddOutput, link_file
+from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.camera_file import to_cameras
-from gsmerge.io.cameras.colmap_model import files_beside, model_files
 from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.formats.streamed import add_levels
-from gsmerge.io.formats.table import COLMAP, HTML, INDEX, MODEL_NAMES
-from gsmerge.io.formats.write import NamedPhotos, photo_folder
+from gsmerge.io.formats.table import NamedPhotos
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
-from gsmerge.measure.visibility import front_rows
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
 
@@ -108,68 +103,6 @@ def other_cameras(path: Path) -> UsageError:
     """Make the error for an existing file of cameras that belongs to another result."""
     remedy = "name another output, or pass --overwrite to replace it"
     return UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
-
-
-def add_result(
-    add: AddOutput,
-    out: Path,
-    first: Path,
-    levels: Sequence[Gaussians],
-    comments: Sequence[str],
-    views: tuple[Cameras, NamedPhotos, str],
-    *,
-    normals: bool,
-    site: bool,
-) -> dict[Path, list[Path]]:
-    """Write Gaussians, whose file is ``first`` now, and coarser levels of them, each with ``comments`` in its header.
-
-    A COLMAP model and a page have the ``views``, too: cameras, names with photos, and the scene's title. Returns
-    the path of each level, in their order, with its files as they are before they are renamed.
-    """
-    ending = output_format(out, levels=True, cameras=True).ending
-    cameras, photos, title = views
-    if ending == COLMAP.ending:
-        return {out: add_colmap(add, out, first, levels[0], cameras, photos)}
-    if ending == HTML.ending:
-        from gsmerge.pages.site import add_site, site_contents
-
-        return {out: add_site(add, first, site_contents(levels[0], cameras, title, comments, apart=site))}
-    if ending == INDEX:
-        (_, finest), *coarser = add_levels(add, out, first, levels, comments)
-        return {out: [first, *finest], **dict(coarser)}
-    written = {out: [first]}
-    for level in range(1, len(levels)):
-        path = level_output(out, level)
-        written[path] = [add(path)]
-    for (file,), gaussians in zip(written.values(), levels, strict=True):
-        write_gaussians(file, gaussians, overwrite=True, comments=comments, ending=ending, normals=normals)
-    return written
-
-
-def level_output(output: Path, level: int) -> Path:
-    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
-    cut = len(output.name) - len(output_format(output).ending)
-    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
-
-
-def add_colmap(
-    add: AddOutput, path: Path, points: Path, gaussians: Gaussians, cameras: Cameras, photos: NamedPhotos
-) -> list[Path]:
-    """Write a COLMAP model as part of :func:`atomic_outputs`; ``points`` is the temporary file of ``path``.
-
-    ``photos``: those of :func:`name_photos`, which are linked where trainers look for them unless that folder exists.
-    Returns the present paths of all files of the model.
-    """
-    files, place = [points, *map(add, files_beside(path))], photo_folder(path)
-    if not place.exists():
-        for name, photo in dict(photos).items():
-            if photo is not None:
-                link_file(photo, add(place / name))
-    names = [name for name, _ in photos]
-    contents = model_files(gaussians, cameras, names, front_rows(gaussians, cameras))
-    for file, name in zip(files, MODEL_NAMES, strict=True):
-        file.write_bytes(contents[name])
-    return files
 
 
 def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:

@@ -37,8 +37,7 @@ from gsmerge.io.cameras.camera_file import (
 from gsmerge.io.formats.read import clear_invalid
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.read import NO_CAMERAS
-from gsmerge.types import Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
+from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
 
 ORDERS = ("view-major", "none")
 _TOLERANCE = 1e-3  # by which opacities and images may leave [0, 1]

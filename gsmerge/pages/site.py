@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import file_order, sog_bytes
-from gsmerge.io.formats.table import SITE_SCENE, VIEWER
+from gsmerge.io.formats.table import VIEWER, Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
@@ -30,18 +30,31 @@ POLICY = (
     "default-src 'none'; img-src 'self' data:; style-src {style}; script-src {script} blob: 'wasm-unsafe-eval';"
     " worker-src data: blob:; connect-src 'self' data: blob:"
 )
-NAMES = {"scene": SITE_SCENE, "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
+NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
 MAX_VIEWS = 64  # of which the page knows where they stood
+LONGEST_TITLE = 255  # bytes of a title, which is a file's name, at most
 LICENSED = ("spark", "three", "fflate")
 
 
-def add_site(add: AddOutput, page: Path, contents: tuple[str, Mapping[str, bytes]]) -> list[Path]:
-    """Write what :func:`site_contents` makes of a ``page``; return the present paths of all files."""
-    text, beside = contents
-    files = {add(page): text.encode(), **{add(page.with_name(name)): content for name, content in beside.items()}}
-    for path, content in files.items():
-        path.write_bytes(content)
-    return list(files)
+def files_beside(page: Path, apart: bool) -> tuple[Path, ...]:
+    """Return the paths of the files beside a page: none unless it is ``apart`` from what it shows."""
+    return tuple(page.with_name(name) for name in NAMES.values() if apart)
+
+
+def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write a page, and the files beside it if it is to have some, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    text, beside = site_contents(
+        contents.levels[0], contents.cameras, contents.title, contents.comments, apart=contents.apart
+    )
+    files = {page: text.encode(), **{add(page.with_name(name)): content for name, content in beside.items()}}
+    for file, content in files.items():
+        file.write_bytes(content)
+    return {path: list(files)}
+
+
+def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
+    """Count the bytes that a page takes at most, whatever its title."""
+    return len(site_contents(gaussians, cameras, "x" * LONGEST_TITLE, comments, apart=False)[0].encode())
 
 
 def site_contents(

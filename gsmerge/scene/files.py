@@ -27,12 +27,12 @@ from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.formats.table import (
     DEPTHS,
     FRAMES,
+    HTML,
     META,
     POSES,
     SCENE_SUFFIXES,
     SEVERAL_USES,
-    SITE,
-    input_format,
+    find_format,
     is_frame,
     may_hold_gaussians,
 )
@@ -300,7 +300,7 @@ def list_plys(folder: Path) -> list[Path]:
     plys = _plys_in(folder) or other_plys(folder / SCENES_PLACE)
     plys = plys or [ply for place in _scenes_below(folder) for ply in _plys_in(place)]
     plys = plys or _FIND_DEPTH_MAPS(folder) or _results_in(folder)
-    plys = plys or [path for path in [folder / META] if path.is_file() and input_format(path).holds(path)]
+    plys = plys or [path for path in [folder / META] if path.is_file() and find_format(path).holds(path)]
     return plys or [folder / place for place in PLY_PLACES if (folder / place).is_file()][:1]
 
 
@@ -382,7 +382,7 @@ def other_plys(folder: Path) -> list[Path]:
     """
     plys = sorted(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
-    packed = [] if scenes or (folder / SITE).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
+    packed = [] if scenes or (folder / HTML.site).exists() else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
     return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
 
 

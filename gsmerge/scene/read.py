@@ -71,9 +71,7 @@ from gsmerge.scene.views import (
     read_scene_cameras,
 )
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import Cameras, LargePhotos, Scene, StrPath
-
-NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
+from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
 
 
 @dataclass(frozen=True)

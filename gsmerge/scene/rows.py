@@ -14,7 +14,7 @@ from gsmerge.geometry import Similarity, rgb_to_sh0
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.read import holds_images, read_depths
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.formats.table import DEPTHS, input_format
+from gsmerge.io.formats.table import DEPTHS, find_format
 from gsmerge.scene.exporters import TURNED, Exporter, ReadHints
 from gsmerge.scene.files import SceneFiles
 from gsmerge.types import Gaussians, Scene, grid_ids
@@ -27,7 +27,7 @@ def color_from_photos(gaussians: Gaussians, images: np.ndarray, files: SceneFile
 
     Other Gaussians stay unchanged. SceneError without photos.
     """
-    if input_format(files.ply) is not DEPTHS or holds_images(files.ply):
+    if find_format(files.ply) is not DEPTHS or holds_images(files.ply):
         return gaussians
     if images.size != 3 * len(gaussians):
         problem = "expected images with the depth maps, found none, and no photos of their views"

@@ -114,7 +114,7 @@ def test_failures_while_writing_leave_nothing(
     }[kind]
     if kind == "compact a state":
         assert run("extend", state, smallest_copy, *quick).code == 0
-    for place in ("gsmerge.compaction.placement", "gsmerge.states.files"):
+    for place in ("gsmerge.io.formats.write", "gsmerge.states.files"):
         monkeypatch.setattr(f"{place}.write_gaussians", half)
     monkeypatch.setattr("gsmerge.states.files.save_state", half)
     before = listing(smallest_copy)
@@ -142,7 +142,7 @@ def test_several_outputs_are_all_there_or_none(
     def no_room(*_: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.compaction.placement.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.io.formats.write.write_gaussians", full)
     monkeypatch.setattr("gsmerge.compaction.placement.viewer_cameras", no_room)
     before = listing(smallest_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")

@@ -8,7 +8,7 @@ from plyfile import PlyListProperty
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.formats.table import PLY, input_format
+from gsmerge.io.formats.table import PLY, find_format
 
 SHARP = "SHARP"  # source of such cameras
 _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # the last not in its first versions
@@ -21,7 +21,7 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     The grid is square whatever the photo's shape: the photo was stretched to it. SceneError if the numbers are
     damaged.
     """
-    if input_format(source.path).read is not PLY.read:
+    if find_format(source.path).read is not PLY.read:
         return None
     data = source.ply
     present = [name for name in _SHARP_ELEMENTS if name in data]

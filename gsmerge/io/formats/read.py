@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, input_format
+from gsmerge.io.formats.table import DEPTHS, META, PLY, SCENE_SUFFIXES, find_format
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, gather, make_array
@@ -134,7 +134,7 @@ def read_parts(paths: Sequence[Path], *, opacity: OpacityChoice = "auto") -> Gau
     """
     if opacity not in ("auto", "logit", "raw"):
         raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    is_depth = input_format(paths[0]) is DEPTHS
+    is_depth = find_format(paths[0]) is DEPTHS
     parts = _READ_FRAMES(paths) if is_depth else parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
@@ -158,7 +158,7 @@ def read_gaussians(path: StrPath, *, opacity: OpacityChoice = "auto") -> Gaussia
     """
     path = Path(path)
     path = path / META if path.is_dir() and (path / META).is_file() else path
-    chosen = input_format(path)
+    chosen = find_format(path)
     if chosen.read is None:
         problem = f"expected one of {', '.join(SCENE_SUFFIXES)}, found {chosen.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made of")

@@ -29,7 +29,7 @@ from gsmerge.io.bounds import ReadBudget, check_file, check_whole, parse_json, r
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, to_float32
 
 MAX_DEGREE = 3
 VERSION = 2
@@ -284,7 +284,7 @@ def sog_files(columns: arrays.Columns, *, mip: bool = False) -> dict[str, bytes]
 def round_means(means: np.ndarray) -> np.ndarray:
     """Return means ``[n,3]`` as a ``.sog`` of them holds them."""
     fixed, low, high = _fix_means(means)
-    return _open_means(fixed, np.array(low), np.array(high))
+    return to_float32(_open_means(fixed, np.array(low), np.array(high)))
 
 
 def _fix_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:

@@ -28,7 +28,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
-from gsmerge.types import SH_C0, Gaussians
+from gsmerge.types import SH_C0, Gaussians, to_float32
 
 VERSION, MAX_DEGREE = 3, 3  # that are written, and the harmonics of that; Spark 2.2 does not read 4
 MAGIC = 0x5053474E
@@ -255,7 +255,7 @@ def _octave(size: float) -> int:
 def round_means(means: np.ndarray) -> np.ndarray:
     """Return means ``[n,3]`` as a ``.spz`` of them holds them."""
     fixed, fraction = fix_means(means, FINE)
-    return fixed / 2.0**fraction
+    return to_float32(fixed / 2.0**fraction)
 
 
 def fix_means(means: np.ndarray, fine: int) -> tuple[np.ndarray, int]:

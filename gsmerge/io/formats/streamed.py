@@ -26,7 +26,7 @@ from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.io.formats.read import GaussianFile, convert_files
 from gsmerge.io.formats.splat_transform import run_program
-from gsmerge.io.formats.table import INDEX
+from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
 
@@ -68,32 +68,31 @@ def write_levels(
     if path.name != INDEX:
         raise UsageError(f"{path}: expected the name {INDEX}, by which viewers recognise the format")
     with atomic_outputs(overwrite=overwrite) as add:
-        add_levels(add, path, add(path), levels, comments)
+        write_output(add, path, add(path), Contents(levels, comments))
     remove_unused_chunks(path)
 
 
-def add_levels(
-    add: AddOutput, path: Path, index: Path, levels: Sequence[Gaussians], comments: Sequence[str] = ()
-) -> list[tuple[Path, list[Path]]]:
-    """Write the files of a Streamed SOG as part of :func:`atomic_outputs`; ``index`` is the temporary file of ``path``.
+def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write the files of a Streamed SOG, as :data:`gsmerge.io.formats.table.WriteOutput`.
 
-    Returns, for each level, the final path of its first chunk's ``meta.json``, and the present paths of all its files.
+    A coarser level's path is that of its first chunk's ``meta.json``.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         words: list[object] = []
-        for level, gaussians in enumerate(levels):
+        for level, gaussians in enumerate(contents.levels):
             words += [ply := Path(folder) / f"{level}.ply", "-l", level]
-            write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=comments)
+            write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
         made = Path(folder) / "made" / INDEX
         run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, made)
         _name_by_content(made)
         index.write_bytes(made.read_bytes())
-        written = []
+        written = dict[Path, list[Path]]()
         for chunks in read_index(made).levels:
             files = [file for chunk in chunks for file in sorted(chunk.parent.iterdir())]
             places = [path.parent / file.relative_to(made.parent) for file in files]
-            written.append((next(place for place in places if place.name == sog.META), list(map(add, places))))
-            for file, temporary in zip(files, written[-1][1], strict=True):
+            name = next(place for place in places if place.name == sog.META) if written else path
+            written[name] = [*([] if written else [index]), *map(add, places)]
+            for file, temporary in zip(files, written[name][-len(files) :], strict=True):
                 temporary.write_bytes(file.read_bytes())
     return written
 

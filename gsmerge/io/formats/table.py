@@ -11,39 +11,81 @@ from typing import Literal
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.setting import join_words
-from gsmerge.types import Gaussians, StrPath
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, to_float32
 
 INDEX = "lod-meta.json"  # the name by which loaders recognise levels of detail in chunks
-FOLDER, PLACE = "colmap", "sparse/0"  # a folder of this name holds a COLMAP model, where trainers look for it
 MODEL_NAMES = POINTS, CAMERAS, IMAGES = "points3D.bin", "cameras.bin", "images.bin"
 FRAMES, POSES = "results_output", "camera_poses.txt"  # DA3-Streaming's folder of frames, and the poses beside it
 
 
+_lazy = lazy_functions(__package__)
+WRITE_APART = _lazy("write.write_apart")
+NamedPhotos = Sequence[tuple[str, Path | None]]  # names below a model's folder of photos, and files if known
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What an output is to hold; formats that have no place for something leave it out."""
+
+    levels: Sequence[Gaussians]  # the finest first
+    comments: Sequence[str] = ()  # lines for the header
+    cameras: Cameras = NO_CAMERAS
+    photos: NamedPhotos = ()  # of the cameras
+    title: str = ""
+    normals: bool = True  # of a ``.ply``, as in :func:`gsmerge.write_ply`
+    apart: bool = False  # whether a page has its parts in files beside it
+
+
+# How to add files to :func:`gsmerge.io.atomic_outputs`, the path of the output, its temporary file, which is there
+# already, and what to write -> the path of each level, in their order, with its files before they are renamed
+WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
+
+
 @dataclass(frozen=True)
 class Format:
-    """A format of files of Gaussians: its ending and how to read and write it."""
+    """A format of files of Gaussians: its ending, and how to read and write it.
+
+    What a run asks of a format stands here, so that a new one is one module and one row. Writers that draw the scene
+    lie above this room; rows name them, as entry points name commands.
+    """
 
     ending: str  # of files' names, in lower case; without a dot at its start, the whole name of a folder's main file
     about: str  # what it is, for people
     read: Callable[[Path], StoredRows] | None  # None: it is only written
-    # with comments for the header; None: :func:`gsmerge.io.write_ply` or :func:`gsmerge.io.write_levels` writes it
+    # One file of Gaussians with comments; None: :func:`gsmerge.io.write_ply` or ``write`` makes it
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # of the harmonics that are written; -1: it is only read
+    write: WriteOutput = WRITE_APART  # by default each level in a file of its own
     require: Callable[[], object] = lambda: None  # raises UsageError where the writer's package or program is missing
-    # bytes of a Gaussian by degree, of a .sog or .spz those of results, as measured; none where no budget counts them
-    each: Sequence[float] = ()
-    rest: Callable[[], int] = lambda: 0  # bytes of a file besides those of its Gaussians, at least
-    round_means: Callable[[np.ndarray], np.ndarray] = lambda means: means  # as it holds them, but for float32
-    # Whether files hold the views' cameras, which others have beside them: "inside", or "needed" where they have to
-    cameras: Literal["", "inside", "needed"] = ""
     finish: Callable[[Path], object] = lambda _: None  # called with the path once all files are in their places
     holds: Callable[[Path], bool] = lambda _: True  # whether a file of this ending has Gaussians, where others do not
+
+    # What its files hold
+    levels: Literal["", "apart", "inside"] = "apart"  # of detail: one alone, each in its own file, or all in one output
+    cameras: Literal["", "inside", "needed"] = ""  # of the views: in a file beside it, inside, or it cannot do without
+    round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # as it holds them
+    kept_as: str = ""  # ending of the format as which its Gaussians are read back, if that is another one
+    lost: str = "{ending} has no room for harmonics above degree {degree}: left out"
+
+    # Its files besides the one that the path names
+    folder: str = ""  # name of an output folder that means this format
+    place: str = ""  # of the main file in this folder
+    site: str = ""  # name of the main file where its parts are in files beside it
+    beside: Callable[[Path, bool], Sequence[Path]] = lambda path, apart: ()  # those whose names are known before
+    notes: Callable[[Path, NamedPhotos], list[str]] = lambda path, photos: []  # on what programs look for beside it
+
+    # Bytes: of a Gaussian by degree, of a .sog or .spz those of results, as measured; none where no budget counts them
+    each: Sequence[float] = ()
+    rest: Callable[[], int] = lambda: 0  # besides those of its Gaussians, at least
+    count: Callable[[int, int], int] | None = None  # bytes and degree -> Gaussians; None where their content matters
+    measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # None: those that ``encode`` returns
 
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
@@ -51,7 +93,7 @@ class Format:
         return name.lower().endswith(self.ending) if self.ending[0] == "." else name == self.ending
 
 
-_lazy = lazy_functions(__package__)
+_page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
 _SOG = 13.0, 22.0, 36.5, 56.5
 IN_TEXT = 4 / 3  # bytes of base64, as which a page has files in its text, for each of theirs
 VIEWER = Path(__file__).parents[2] / "pages/vendor/spark-three.js.gz"
@@ -60,20 +102,29 @@ _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
-    each=(68.0, 104.0, 164.0, 248.0),
+    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes,
+    lost="harmonics above degree {degree} are left out: few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
-    round_means=_lazy("sog.round_means"), finish=_lazy("streamed.remove_unused_chunks"),
+    write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
+    round_means=_lazy("sog.round_means"), kept_as=".sog",
 )  # fmt: skip
-COLMAP = Format(POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0, cameras="needed")
+COLMAP = Format(
+    POINTS, "a COLMAP model: cameras, views, and Gaussians as points", None, None, 0,
+    write=_model("colmap_output.write_output"), levels="", cameras="needed", round_means=lambda means: means,
+    lost="points of COLMAP have colours alone: harmonics, sizes and opacities are left out",
+    folder="colmap", place="sparse/0",  # where trainers look for it
+    beside=_model("colmap_output.files_beside"), notes=_model("colmap_output.note_photos"),
+)  # fmt: skip
 HTML = Format(
-    ".html", "a page with a viewer and the .sog that it shows", None, None, 3, round_means=_lazy("sog.round_means"),
+    ".html", "a page with a viewer and the .sog that it shows", None, None, 3,
+    write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
+    kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
     each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size) + PAGE,
-    cameras="inside",
+    measure=_page("site.measure"),
 )  # fmt: skip
-SITE, SITE_SCENE = "index.html", "scene.sog"  # of a page that has its files beside it
 FILES = (  # of endings that end alike the longest first
     Format(
         ".compressed.ply", "PlayCanvas' packed .ply", ply.read_rows, None, -1, each=(16.3, 25.3, 40.4, 61.4),
@@ -94,10 +145,11 @@ FILES = (  # of endings that end alike the longest first
     ),
     Format(
         ".usdc", "USD with ParticleField3DGaussianSplat, binary", None, _lazy("usd.usdc_bytes"), 3,
-        require=_REQUIRE_USD, each=_USD,
+        require=_REQUIRE_USD, each=_USD, kept_as=".ply",
     ),
     Format(
         ".usdz", "USD, a .usdc in an archive", None, _lazy("usd.usdz_bytes"), 3, require=_REQUIRE_USD, each=_USD,
+        kept_as=".ply",
     ),
 )  # fmt: skip
 DEPTHS = Format(
@@ -120,6 +172,7 @@ BY_PROGRAM = (  # which splat-transform reads in our place
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
+FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
         Path(f"_{row.ending}").suffix
@@ -134,8 +187,8 @@ def count_for_bytes(chosen: Format, max_bytes: int, sh_degree: int) -> int:
 
     The number is exact for a ``.ply``, and approximate for other formats, whose size depends on their content.
     """
-    if chosen is PLY:
-        return ply.count_for_bytes(max_bytes, sh_degree)
+    if chosen.count is not None:
+        return chosen.count(max_bytes, sh_degree)
     each, rest = chosen.each[min(sh_degree, len(chosen.each) - 1)], chosen.rest()
     if max_bytes < rest + each:
         viewer = f"{rest / 1e6:.2f} MB for the viewer of a page, and " if rest else ""
@@ -150,22 +203,20 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     Columns of degree 0 are not counted. A ``.ply`` is counted exactly by its header, other formats by their size in
     bytes; zeros for files that cannot be read.
     """
-    counts = [
-        ply.header_counts(path) if input_format(path).read is ply.read_rows else _by_bytes(path) for path in paths
-    ]
+    counts = [ply.header_counts(path) if find_format(path).read is ply.read_rows else _by_bytes(path) for path in paths]
     return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
 
 
 def _by_bytes(path: Path) -> tuple[int, int]:
     """Estimate the number of Gaussians of a file by its size, assuming degree 0; the second number is 0."""
     try:
-        return int(path.stat().st_size / (input_format(path).each or (math.inf,))[0]), 0
+        return int(path.stat().st_size / (find_format(path).each or (math.inf,))[0]), 0
     except OSError:
         return 0, 0
 
 
-def input_format(path: StrPath) -> Format:
-    """Return the format in which to read a path; PLY for unknown endings."""
+def find_format(path: StrPath) -> Format:
+    """Return the format that a path names; PLY for unknown endings."""
     return next((row for row in FORMATS if row.names(path)), PLY)
 
 
@@ -176,7 +227,7 @@ def is_frame(path: Path) -> bool:
 
 def may_hold_gaussians(path: Path) -> bool:
     """Return whether the ending, and for endings with several uses the content, is that of Gaussians."""
-    return path.suffix.lower() in SCENE_SUFFIXES and input_format(path).holds(path)
+    return path.suffix.lower() in SCENE_SUFFIXES and find_format(path).holds(path)
 
 
 def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False) -> Format:
@@ -184,16 +235,17 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
 
     ``levels``: an index of levels of detail is allowed; ``cameras``: a COLMAP model or a page, which have cameras.
     """
-    allowed = {LEVELS: levels, COLMAP: cameras, HTML: cameras}
-    chosen = next((row for row in FORMATS if row.names(path) and allowed.get(row, True)), None)
-    if chosen is None and not cameras and Path(path).name in (FOLDER, POINTS):
-        problem = "expected a format without cameras, got a COLMAP model"
+    named = next((row for row in FORMATS if row.names(path)), None)
+    refused = named is not None and ((named.levels == "inside" and not levels) or (named.cameras and not cameras))
+    chosen, meant = None if refused else named, FOLDERS.get(Path(path).name, named)
+    if meant is not None and meant.cameras == "needed" and not cameras:
+        problem = f"expected a format without cameras, got {meant.about.partition(':')[0]}"
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if chosen is None or chosen.max_degree < 0:
         read_only = "" if chosen is None else f"{chosen.ending} is read, not written: "
         endings = join_words((*OUTPUT_FORMATS, *([HTML.ending] if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
-        folder = f", or a folder, or one named {FOLDER}" if cameras else ""
+        folder = f", or a folder, or one named {' or '.join(FOLDERS)}" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")
     chosen.require()
     return chosen

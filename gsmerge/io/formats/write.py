@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsmerge.io.atomic import atomic_output
+from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.table import COLMAP, PLY, output_format
+from gsmerge.io.formats.table import Contents, NamedPhotos, find_format, output_format
 from gsmerge.types import Gaussians, StrPath
-
-NamedPhotos = Sequence[tuple[str, Path | None]]  # names below a model's folder of photos, and files if known
 
 
 def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
@@ -18,27 +16,31 @@ def lost_harmonics(path: StrPath, sh_degree: int) -> str | None:
     chosen = output_format(path, levels=True, cameras=True)
     if sh_degree <= chosen.max_degree:
         return None
-    if chosen is COLMAP:
-        return "points of COLMAP have colours alone: harmonics, sizes and opacities are left out"
-    if chosen is PLY:
-        return f"harmonics above degree {chosen.max_degree} are left out: few programs read a .ply with them"
-    return f"{chosen.ending} has no room for harmonics above degree {chosen.max_degree}: left out"
-
-
-def photo_folder(points: Path) -> Path:
-    """Return the folder in which trainers look for the photos of a COLMAP model, given the path of its points."""
-    return points.parent.parent.parent / "images"
+    return chosen.lost.format(ending=chosen.ending, degree=chosen.max_degree)
 
 
 def output_notes(out: Path, sh_degree: int, photos: NamedPhotos) -> list[str]:
-    """Describe what an output lacks: harmonics that are not written, and the ``photos`` of a COLMAP model."""
-    lost, place = lost_harmonics(out, sh_degree), photo_folder(out)
-    notes = [lost] if lost else []
-    if COLMAP.names(out) and (place.exists() or any(photo is None for _, photo in photos)):
-        absent = len({name for name, _ in photos if not (place / name).is_file()})
-        more = f"trainers look for photos in {place}: copy or link the {absent:,} that it lacks there"
-        notes += [more] if absent else []
-    return notes
+    """Describe what an output lacks: harmonics that are not written, and files that programs look for beside it."""
+    lost = lost_harmonics(out, sh_degree)
+    return [*([lost] if lost else []), *find_format(out).notes(out, photos)]
+
+
+def level_output(output: Path, level: int) -> Path:
+    """Return the path of a further level of detail, counted from 1: ``out.ply`` -> ``out.level1.ply``."""
+    cut = len(output.name) - len(output_format(output).ending)
+    return output.with_name(f"{output.name[:cut]}.level{level}{output.name[cut:]}")
+
+
+def write_apart(add: AddOutput, path: Path, first: Path, contents: Contents) -> dict[Path, list[Path]]:
+    """Write each level into a file of its own, as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    written, ending = {path: [first]}, output_format(path).ending
+    for level in range(1, len(contents.levels)):
+        written[level_output(path, level)] = [add(level_output(path, level))]
+    for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
+        write_gaussians(
+            file, gaussians, overwrite=True, comments=contents.comments, ending=ending, normals=contents.normals
+        )
+    return written
 
 
 def write_gaussians(

@@ -272,7 +272,7 @@ def test_warnings_become_notes(scene: Path, out: Path, monkeypatch: pytest.Monke
 
 KILLS = {
     "while it reads": ("gsmerge.batch.jobs.content_hash", True),
-    "while it writes": ("gsmerge.compaction.placement.write_gaussians", False),
+    "while it writes": ("gsmerge.io.formats.write.write_gaussians", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.batch.run.append_line", True),
     "before the mark is gone": ("gsmerge.batch.run.Path.unlink", True),
@@ -325,7 +325,7 @@ def test_a_record_cut_in_the_middle_is_done_again(scene: Path, out: Path, undist
 
 @pytest.mark.parametrize(
     "name",
-    ["gsmerge.batch.run.mark", "gsmerge.batch.jobs.compact_files", "gsmerge.compaction.placement.write_gaussians"],
+    ["gsmerge.batch.run.mark", "gsmerge.batch.jobs.compact_files", "gsmerge.io.formats.write.write_gaussians"],
 )
 def test_a_full_disk_fails_the_scene_and_leaves_nothing(
     name: str, scene: Path, out: Path, monkeypatch: pytest.MonkeyPatch

@@ -17,7 +17,6 @@ from page_policy import check_policy
 
 from gsmerge.cli.paths import is_page, output_file
 from gsmerge.io import read_gaussians
-from gsmerge.io.formats.table import SITE_SCENE
 from gsmerge.pages.site import MAX_VIEWS, NAMES, site_contents
 from gsmerge.types import Cameras
 
@@ -66,12 +65,12 @@ def test_one_file_holds_what_is_beside_a_site(site: Contents) -> None:
 
 def test_all_but_the_scene_takes_little(site: Contents) -> None:
     page, files = site
-    assert len(page) + sum(len(content) for name, content in files.items() if name != SITE_SCENE) < 700_000
+    assert len(page) + sum(len(content) for name, content in files.items() if name != NAMES["scene"]) < 700_000
     assert len(contents_of(apart=False)[0]) < 1_000_000
 
 
 def test_its_scene_is_a_sog_of_all_gaussians(site: Contents, tmp_path: Path) -> None:
-    (tmp_path / "a.sog").write_bytes(site[1][SITE_SCENE])
+    (tmp_path / "a.sog").write_bytes(site[1][NAMES["scene"]])
     assert len(read_gaussians(tmp_path / "a.sog").gaussians) == len(
         scenes.make_scene(scenes.room(), scenes.arc(3)).gaussians
     )
