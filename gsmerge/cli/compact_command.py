@@ -129,7 +129,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
     beside = cameras if args.overwrite else None  # otherwise it may be there already, for another format
     named = (out, *files_beside(out, site=writing.site), *levels, beside)
     check_outputs(named, inputs, overwrite=args.overwrite or args.dry_run)
-    check_format(out, writing, levels=True, cameras=True)
+    check_format(out, writing)
     if writing.columns == "full" and settings.budget.in_bytes:
         raise UsageError(
             f"columns full: expected a --budget as a number or a share with it, got {settings.budget.budget}"
@@ -187,12 +187,12 @@ def _decode(args: opt.Args, path: Path, start: float) -> None:
 
     decoding, writing = args.make(DecodeOptions, FileOptions, columns="needed")
     out = output_file(args.output or default_output(path), default_output(path).name, site=writing.site)
-    check_outputs((out,), (path,), overwrite=args.overwrite or args.dry_run)
+    check_outputs((out, *files_beside(out, site=writing.site)), (path,), overwrite=args.overwrite or args.dry_run)
     check_format(out, writing)
     before = {"import": perf_counter() - start}
     document = decode_file(
         path, out, decoding, normals=writing.normals, viewer_cameras=writing.viewer_cameras,
-        overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
+        site=writing.site, overwrite=args.overwrite, dry_run=args.dry_run, seconds_before=before,
     )  # fmt: skip
     say_notes(document["notes"], quiet=args.silent)
     print_document(document, decoding_line(document), as_json=args.json, quiet=args.quiet and not args.dry_run)

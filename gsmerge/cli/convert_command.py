@@ -52,7 +52,7 @@ def convert(args: opt.Args) -> None:
     named = [path for path in (args.cameras, images) if isinstance(path, Path)]
     output = output_file(output, inputs[0].name, site=writing.site)
     check_outputs((output, *files_beside(output, site=writing.site)), (*inputs, *named), overwrite=args.overwrite)
-    check_format(output, writing, levels=True, cameras=True)
+    check_format(output, writing)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.record import record_run
 

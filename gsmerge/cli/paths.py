@@ -77,15 +77,11 @@ def files_beside(output: Path, *, site: bool = False) -> tuple[Path, ...]:
     return tuple(find_format(output).beside(output, site))
 
 
-def check_format(output: Path, options: FileOptions, *, levels: bool = False, cameras: bool = False) -> None:
-    """Raise UsageError if an output's format cannot be written, or does not fit the options.
-
-    ``levels``: an index of levels is allowed; ``cameras``: a COLMAP model is allowed. UsageError for an unknown ending,
-    a missing package, or a version of ``.spz`` with another format.
-    """
+def check_format(output: Path, options: FileOptions) -> None:
+    """Raise UsageError if an output's ending is unknown, its package is missing, or it does not fit the options."""
     from gsmerge.io import output_format
 
-    ending = output_format(output, levels=levels, cameras=cameras).ending
+    ending = output_format(output, levels=True, cameras=True).ending
     if options.columns == "full" and (ending != ".ply" or not options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
 

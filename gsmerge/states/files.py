@@ -14,21 +14,22 @@ from zipfile import ZipFile
 import numpy as np
 
 from gsmerge.compaction.files import read_input
-from gsmerge.compaction.placement import add_views
+from gsmerge.compaction.placement import add_views, name_photos
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io import atomic_output, atomic_outputs, output_format, write_gaussians
+from gsmerge.io import atomic_output, atomic_outputs, output_format
 from gsmerge.io.archives import new_member
 from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
-from gsmerge.io.formats.write import lost_harmonics
+from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.write import output_notes
 from gsmerge.io.locks import lock_folder
 from gsmerge.report import document_head, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.content_hash import content_hash, read_files
 from gsmerge.scene.exporters import AUTO, ReadHints
-from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.files import SceneFiles, scene_title
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions
@@ -127,14 +128,15 @@ def decode_file(
     *,
     normals: bool = True,
     viewer_cameras: bool = True,
+    site: bool = False,
     overwrite: bool = False,
     dry_run: bool = False,
     seconds_before: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Decode the Feature Gaussians in a ``.gsm`` into a file, with the cameras beside it; return the report.
+    """Decode the Feature Gaussians in a ``.gsm`` into an output, with the cameras in or beside it; return the report.
 
-    ``dry_run``: write nothing. Raises SceneError if a file cannot be read or written, UsageError for a K that the
-    networks do not make.
+    ``site``: a page has its parts beside it. ``dry_run``: write nothing. Raises SceneError if a file cannot be read or
+    written, UsageError for a K that the networks do not make.
     """
     start, state = perf_counter(), load_state(path)
     features, batches = state.features, state.about["batches"]
@@ -147,26 +149,29 @@ def decode_file(
         most = options.max_k * len(features)
         return document | {"dry_run": True, "output": {"path": str(out), "num_gaussians_at_most": most}, "notes": []}
     read = perf_counter()
-    cameras_path = viewer_cameras_path(out) if viewer_cameras else None
+    chosen, names = output_format(out, levels=True, cameras=True), features.names
+    cameras_path = viewer_cameras_path(out) if viewer_cameras and not chosen.cameras else None
     with atomic_outputs(overwrite=overwrite) as add:
-        temporary = add(out)
+        first = add(out)
         gaussians, done = decode_features(features, options), perf_counter()
         if len(gaussians) == 0:
             raise SceneError(path, "expected visible Gaussians, found none", "extend a new state by the scene")
-        lost = lost_harmonics(out, gaussians.sh_degree)
-        write_gaussians(
-            temporary, gaussians, overwrite=True, comments=[RESULT_COMMENT], ending=output_format(out).ending,
-            normals=normals,
-        )  # fmt: skip
+        cameras, photos = features.frame.leave_cameras(features.cameras), name_photos(None, names)
+        notes = [*output_notes(out, gaussians.sh_degree, photos), *rounding_notes(out, gaussians)]
+        contents = Contents(
+            [gaussians], [RESULT_COMMENT], cameras, photos, scene_title(path), normals=normals, apart=site
+        )
+        (files,) = chosen.write(add, out, first, contents).values()
+        num_bytes = sum(file.stat().st_size for file in files)
         if cameras_path is not None:
-            cameras = features.frame.leave_cameras(features.cameras)
-            add_views(add, cameras_path, cameras, features.names, overwrite=overwrite)
+            add_views(add, cameras_path, cameras, names, overwrite=overwrite)
+    chosen.finish(out)
     seconds = {**(seconds_before or {}), "read": read - start, "decode": done - read, "write": perf_counter() - done}
     return document | {
-        "output": {"path": str(out), "bytes": out.stat().st_size, "num_gaussians": len(gaussians)},
+        "output": {"path": str(out), "bytes": num_bytes, "num_gaussians": len(gaussians)},
         "ratio": len(gaussians) / max(num_input, 1),
         **seconds_document(seconds),
-        "notes": [*([lost] if lost else []), *rounding_notes(out, gaussians)],
+        "notes": notes,
     }
 
 

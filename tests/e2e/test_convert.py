@@ -20,9 +20,12 @@ from gsmerge.compaction.placement import find_placement, turn_to
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
+from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.colmap_model import model_files
 from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.ply import header_content
+from gsmerge.io.formats.table import Contents, Format
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
@@ -282,3 +285,39 @@ def test_all_columns_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> No
         assert header.count(b"property float") == 62
         assert not read(tmp_path / name).shN.any()
     assert run("convert", tmp_path / "a.ply", tmp_path / "b.spz", "--set", "columns=full").code == 2
+
+
+def _write_parts(add: AddOutput, path: Path, first: Path, contents: Contents) -> dict[Path, list[Path]]:
+    files = [first, *map(add, _name_parts(path, False))]
+    for file, part in zip(files, (contents.title, len(contents.cameras), len(contents.levels[0])), strict=True):
+        file.write_text(str(part))
+    return {path: files}
+
+
+def _name_parts(path: Path, apart: bool) -> tuple[Path, ...]:
+    return path.with_suffix(".views"), path.with_suffix(".rows")
+
+
+PARTS = Format(
+    ".parts", "a format of three files", None, None, 0, write=_write_parts, beside=_name_parts, levels="",
+    cameras="inside", lost="no harmonics in {ending}",
+)  # fmt: skip
+
+
+def test_a_new_format_of_several_files_with_cameras_is_one_row(
+    result: Path, tmp_path: Path, run: Run, small_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.io.formats.table.FORMATS", (PARTS, *formats.FORMATS))
+    out, small = tmp_path / "out.parts", tmp_path / "small.parts"
+    document = json.loads(run("convert", result, out, "--json", code=0).out)
+    assert (document["output"]["format"], document["viewer_cameras"]) == (".parts", None)
+    assert noted(document["notes"], "no harmonics in .parts")
+    assert document["output"]["bytes"] == sum(path.stat().st_size for path in tmp_path.glob("out.*"))
+    assert (tmp_path / "out.rows").read_text() == "400"
+    assert_refused(run("convert", result, out), 2, "out.parts", "--overwrite")
+    out.unlink()
+    assert_refused(run("convert", result, out), 2, "out.views", "--overwrite")  # its other files, too
+    quick = ("--effort", "draft", "--budget", "50", "-o", small)
+    assert_refused(run("compact", small_scene, *quick, "--levels", "2"), 2, "small.parts", "--levels")
+    run("compact", small_scene, *quick, code=0)
+    assert (tmp_path / "small.views").read_text() == str(len(gsmerge.read_scene(small_scene)))

@@ -215,6 +215,24 @@ def test_feature_gaussians_are_decoded(k: str, features: Path, tmp_path: Path, r
     assert "Feature Gaussians ->" in run("compact", features, *words, "--overwrite", code=0).out
 
 
+@pytest.mark.parametrize(
+    ("out", "files"),
+    [
+        ("a.sog", {"a.sog", "a.cameras.json"}),
+        ("a.html", {"a.html"}),
+        ("colmap", {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}),
+    ],
+)
+def test_feature_gaussians_in_every_kind_of_output(
+    out: str, files: set[str], features: Path, tmp_path: Path, run: Run
+) -> None:
+    document = json.loads(run("compact", features, "-o", tmp_path / out, "--json", code=0).out)
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()} == files
+    assert document["output"]["bytes"] == sum(
+        (tmp_path / name).stat().st_size for name in files if not name.endswith(".json")
+    )
+
+
 def test_feature_gaussians_as_arrays(features: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "features.npz"
     document = json.loads(run("convert", features, out, "--json", code=0).out)
