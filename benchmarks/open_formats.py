@@ -40,7 +40,7 @@ from gsmerge.compaction.convert import ConvertOptions, convert_files
 from gsmerge.errors import UsageError
 from gsmerge.geometry import sh0_to_rgb
 from gsmerge.io.cameras.colmap_model import POINTS
-from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.io.formats.table import FOLDER, PLACE
 from gsmerge.pages.page import ENGINE

@@ -18,7 +18,7 @@ import numpy as np
 import gsmerge
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.io import write_gaussians
-from gsmerge.io.cameras.json_files import viewer_cameras
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras
 from gsmerge.types import Cameras, Gaussians
 
 FITTED = 0.5  # share of the input's Gaussians that is fitted at most; the others come by splitting

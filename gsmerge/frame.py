@@ -17,7 +17,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
-SAMPLES = 65536  # Gaussians that the frame is measured on
+SAMPLE_GAUSSIANS = 65536  # Gaussians that the frame is measured on
 ROWS = 65536  # Gaussians per task
 MAX_VIEWS = 32  # of an unaligned scene, that the unit is taken from
 
@@ -89,7 +89,7 @@ def sample_rows(scene: Scene) -> np.ndarray:
     count = len(scene.gaussians) if valid is None else int(np.count_nonzero(valid))
     if count == 0:
         raise ValueError("expected at least one valid Gaussian, got none")
-    step = max(1, count // SAMPLES)
+    step = max(1, count // SAMPLE_GAUSSIANS)
     if valid is None or count == len(valid):
         return np.arange(0, count, step)
     return np.flatnonzero(valid)[::step]

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from gsmerge.budget import FileSize, exact_count, file_size, max_allowed
 from gsmerge.errors import UsageError
 from gsmerge.facts.confirm_depths import FEWEST, Agreement
-from gsmerge.facts.partition import usual_blocks
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import RENDERS
 from gsmerge.facts.scene_size import SceneSize
@@ -53,6 +52,9 @@ PER_STEP, PER_DRAWN = 700, 40
 RENDERS_STEPS = 0.35  # times the step sizes of a fit where renders stand for photos: it begins near to them
 PLACED_STEPS = 0.2  # the same where views are placed, which show other views less
 NO_FIT = "nothing is fitted to placed views: that takes --effort best, or the default effort with a --budget"
+BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
+WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece, unless it has many views
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same in views, where those of different blocks see little of each other
 LONE_K = 4  # where all views have one camera: no other adds Gaussians of its own to a surface
 
 
@@ -86,7 +88,7 @@ class Plan:
     match: MatchOptions  # Merging across views
     decode: DecodeOptions  # Gaussians per group
     fit: FitOptions  # Fit to the photos
-    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels, see :func:`merges_pairs`
+    merges_pairs: bool  # Whether neighbours are merged pair by pair, not superpixels
     clean: CleanOptions  # What is left out of the result
     unseen: Gaussians  # Merged canonical Gaussians that no view sees
     target_psnr: float | None  # PSNR (dB) that the input's views have to reach; None: no target, or not known yet
@@ -177,7 +179,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         )
         limits = choices.limits
         fit = _fit_photos(prepared, options, choices.fit)
-        pairs = checkpoint is None and merges_pairs(size, asked)
+        pairs = checkpoint is None and choices.merges_pairs
         if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
             factor = PLACED_STEPS if reference.placed else RENDERS_STEPS
             tuning = replace(fit.tuning.scaled(factor), max_ratio=math.inf)  # strokes of the input are wanted
@@ -227,6 +229,7 @@ class SceneChoices:
     checkpoint: str  # Name of the networks to load; "none"
     fit: FitOptions  # With the steps that are taken
     keeps_input: bool  # see :func:`keeps_input`
+    merges_pairs: bool  # see :func:`_can_merge_pairs`
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
         """Return all settings by flat name, with the values that the plan chose."""
@@ -263,7 +266,8 @@ def choose_for_scene(
     fit = replace(fit, fit_steps=steps, share=share)
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
-    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps)
+    pairs = _can_merge_pairs(scene, options, networks)
+    return SceneChoices(choose_blocks(scene, options), decode, limits, match, networks, fit, keeps, pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
@@ -279,6 +283,13 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     if asked > scene.num_views:
         raise UsageError(f"blocks {asked}: expected at most one for each of {scene.num_views} views")
     return asked
+
+
+def usual_blocks(num_gaussians: int, num_views: int) -> int:
+    """Return the usual number of blocks for an aligned scene, or an upper bound if the number of views decides."""
+    if num_gaussians > WHOLE_GAUSSIANS:
+        return -(-num_gaussians // BLOCK_GAUSSIANS)
+    return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
 def note_engine(scene: SceneSize, options: CompactOptions, blocks: int) -> None:
@@ -331,13 +342,13 @@ def _check_photos(prepared: Prepared, options: CompactOptions) -> None:
         raise UsageError("drop sky: expected photos, which say where the sky is; name them with --images")
 
 
-def merges_pairs(scene: SceneSize, options: CompactOptions) -> bool:
+def _can_merge_pairs(scene: SceneSize, options: CompactOptions, networks: str) -> bool:
     """Return whether neighbours are merged, not superpixels: no views show the scene, or renders of it alone.
 
     Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
     """
     usual = not options.changed(lambda one: one.acts_on == "superpixels" and not one.counts)
-    ours = options.method == OURS and choose_networks(options, scene) == "none"
+    ours = options.method == OURS and networks == "none"
     return ours and (scene.num_views == 0 or (usual and scene.rendered))
 
 

@@ -17,7 +17,7 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, m
 from gsmerge.io.photo_files import Size
 from gsmerge.types import Cameras, Gaussians
 
-_GRID_SAMPLES = 300  # Gaussians per view that cameras are estimated from
+_GRID_GAUSSIANS = 300  # Gaussians per view that cameras are estimated from
 
 
 def estimate_cameras(
@@ -32,7 +32,7 @@ def estimate_cameras(
     possible = [layout for layout in layouts if layout.per_pixel == 1 and len(layout.views) == len(names)]
     fits = []
     for layout in possible:
-        pairs = find_correspondences(gaussians.means, valid, subsample(layout, _GRID_SAMPLES))
+        pairs = find_correspondences(gaussians.means, valid, subsample(layout, _GRID_GAUSSIANS))
         fit = calibrate(pairs, layout.width, layout.height)
         fits += [] if fit is None else [fit]
     fits.sort(key=lambda fit: fit.worst_px)

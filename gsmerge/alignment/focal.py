@@ -31,15 +31,15 @@ from gsmerge.kernels.matrices import transform
 from gsmerge.kernels.pictures import sample_bilinear
 from gsmerge.types import Cameras, Gaussians
 
-_GRID_SAMPLES = 500  # Gaussians per view that intrinsics are solved from
+_GRID_GAUSSIANS = 500  # Gaussians per view that intrinsics are solved from
 _MAX_UNEVEN = 1.5  # of one focal length to the other
 _MAX_VIEWS = 12  # whose photos are compared with the Gaussians
 _SIDE = 256  # the longer one of these photos, pixels
 _SHORTEST = 0.25  # focal length that is tried, over the photo's longer side
 _STEP = 1.06  # from one that is tried to the next
 _STEPS = 48  # so that the last is four sides
-_FEW_SAMPLES = 3000  # Gaussians that are compared with the photos at each of these
-_SAMPLES = 20_000  # and near the best
+_FEW_GAUSSIANS = 3000  # Gaussians that are compared with the photos at each of these
+_SAMPLE_GAUSSIANS = 20_000  # and near the best
 _SPANS = (0.3, 0.08, 0.02, 0.005, 0.00125)  # shares of it around the best that are searched next
 _STRIDES = 0, 1, 2, 4  # of a round's change that are gone once more: along a valley (Hooke and Jeeves 1961)
 _ROUNDS = 16  # of each of them, at most
@@ -108,7 +108,7 @@ def _intrinsics_of_rays(
         for number, layout in enumerate(exact_layouts(count, views, grid.width, grid.height)):
             if len(set(layout.views)) < views:
                 continue
-            for sample in subsample(layout, _GRID_SAMPLES).with_views_in(view_orders(names)):
+            for sample in subsample(layout, _GRID_GAUSSIANS).with_views_in(view_orders(names)):
                 pairs = find_correspondences(ply.gaussians.means, ply.valid, sample)
                 solved = (_solve_intrinsics(pairs, viewmats) for viewmats in readings)
                 fits += [(px, values, number) for px, values in solved]
@@ -154,7 +154,7 @@ def _intrinsics_of_colors(
 ) -> np.ndarray | None:
     """Search for intrinsics ``[3,3]``, pixels, under which the Gaussians have the photos' colours."""
     pictures = _small_pictures(photos, size)
-    few = _sample(ply, _FEW_SAMPLES)
+    few = _sample(ply, _FEW_GAUSSIANS)
     focals = [_SHORTEST * max(pictures.images.shape[1:3])]
     while len(focals) < _STEPS:
         focals.append(focals[-1] * _STEP)
@@ -162,7 +162,7 @@ def _intrinsics_of_colors(
         checks = [_check(few, pictures, viewmats, focal) for focal in focals]
         best = max(range(len(focals)), key=lambda number: checks[number].score)
         if checks[best].ok and not math.isnan(checks[best].color_ratio):
-            many = _sample(ply, _SAMPLES)
+            many = _sample(ply, _SAMPLE_GAUSSIANS)
             K = _refine(many, pictures, viewmats, focals[best])
             return K * np.array([1 / pictures.ratio, 1 / pictures.ratio, 1])[:, None]
     return None

@@ -30,7 +30,7 @@ _WRONG_SIZE_PX = 0.3  # median distance that a grid of a wrong size does not rea
 
 
 @dataclass(frozen=True)
-class Fit:
+class GridReading:
     """A reading of the rows in a grid of some size."""
 
     grid: Grid
@@ -51,7 +51,7 @@ class Fit:
 class Recovery:
     """The reading of the rows that was taken, and how clearly it is the right one."""
 
-    fit: Fit
+    chosen: GridReading
     # how many times nearer the Gaussians are to their pixels than to shuffled pixels
     margin: float
     other: Reading | None = None  # another one that fits the pixels as well, against which the photos' colours decided
@@ -62,7 +62,7 @@ class Recovery:
     @property
     def best(self) -> Reading:
         """The reading of the rows."""
-        return self.fit.reading
+        return self.chosen.reading
 
     @property
     def description(self) -> str:
@@ -76,23 +76,29 @@ class Recovery:
         return text + ("; the photos' colours do not confirm it" if self.confirmed is False else "")
 
 
-def judge(fits: Sequence[Fit], read: Callable[[Grid], AlignmentInput], refine: Callable[[Fit], Fit]) -> Recovery | None:
-    """Take the fit that is the nearest to its pixels, or the one of similar fits whose photos have the right colours.
+def judge(
+    candidates: Sequence[GridReading],
+    read: Callable[[Grid], AlignmentInput],
+    refine: Callable[[GridReading], GridReading],
+) -> Recovery | None:
+    """Take the candidate nearest to its pixels, or the one of similar ones whose photos have the right colours.
 
-    ``read`` reads the photos of a grid, and ``refine`` scores a fit on more Gaussians. Frames that need less solving
-    come first. None if no fit stands out; SceneError where poses fit in several conventions.
+    ``read`` reads the photos of a grid, and ``refine`` scores one on more Gaussians. Frames that need less solving
+    come first. None if none stands out; SceneError where poses fit in several conventions.
     """
-    effort = min((fit.reading.effort for fit in fits), default=0)
-    first, *_ = ranked = sorted((fit for fit in fits if fit.reading.effort == effort), key=lambda fit: fit.px)
-    near = [fit for fit in ranked if not is_clearly_nearer(first.px, fit.px)]
-    conventions = list(dict.fromkeys(fit.grid.camera_file.convention for fit in near))
+    effort = min((each.reading.effort for each in candidates), default=0)
+    first, *_ = ranked = sorted(
+        (each for each in candidates if each.reading.effort == effort), key=lambda each: each.px
+    )
+    near = [each for each in ranked if not is_clearly_nearer(first.px, each.px)]
+    conventions = list(dict.fromkeys(each.grid.camera_file.convention for each in near))
     if len(conventions) > 1:
         both = " and as ".join(map(describe_convention, conventions[:2]))
         problem = f"expected poses that fit in one reading, found that they fit as {both}"
         raise SceneError(first.grid.camera_file.path, problem, "convert them to the format's own")
     if first.reading.layout.kind == "pruned":  # what lacks pixels fits into grids of nearly its size as well
-        near = [fit for fit in near if fit.grid.size == first.grid.size]
-    colors = [color_error(read(fit.grid), fit.reading.layout) for fit in near] if len(near) > 1 else [math.nan]
+        near = [each for each in near if each.grid.size == first.grid.size]
+    colors = [color_error(read(each.grid), each.reading.layout) for each in near] if len(near) > 1 else [math.nan]
     order = sorted(range(len(near)), key=lambda i: (colors[i], i))
     others = [i for i in order if _differs(near[i].reading.layout, near[order[0]].reading.layout)]
     if not others:  # of photos that were resized in several ways
@@ -109,16 +115,16 @@ def judge(fits: Sequence[Fit], read: Callable[[Grid], AlignmentInput], refine: C
     return Recovery(best, margin, other, next_color / max(color, 1e-3), True)
 
 
-def _accept(fit: Fit, read: Callable[[Grid], AlignmentInput]) -> Recovery | None:
-    """Accept a fit that has no others if its pixels beat shuffled ones; None if they do not."""
-    inputs = read(fit.grid)
-    shuffled_px, shuffled_color = score_shuffled(inputs, fit.reading)
-    if not beats_shuffled(fit.reading, shuffled_px):
+def _accept(candidate: GridReading, read: Callable[[Grid], AlignmentInput]) -> Recovery | None:
+    """Accept a candidate that has no others if its pixels beat shuffled ones; None if they do not."""
+    inputs = read(candidate.grid)
+    shuffled_px, shuffled_color = score_shuffled(inputs, candidate.reading)
+    if not beats_shuffled(candidate.reading, shuffled_px):
         return None
     confirmed = None  # where colours hardly vary, or there are no photos
     if shuffled_color > SAME_COLORS:
-        confirmed = color_error(inputs, fit.reading.layout) <= RANDOM_SHARE * shuffled_color
-    return Recovery(fit, shuffled_px / max(fit.px, AS_NEAR_PX), confirmed=confirmed)
+        confirmed = color_error(inputs, candidate.reading.layout) <= RANDOM_SHARE * shuffled_color
+    return Recovery(candidate, shuffled_px / max(candidate.px, AS_NEAR_PX), confirmed=confirmed)
 
 
 def _differs(layout: Layout, other: Layout) -> bool:

@@ -17,13 +17,13 @@ import numpy as np
 from gsmerge.alignment.cameras import other_conventions
 from gsmerge.alignment.frames import own_poses, solved_frames, usual_frames
 from gsmerge.alignment.grids import Grid
-from gsmerge.alignment.judge import Fit
+from gsmerge.alignment.judge import GridReading
 from gsmerge.alignment.layouts import Layout, every_nth, some_views, subsample, view_orders
 from gsmerge.alignment.resection import projective_error
 from gsmerge.alignment.score import (
     AS_NEAR_PX,
-    QUICK_SAMPLES,
-    SAMPLES,
+    QUICK_GAUSSIANS,
+    SAMPLE_GAUSSIANS,
     AlignmentInput,
     Correspondences,
     Reading,
@@ -41,7 +41,7 @@ from gsmerge.types import Cameras
 
 # pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
 _SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
-_SHOWN_SAMPLES = 200  # Gaussians of a view that it is judged by
+_SHOWN_GAUSSIANS = 200  # Gaussians of a view that it is judged by
 
 Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
 
@@ -95,19 +95,19 @@ class RowSource:
         return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
 
 
-def match_views(source: RowSource, places: Sequence[Place]) -> list[Fit]:
+def match_views(source: RowSource, places: Sequence[Place]) -> list[GridReading]:
     """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
     errors = [_projective_error(source, *place) for place in places]
     far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)
     shown = [place for place, error in zip(places, errors, strict=True) if error <= far and math.isfinite(error)]
-    fits = [fit for place in shown for fit in _fit_views(source, *place)]
+    candidates = [candidate for place in shown for candidate in _fit_views(source, *place)]
     usual, convention = source.camera_file.viewmats, source.camera_file.convention
-    for poses in other_conventions(usual, convention) if shown and not fits else ():
+    for poses in other_conventions(usual, convention) if shown and not candidates else ():
         for grid, layout in shown:
             file = replace(grid.camera_file, viewmats=poses.viewmats, convention=poses.convention)
             moved = replace(grid, camera_file=file, cameras=replace(grid.cameras, viewmats=poses.viewmats))
-            fits += _fit_views(source, moved, layout)
-    return fits
+            candidates += _fit_views(source, moved, layout)
+    return candidates
 
 
 def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
@@ -118,17 +118,17 @@ def _projective_error(source: RowSource, grid: Grid, layout: Layout) -> float:
     limit = _SHOWN_LIMITS * pixel_limit(*grid.size)
     inputs = source.inputs(grid, photos=False)
     for view in some_views(layout):
-        pairs = inputs.pairs(subsample(layout.select(view), _SHOWN_SAMPLES))
+        pairs = inputs.pairs(subsample(layout.select(view), _SHOWN_GAUSSIANS))
         error = projective_error(pairs.points, pairs.pixels)
         if error <= limit:
             return error
     return math.inf
 
 
-def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[Fit]:
+def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[GridReading]:
     """Fit the views of a layout to the file's cameras, in each likely order and in that of the nearest poses."""
     inputs = source.inputs(grid, photos=False)
-    pairs = inputs.pairs(sample_layout(layout, QUICK_SAMPLES))
+    pairs = inputs.pairs(sample_layout(layout, QUICK_GAUSSIANS))
     numbers, parts = np.unique(layout.views, return_inverse=True)  # of the views; the view of each part
     count, pairs = len(numbers), replace(pairs, views=parts[pairs.parts])
 
@@ -139,21 +139,21 @@ def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[Fit]:
     def find_own(cameras: Sequence[int]) -> dict[int, np.ndarray]:
         return solve(grid.cameras.Ks[list(cameras)].astype(np.float64).tobytes())
 
-    def fit(cameras: Sequence[int]) -> Fit:
+    def read_as(cameras: Sequence[int]) -> GridReading:
         own = {cameras[view]: pose for view, pose in find_own(cameras).items()}
         views = np.array(cameras)
         labelled = replace(layout, views=tuple(views[parts].tolist()))
-        return Fit(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
+        return GridReading(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
 
     some = [ids for ids in (*every_nth(len(grid.cameras)), tuple(range(count))) if len(ids) == count]
     orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
-    fits = [fit(order) for order in orders]
+    candidates = [read_as(order) for order in orders]
     nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)
     if nearest is not None and nearest not in orders and source.scale is None:
-        other = fit(nearest)
+        other = read_as(nearest)
         same_axes = ("same", "scaled", "shifted") if count > 1 else ("same",)  # one view fits any camera
-        fits += [other] if other.reading.frame.kind in same_axes else []
-    return [each for each in fits if each.reading.alignment.ok]
+        candidates += [other] if other.reading.frame.kind in same_axes else []
+    return [each for each in candidates if each.reading.alignment.ok]
 
 
 def _nearest_cameras(own: Mapping[int, np.ndarray], count: int, cameras: Cameras) -> tuple[int, ...] | None:
@@ -188,21 +188,24 @@ def read_views(
     readings: list[Reading] = []
     for effort, frame in frames:
         reading = replace(score_layout(inputs, layout, frame, pairs), effort=effort)
-        fit = reading.alignment
+        measured = reading.alignment
         if effort == 2 and readings:
             break
-        if fit.ok and is_as_near(fit.worst_px, least.worst_px):
+        if measured.ok and is_as_near(measured.worst_px, least.worst_px):
             return reading
         is_solved = effort > 0 and inputs.scale is None
-        if fit.ok and not (is_solved and is_clearly_nearer(least.middle_px, fit.middle_px)):
+        if measured.ok and not (is_solved and is_clearly_nearer(least.middle_px, measured.middle_px)):
             readings.append(reading)  # otherwise cameras are wrong
     lowest = min((reading.alignment.worst_px for reading in readings), default=math.inf)
     near = (reading for reading in readings if is_as_near(reading.alignment.worst_px, lowest))
     return next(near, replace(bound, alignment=replace(least, ok=False)))
 
 
-def refine(source: RowSource, fit: Fit) -> Fit:
+def refine(source: RowSource, candidate: GridReading) -> GridReading:
     """Score a fit again, with its frame solved again, on more Gaussians."""
-    inputs = source.inputs(fit.grid, photos=False)
-    pairs = inputs.pairs(sample_layout(fit.reading.layout, SAMPLES))
-    return replace(fit, reading=read_views(inputs, fit.reading.layout, pairs, own_poses(pairs, fit.grid.cameras.Ks)))
+    inputs = source.inputs(candidate.grid, photos=False)
+    pairs = inputs.pairs(sample_layout(candidate.reading.layout, SAMPLE_GAUSSIANS))
+    return replace(
+        candidate,
+        reading=read_views(inputs, candidate.reading.layout, pairs, own_poses(pairs, candidate.grid.cameras.Ks)),
+    )

@@ -15,7 +15,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import QuatChoice
 from gsmerge.types import Scene
 
-_SAMPLES = 3000  # pixels per view whose surface is used
+_SAMPLE_PIXELS = 3000  # pixels per view whose surface is used
 _MOST_VIEWS = 200  # whose surfaces are used
 _STEP = 2  # pixels to the neighbours that span the surface
 _FLAT = 0.8  # thinnest over middle scale, at most, where a Gaussian's thinnest axis is a normal of its surface
@@ -183,7 +183,7 @@ def _normals(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute surface normals ``[t,3]`` at a sample of pixels; also return the rows and views of these."""
     v, h, w = scene.valid.shape
     inner = np.arange(h * w).reshape(h, w)[_STEP:-_STEP, _STEP:-_STEP].reshape(-1)
-    step = spread_step(len(inner) // _SAMPLES, w - 2 * _STEP)
+    step = spread_step(len(inner) // _SAMPLE_PIXELS, w - 2 * _STEP)
     views = np.arange(0, v, -(-v // _MOST_VIEWS))
     rows = (h * w * views[:, None] + inner[::step]).reshape(-1)
     valid, means = scene.valid.reshape(-1), scene.gaussians.means

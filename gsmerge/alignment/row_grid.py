@@ -26,7 +26,8 @@ _MAX_STEP = 8.0  # times the median; longer steps, at the edges of things, count
 _MIN_PEAK = 8.0  # times the median correlation of steps: a period
 _SHARE = 0.25  # of the highest peak: lines that repeat less than views do
 _PERIODS = 6  # that are tried
-_SAMPLES, _MIN_SAMPLES, _MAX_SAMPLES = 200, 60, 10_000  # Gaussians of a view to look at, to solve from, of all views
+_SAMPLE_GAUSSIANS = 200  # of a view that are looked at
+_LEAST_GAUSSIANS, _MOST_GAUSSIANS = 60, 10_000  # that a calibration is solved from: of a view, of all views
 _PLACES = tuple(number * 0.6180339887498949 % 1 for number in range(9))  # in the file, of views that are looked at
 _RECURRENCE = 0.7548776662466927, 0.5698402909980532  # powers of the plastic number's inverse
 
@@ -66,7 +67,7 @@ def _calibrate_layouts(
     """Calibrate the cameras of layouts; leave out layouts whose pixels do not match the rows."""
     fits = []
     for layout in layouts:
-        samples = max(_MIN_SAMPLES, min(_MAX_SAMPLES // len(layout.views), _MAX_SAMPLES // 10))
+        samples = max(_LEAST_GAUSSIANS, min(_MOST_GAUSSIANS // len(layout.views), _MOST_GAUSSIANS // 10))
         pairs = find_correspondences(means, valid, _thin(layout, samples))
         calibration = calibrate(pairs, layout.width, layout.height)
         fits += [] if calibration is None else [(layout, calibration)]
@@ -76,7 +77,7 @@ def _calibrate_layouts(
 def _shows_pixels(means: np.ndarray, valid: np.ndarray, layout: Layout) -> bool:
     """Return whether projective cameras show the rows of the first, the middle and the last view in their pixels."""
     for view in some_views(layout):
-        pairs = find_correspondences(means, valid, _thin(layout.select(view), _SAMPLES))
+        pairs = find_correspondences(means, valid, _thin(layout.select(view), _SAMPLE_GAUSSIANS))
         if not projective_error(pairs.points, pairs.pixels) <= pixel_limit(layout.width, layout.height):
             return False
     return True
@@ -132,7 +133,7 @@ def _find_height(means: np.ndarray, valid: np.ndarray, step: int, width: int) ->
             break
         limit, errors = pixel_limit(width, height), []
         for view, layer in dict.fromkeys((int(share * views), int(share * step)) for share in _PLACES):
-            pixels = _spread(_SAMPLES, width, height)
+            pixels = _spread(_SAMPLE_GAUSSIANS, width, height)
             rows = (view * width * height + pixels) * step + layer
             rows, pixels = rows[valid[rows]], pixels[valid[rows]]
             if len(rows) >= MIN_POINTS:

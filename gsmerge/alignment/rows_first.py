@@ -30,7 +30,7 @@ from gsmerge.alignment.grids import (
     square_sizes,
     with_photo_size,
 )
-from gsmerge.alignment.judge import Fit, Recovery, judge
+from gsmerge.alignment.judge import GridReading, Recovery, judge
 from gsmerge.alignment.layouts import (
     ESTIMATED,
     MAY_BE_UNALIGNED,
@@ -59,7 +59,7 @@ _ENOUGH, _FEW = 24, 0.05  # finite rows that decide between readings; fewer will
 _MANY_PIXELS = 2  # times as many pixels as rows: likely photos of another size than the grid's
 _PER_VIEW = 500  # finite rows for each camera, from which it is searched which pixels lack one
 _SAME_FOCAL, _OFF = 0.1, 1  # by which focal lengths may differ, relative, and principal points, pixels
-_MOVED_SAMPLES = 2000  # Gaussians of a view that its moved pose is solved from
+_MOVED_GAUSSIANS = 2000  # Gaussians of a view that its moved pose is solved from
 
 
 @dataclass(frozen=True)
@@ -138,21 +138,21 @@ def _read_in_order(source: RowSource, grids: Sequence[Grid]) -> Recovery | None:
 
     Or read them by the pixels that they showed when their cameras were estimated.
     """
-    count, pixel_ids, fits = len(source.ply.gaussians), source.camera_file.pixel_ids, []
+    count, pixel_ids, candidates = len(source.ply.gaussians), source.camera_file.pixel_ids, []
     for grid in grids:
         inputs = source.inputs(grid, photos=False)
         if pixel_ids is not None:
             layout = dropped_layout(pixel_ids, len(grid.cameras), *grid.size)
-            fits.append(Fit(grid, score_layout(inputs, layout, IDENTITY)))
+            candidates.append(GridReading(grid, score_layout(inputs, layout, IDENTITY)))
         elif count == len(grid.cameras) * math.prod(grid.size) and source.may_be("view-major") and _has_enough(source):
             layouts = plain_layout(len(grid.cameras), *grid.size).with_views_in(source.orders(grid))
             best, *others = (score_layout(inputs, layout, IDENTITY) for layout in layouts)
             worst = best.alignment.worst_px
             far = SHUFFLED_MARGIN * max(worst, AS_NEAR_PX)
             if source.scale is None and worst <= _PLAIN_PX and all(o.alignment.worst_px >= far for o in others):
-                fits.append(Fit(grid, best))
-    fits = [fit for fit in fits if fit.reading.alignment.ok]
-    return judge(fits, source.inputs, lambda fit: fit) if fits else None
+                candidates.append(GridReading(grid, best))
+    candidates = [candidate for candidate in candidates if candidate.reading.alignment.ok]
+    return judge(candidates, source.inputs, lambda candidate: candidate) if candidates else None
 
 
 def _has_enough(source: RowSource) -> bool:
@@ -173,12 +173,12 @@ def _find_pixels(source: RowSource, named: Sequence[Grid]) -> Recovery | None:
         return None
     found = None
     for turn, places in enumerate(_rounds(source, named)):
-        fits = match_views(source, places)
-        other = judge(fits, source.inputs, partial(refine, source)) if fits else None
+        candidates = match_views(source, places)
+        other = judge(candidates, source.inputs, partial(refine, source)) if candidates else None
         if other is None and turn == 0 and named:
             other = _move_cameras(source, named[0])
-        found = min(filter(None, (found, other)), key=lambda each: each.fit.px, default=None)
-        if found is not None and not found.fit.is_doubtful:
+        found = min(filter(None, (found, other)), key=lambda each: each.chosen.px, default=None)
+        if found is not None and not found.chosen.is_doubtful:
             return found
     return found
 
@@ -300,15 +300,15 @@ def _move_cameras(source: RowSource, grid: Grid) -> Recovery | None:
     best = min(readings, key=lambda reading: reading.alignment.worst_px, default=None)
     if best is None or not NEAR_PX < best.alignment.worst_px <= max_pixels(*grid.size):
         return None
-    pairs = inputs.pairs(subsample(best.layout, _MOVED_SAMPLES))
+    pairs = inputs.pairs(subsample(best.layout, _MOVED_GAUSSIANS))
     path = str(source.camera_file.path)
     moved = move_cameras(pairs, grid.cameras, source.camera_file.names, path, inputs.images)
     if moved is None:
         return None
     given, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
     grid = replace(grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, given=given)
-    fit = Fit(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
-    found = judge([fit], source.inputs, lambda each: each) if fit.reading.alignment.ok else None
+    candidate = GridReading(grid, score_layout(source.inputs(grid), best.layout, IDENTITY))
+    found = judge([candidate], source.inputs, lambda each: each) if candidate.reading.alignment.ok else None
     return None if found is None or found.confirmed is False else found
 
 
@@ -361,7 +361,9 @@ def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Align
     grid, frame = placed
     inputs, moved = source.inputs(grid), replace(grid, cameras=frame.move(grid.cameras))
     for ((_, layout),) in _follow_cameras(source, [moved]):
-        found = judge([Fit(grid, score_layout(inputs, layout, frame))], source.inputs, lambda fit: fit)
+        found = judge(
+            [GridReading(grid, score_layout(inputs, layout, frame))], source.inputs, lambda candidate: candidate
+        )
         if found is not None:
             return _make_result(source, found)
     return AlignmentResult(
@@ -377,7 +379,7 @@ def _place_upright(source: RowSource, grid: Grid, rotation: Similarity) -> Align
 
 def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras in the frame of the Gaussians."""
-    grid, best = recovery.fit.grid, recovery.best
+    grid, best = recovery.chosen.grid, recovery.best
     inputs = source.inputs(grid)
     free_pages(vars(inputs.gaussians).values())  # the search has looked at all rows
     frame, layout, count = best.frame, best.layout, len(grid.cameras)

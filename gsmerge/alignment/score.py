@@ -20,7 +20,7 @@ SHUFFLED_MARGIN = 5.0  # and by which it must beat shuffled pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 RANDOM_SHARE = 0.85  # of the colours' distance from shuffled pixels: as good as random
 SAME_COLORS = 0.01  # mean distance of colours from shuffled pixels below which photos say nothing
-QUICK_SAMPLES, SAMPLES, MIN_SAMPLES = 1500, 6000, 60  # Gaussians of a score; per view at least
+QUICK_GAUSSIANS, SAMPLE_GAUSSIANS, MIN_SAMPLE_GAUSSIANS = 1500, 6000, 60  # Gaussians of a score; per view at least
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 MAX_MEDIAN_PX = 1.5  # backbones move a Gaussian within its pixel, and some a little beyond
 
@@ -133,9 +133,9 @@ def pixel_limit(width: int, height: int) -> float:
     return max(0.5, min(MAX_MEDIAN_PX, 0.1 * math.sqrt(width * height)))
 
 
-def sample_layout(layout: Layout, samples: int = SAMPLES) -> Layout:
+def sample_layout(layout: Layout, samples: int = SAMPLE_GAUSSIANS) -> Layout:
     """Thin a layout to a sample of rows for scoring."""
-    return subsample(layout, max(MIN_SAMPLES, samples // len(layout.views)))
+    return subsample(layout, max(MIN_SAMPLE_GAUSSIANS, samples // len(layout.views)))
 
 
 def score_layout(

@@ -18,13 +18,13 @@ from gsmerge.types import Cameras, Gaussians
 
 _FRAME_GAIN = 1.1  # times the score of the cameras as given, for another frame; of as good ones those stay as they are
 _PEAK_GAIN = 1.05  # times that of a scale two steps of the search beside it, for a scale that colours chose
-_SEEN_SAMPLES = 20_000  # Gaussians that are projected to see whether cameras see them
-_FEW_SAMPLES, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
+_SEEN_GAUSSIANS = 20_000  # Gaussians that are projected to see whether cameras see them
+_FEW_GAUSSIANS, _MAX_PROJECTED = 200, 4_000_000  # at least, and times the cameras at most
 _MIN_SEEN = 0.5  # share of them that some camera sees
 _MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, of the foremost ones alone in a frame that colours chose
 _FRONT, _PER_CELL = 1.05, 3  # times the depth of the nearest one of its cell; Gaussians of a cell
 _SCALES = np.geomspace(1 / 30, 30, 55)  # of the cameras' positions, tried in turn
-_SCALE_SAMPLES = 2000  # Gaussians that they are tried on
+_SCALE_GAUSSIANS = 2000  # Gaussians that they are tried on
 # next, nearer and nearer: reach (natural logarithm), steps, Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 _MIN_PADDING = 16  # equal rows at the origin: fewer may be Gaussians
@@ -59,7 +59,7 @@ def check_cameras(
     valid: np.ndarray,
     cameras: Cameras,
     images: np.ndarray,
-    samples: int = _SEEN_SAMPLES,
+    samples: int = _SEEN_GAUSSIANS,
     *,
     foremost: bool = False,
 ) -> CameraCheck:
@@ -67,14 +67,14 @@ def check_cameras(
 
     With ``foremost`` only Gaussians that no other hides count for the colours.
     """
-    samples = min(samples, max(_FEW_SAMPLES, _MAX_PROJECTED // len(cameras)))
+    samples = min(samples, max(_FEW_GAUSSIANS, _MAX_PROJECTED // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
     points = gaussians.means[rows].astype(np.float64)
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
     visible, errors, shuffled_errors = np.zeros(len(rows), bool), [], []
     rng = np.random.default_rng(0)
-    at_once = 1 + _SEEN_SAMPLES // max(1, len(rows))
+    at_once = 1 + _SEEN_GAUSSIANS // max(1, len(rows))
     for first in range(0, len(cameras), at_once):
         some = cameras[first : first + at_once]
         with np.errstate(all="ignore"):
@@ -218,7 +218,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     return best if _stands_out(inputs, best) and _score_frame(inputs, best) > _FRAME_GAIN * enough else None
 
 
-def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN_SAMPLES) -> float:
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN_GAUSSIANS) -> float:
     """Score what the cameras see in a frame; 0 where the photos cannot tell."""
     # the first camera may see all Gaussians at any scale
     seen = slice(1 if len(inputs.cameras) > 1 else 0, None)
@@ -227,7 +227,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _SEEN
     return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
 
 
-def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _SEEN_SAMPLES) -> Similarity:
+def _best_frame(inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _SEEN_GAUSSIANS) -> Similarity:
     return max(frames, key=lambda frame: _score_frame(inputs, frame, samples))
 
 
@@ -249,7 +249,7 @@ def _scaled(frame: Similarity, factor: float) -> Similarity:
 
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     """Find the scale at which the colours are nearest to the photos."""
-    best = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_SAMPLES)
+    best = _best_frame(inputs, (_scaled(frame, float(scale)) for scale in _SCALES), _SCALE_GAUSSIANS)
     for reach, steps, samples in _FINER:
         factors = exp(np.linspace(-reach, reach, steps))
         best = _best_frame(inputs, [_scaled(best, float(factor)) for factor in factors], samples)

@@ -25,7 +25,7 @@ from gsmerge.types import Cameras
 
 _QUANTILE = 0.95  # of the distances along the widest axis, which is 1 in such a file
 _SMALL = 1e-3  # how exactly
-_ROUGH_SAMPLES, _ROUGH = 2000, 1.0  # rows that are looked at first, and how far off before they are turned back
+_ROUGH_ROWS, _ROUGH = 2000, 1.0  # rows that are looked at first, and how far off before they are turned back
 _PER_PIXEL = (1, 2, 3)  # Gaussians of a pixel
 _OUTSIDE = 999  # a colour that no pixel has
 _UNIQUE = 1.1  # times as far as the nearest place is the next one, at least
@@ -56,7 +56,7 @@ class _Try:
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation, from any camera, of rows centred, rescaled and turned upright; None for other rows."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    few = means[:: max(1, len(means) // _ROUGH_SAMPLES)]
+    few = means[:: max(1, len(means) // _ROUGH_ROWS)]
     if not len(few) or _uneven(few) > _ROUGH:
         return None
     for view, viewmat in enumerate(inputs.cameras.viewmats):

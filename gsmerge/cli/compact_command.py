@@ -100,7 +100,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
         _decode(args, features, start)
         return
     hints = args.hints()
-    from gsmerge.io.cameras.json_files import viewer_cameras_path
+    from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
     from gsmerge.io.formats.table import find_format, output_format
     from gsmerge.io.formats.write import level_output
 
@@ -225,7 +225,7 @@ def _check_scenes(args: opt.Args) -> None:
 
 def _warn_of_memory(files: SceneFiles, settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before reading if the scene is not likely to fit into memory; not if it is compacted in blocks."""
-    from gsmerge.facts.partition import gaussians_at_once
+    from gsmerge.compaction.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.estimate import memory_bytes, memory_problem

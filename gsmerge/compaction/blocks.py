@@ -11,10 +11,7 @@ import numpy as np
 from gsmerge.alignment.registration.join import concat_scenes
 from gsmerge.budget import file_size
 from gsmerge.compaction.file_size import drop_to_bytes, measure_rest
-from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
-from gsmerge.compaction.result import CompactResult, measure_besides, measure_input, measure_on_files, measure_result
-from gsmerge.facts.partition import (
-    WHOLE_GAUSSIANS,
+from gsmerge.compaction.partition import (
     Block,
     Covisibility,
     count_factors,
@@ -24,13 +21,15 @@ from gsmerge.facts.partition import (
     partition_apart,
     partition_views,
 )
+from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
+from gsmerge.compaction.result import CompactResult, measure_besides, measure_input, measure_on_files, measure_result
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.pipeline import start
-from gsmerge.plan import Plan, SceneChoices, make_plan
+from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices, make_plan
 from gsmerge.raster import contributions, tile_view
 from gsmerge.raster import prepare as prepare_splats
 from gsmerge.raster.metrics import describe_loss

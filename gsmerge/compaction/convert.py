@@ -15,8 +15,8 @@ from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame
 from gsmerge.io import GaussianFile, atomic_outputs, file_notes, output_format, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
-from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import holds_images
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import kept_comments
 from gsmerge.io.formats.rounding import rounding_notes

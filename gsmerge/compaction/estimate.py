@@ -10,9 +10,9 @@ import numpy as np
 
 from gsmerge.compaction.files import Outputs, check_cameras, sized
 from gsmerge.compaction.methods import check_method
+from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.compaction.search import AUTO_RUNGS, LONG, RUNGS, SHORT, rungs
 from gsmerge.facts.confirm_depths import confirm_depths
-from gsmerge.facts.partition import gaussians_at_once
 from gsmerge.facts.place_cameras import count_placed, placed_views
 from gsmerge.facts.prepare import missing_notes
 from gsmerge.facts.scene_size import SceneSize, measure_size
@@ -26,7 +26,6 @@ from gsmerge.plan import (
     SceneChoices,
     choose_for_scene,
     load_networks,
-    merges_pairs,
     resolve_budget,
     stands_alone,
 )
@@ -49,7 +48,7 @@ from gsmerge.stages.segment import largest_count
 from gsmerge.types import Scene
 
 COARSER = 0.5  # of the time of a result, that each coarser level takes
-MAX_DRAWN_SAMPLES = 10_000  # Gaussians of which an estimate asks how many lie in a view
+MAX_DRAWN_GAUSSIANS = 10_000  # Gaussians of which an estimate asks how many lie in a view
 
 
 def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
@@ -81,7 +80,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
             views=count_placed(placed_views(steps)), tries=TRIED if choices.keeps_input else 1,
         )  # fmt: skip
     else:
-        inside = float(np.mean(shares_inside(scene, MAX_DRAWN_SAMPLES) or [1.0]))
+        inside = float(np.mean(shares_inside(scene, MAX_DRAWN_GAUSSIANS) or [1.0]))
         seconds = wall_seconds(
             at_once * choices.blocks, len(scene), settings, threads=threads, fit_steps=steps, num_drawn=drawn * inside,
             **_search(size, options, choices, inside),
@@ -97,7 +96,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if merges_pairs(size, options) else None if distributed else limits.per_view,
+        "superpixels_per_view": 0 if choices.merges_pairs else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings | {"fit": choices.fit.fit}),
         "fit_steps": choices.fit.steps,

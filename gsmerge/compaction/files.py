@@ -34,7 +34,7 @@ from gsmerge.types import Scene
 
 # Opacity times area of a scene's Gaussians together, of each view, as a share of its box's squared diagonal: all of it
 # that is left once they are merged is at most a tenth of this where each result is too transparent to be kept
-COVERED, SAMPLES = 0.006, 200_000
+COVERED, SAMPLE_GAUSSIANS = 0.006, 200_000
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def nothing_left(path: Path) -> SceneError:
 def shows_nothing(scene: Scene) -> bool:
     """Return whether a run would end with :func:`nothing_left`; a scene that covers little is merged to find out."""
     gaussians = scene.finite_gaussians
-    sample = gaussians[:: max(1, len(gaussians) // SAMPLES)]
+    sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     if len(sample) == 0:
         return False
     low, high = np.percentile(sample.means.astype(np.float64), BOX_QUANTILES, axis=0)

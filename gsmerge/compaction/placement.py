@@ -13,8 +13,8 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.camera_file import to_cameras
-from gsmerge.io.cameras.json_files import viewer_cameras
 from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras
 from gsmerge.io.formats.table import NamedPhotos
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul

@@ -17,7 +17,7 @@ from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors, photos_of, pixel_weights, shrink_pictures
 from gsmerge.types import Cameras, Gaussians, Scene
 
-SAMPLES = 1 << 17  # Gaussians that are drawn
+SAMPLE_GAUSSIANS = 1 << 17  # Gaussians that are drawn
 SIDE = 96  # pixels of the longer side of pictures that photos are compared with
 LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
 
@@ -96,7 +96,7 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     return Pairs(photos_of(photos, scene.cameras, level).images, shown)
 
 
-def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLES) -> Shown:
+def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS) -> Shown:
     """Make small pictures of what a scene's Gaussians show in its views, in any frame.
 
     Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.

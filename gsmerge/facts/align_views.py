@@ -25,10 +25,10 @@ from gsmerge.types import PicturedScene
 
 SIDES = (60, 120, 240)  # longer side of the photos, pixels, one after the other
 MIN_SIDE = 24  # pixels of the shorter side at the first size, below which photos say too little
-OVERLAP_SAMPLES = 400  # pixels of a view by which its neighbours are chosen
+OVERLAP_PIXELS = 400  # pixels of a view by which its neighbours are chosen
 BORDER = 2  # pixels that no lookup goes near
-SAMPLES = 1500  # pixels of a view that are looked up, those where the photo changes most
-FIRST_SAMPLES, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which right poses pay for
+SAMPLE_PIXELS = 1500  # pixels of a view that are looked up, those where the photo changes most
+FIRST_PIXELS, FIRST_STEPS = 600, 2  # the same, and the most steps, at the first size, which right poses pay for
 NEIGHBOURS = 4  # views that a view is looked up in
 MIN_OVERLAP = 0.2  # share of a view's pixels that a neighbour must see
 STEPS = 6  # most Gauss-Newton steps at each size
@@ -87,7 +87,7 @@ def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = Fa
     viewmats = start
     for side in sides:
         check = side == sides[0] != sides[-1] and not always
-        level = _level_of(scene, pairs, largest / side, FIRST_SAMPLES if check else SAMPLES)
+        level = _level_of(scene, pairs, largest / side, FIRST_PIXELS if check else SAMPLE_PIXELS)
         viewmats, first, last = _descend(level, viewmats, check=check)
         before = first if side == sides[0] else _compare(level, start)
         if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, last, end=side == sides[-1])):
@@ -100,7 +100,7 @@ def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = Fa
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that see most of it."""
     cameras, means = scene.cameras, scene.gaussians.means.reshape(len(scene), -1, 3)
-    step = max(1, scene.pixels_per_view // OVERLAP_SAMPLES)
+    step = max(1, scene.pixels_per_view // OVERLAP_PIXELS)
     size, pairs, chosen = np.array([cameras.width, cameras.height]), set(), set(views)
     for view in views:
         xyz = means[view, ::step][scene.valid[view].reshape(-1)[::step]]

@@ -18,7 +18,7 @@ from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import Scene
 
-SAMPLES = 1200  # pixels of a view
+SAMPLE_PIXELS = 1200  # pixels of a view
 NEIGHBORS = 16  # nearest other views in which they are looked up
 REACH, PIXELS = 1 / 120, 1.5  # of the longer side, and pixels at least: distance to which a pixel is found again
 SAME = 0.05  # logarithm of two depths of one surface
@@ -85,7 +85,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
     def count(view: int) -> np.ndarray:
         rows = np.flatnonzero(valid[view])
-        rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLES))]
+        rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), SAMPLE_PIXELS))]
         points, pixels = means[view, rows].astype(np.float64), np.stack([rows % width, rows // width], 1) + 0.5
         others = nearest_views(centres, view)[:NEIGHBORS]
         places, depths = project(points, cameras[others])

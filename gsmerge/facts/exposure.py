@@ -31,7 +31,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
-SAMPLES = 2000  # pixels of a view that are looked up in the others
+SAMPLE_PIXELS = 2000  # pixels of a view that are looked up in the others
 SAME_DEPTH = 0.05  # logarithm of depths that are of one surface
 LOW, HIGH = 0.05, 0.95  # colours in between are neither noise nor clipped
 MIN_PAIRS = 60  # pixels that two views must share; so many of each pair are compared again
@@ -192,7 +192,7 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between views that see the same surfaces."""
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
-    sample = np.random.default_rng(0).permutation(size)[:SAMPLES]
+    sample = np.random.default_rng(0).permutation(size)[:SAMPLE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
     def measure(row: int) -> list[_Pair]:

@@ -23,7 +23,7 @@ JUDGES, JUDGE_SIZE = 8, 512  # views that judge a result, and their pixels per s
 FITTED = 16  # views that a fit without cameras sees of each kind, and half of it on a walk
 FITTED_LONG, LONG = 48, 600  # the same of a long fit, and steps of it from which on it is one
 FEWER = 3  # of the candidates every third is tried where views only judge
-SAMPLES = 40_000  # Gaussians that candidates are judged by
+SAMPLE_GAUSSIANS = 40_000  # Gaussians that candidates are judged by
 EXTENT = (0.05, 0.95)  # quantiles of the positions, per axis, that the scene is taken to span
 AROUND = 40  # candidate cameras around the scene
 ABOVE = -0.25  # height of the ring of cameras to look from, in its radii: y points down
@@ -67,7 +67,7 @@ def add_views(scene: Scene, *, shown: bool = False) -> Scene:
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
     """Place cameras to look from: on a ring around the scene, which may be an object, then inside: it may be a room."""
     inside = place_cameras(gaussians, NUM_VIEWS // 2)
-    centre, half = _extent(thin_out(gaussians, SAMPLES).means.astype(np.float64))
+    centre, half = _extent(thin_out(gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64))
     turns = 2 * np.pi * np.arange(len(inside)) / len(inside)
     ring = np.stack([sin(turns), np.full(len(turns), ABOVE), -cos(turns)], 1)  # the first where most models look from
     around = replace(inside, viewmats=_around(centre, half, FAR_RADII, normalize(ring)))
@@ -110,7 +110,7 @@ def draw_placed(scene: PicturedScene, count: int) -> PicturedScene:
 
     They come last. What a background shows through the renders is their ``empty``.
     """
-    means = thin_out(scene.gaussians, SAMPLES).means.astype(np.float64)
+    means = thin_out(scene.gaussians, SAMPLE_GAUSSIANS).means.astype(np.float64)
     centre, half = _extent(means)
     outside = [_around(centre, half, radii, _sphere(count)) for radii in (FAR_RADII, NEAR_RADII)]
     within = [_walk(np.median(means, axis=0), half, count // 2), place_cameras(scene.gaussians, count).viewmats]
@@ -145,7 +145,7 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
     if views == 1:
         return scene
     count = min(int(OUTSIDE * views), MOST_OUTSIDE)
-    more = outside_cameras(means[:: max(1, len(means) // SAMPLES)], scene.cameras, count, NEAREST, FARTHEST)
+    more = outside_cameras(means[:: max(1, len(means) // SAMPLE_GAUSSIANS)], scene.cameras, count, NEAREST, FARTHEST)
     if views <= FEW_VIEWS:
         more = concat_cameras(between_cameras(scene.cameras), more)
     images = np.concatenate([scene.images, render(scene.gaussians, more).images.clip(0, 1)])
@@ -183,7 +183,7 @@ def place_cameras(
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
-    sample = thin_out(gaussians, SAMPLES // step)
+    sample = thin_out(gaussians, SAMPLE_GAUSSIANS // step)
     centre, half = _extent(sample.means.astype(np.float64))
     viewmats = _candidates(centre, half)[::step]
     shares = _shares_seen(sample, viewmats, CLEAR * float(np.sqrt((half * half).sum())))

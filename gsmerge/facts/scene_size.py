@@ -15,7 +15,7 @@ from gsmerge.types import Gaussians, Scene
 # fewer nothing is said
 TINY, LARGE, BRIGHT, FEWEST = 1e-6, 0.25, 10.0, 100
 FLAT, FAINT = 0.01, 1 / 255  # range of the base colours' coefficients, and median opacity, at least
-SAMPLES = 65536  # Gaussians that these are measured on
+SAMPLE_GAUSSIANS = 65536  # Gaussians that these are measured on
 Pictures = Literal["photos", "renders"]  # photos or what stands in for them; drawings of the scene itself
 
 
@@ -62,7 +62,7 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     """
     if len(gaussians) < FEWEST:
         return None
-    sample = gaussians[:: max(1, len(gaussians) // SAMPLES)]
+    sample = gaussians[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     means = sample.means.astype(np.float64)
     low, middle, high = np.percentile(means, (1, 50, 99), axis=0)
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))

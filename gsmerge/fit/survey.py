@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians
 
 JUDGES, ENOUGH = 12, 6  # photos that judge a fit, at most; in so many a Gaussian is looked at, if they may show it
 FEWER = 0.03  # share of what a photo may show that is looked at in fewer
-SAMPLES = 4096  # Gaussians by which photos are chosen
+SAMPLE_GAUSSIANS = 4096  # Gaussians by which photos are chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
 
 def choose_looks(gaussians: Gaussians, photos: Photos) -> list[int]:
     """Choose the photos of a survey: those that judge, and others of which much would be looked at in too few."""
-    means = gaussians.means[:: max(1, len(gaussians) // SAMPLES)]
+    means = gaussians.means[:: max(1, len(gaussians) // SAMPLE_GAUSSIANS)]
     pixels, depths = project(means, Cameras(photos.viewmats, photos.Ks, photos.width, photos.height))
     inside = (depths > NEAR_PLANE) & ((pixels > 0) & (pixels < (photos.width, photos.height))).all(-1)
     chosen = judging_views(len(photos))

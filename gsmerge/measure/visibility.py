@@ -17,7 +17,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 Points = NDArray[np.float64]  # [n,3]
 _OPAQUE = 0.5  # alpha from which a rendered depth is that of a surface
 _NEAR, _BEHIND = 0.01, 1.05  # times the median depth of a view; times a surface's depth, from which on it hides
-MAX_SAMPLES = 200_000  # Gaussians that a share is measured on
+MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is measured on
 _CHUNK = 1 << 16  # points at a time: all of them, in every thread, would take too much memory
 _DILATION = 3  # pixels of the input views per side of the square that every sample marks
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_layout, find_unread
-from gsmerge.io.cameras.json_files import viewer_cameras_path
 from gsmerge.io.cameras.read import (
     CHUNK,
     find_cameras,
@@ -23,6 +22,7 @@ from gsmerge.io.cameras.read import (
     read_cameras,
     read_sharp_camera,
 )
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.ply import header_content, header_counts
 from gsmerge.io.formats.table import (
     DEPTHS,

@@ -26,7 +26,7 @@ from gsmerge.alignment import (
 from gsmerge.errors import SceneError
 from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
-from gsmerge.io.cameras.json_files import read_dataparser
+from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_depths
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES

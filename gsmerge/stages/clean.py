@@ -26,7 +26,7 @@ APART = 3.0  # times the median distance of nearest Gaussians: a floater's own i
 # scene if it is also so many times as large as the median one. Exports, and results without a fit, have none
 CURTAIN, WIDER = (0.1, 0.33), 8.0
 TRANSPARENT = 1 / 255  # opacity below which a Gaussian shows nothing
-MAX_SAMPLES = 200_000  # Gaussians that a share is estimated from
+MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is estimated from
 
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
@@ -97,7 +97,7 @@ def curtains(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
 
 def floater_share(gaussians: Gaussians) -> float:
     """Estimate the share of finite Gaussians that are :func:`floaters`; 0 without any."""
-    rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLES)))
+    rows = np.arange(0, len(gaussians), max(1, -(-len(gaussians) // MAX_SAMPLE_GAUSSIANS)))
     return float(floaters(gaussians, rows).mean()) if len(rows) else 0.0
 
 

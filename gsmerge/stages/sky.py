@@ -31,7 +31,7 @@ FAR = 3.0  # times the depth of the rest
 LEAST_VIEWS, LEAST_SHARE = 2, 0.2  # views that show sky, and their share of all: fewer may be mistaken
 AGREEMENT = 0.7  # least share of a Gaussian's blending weights that lies in the sky
 LAYERS, LAST_LAYER = 6, 0.02  # most rounds; share of all sky so far that a round which is the last adds
-MAX_SAMPLES = 200_000  # Gaussians that depths are taken from
+MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that depths are taken from
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
 
 def _is_far(means: np.ndarray, camera: Cameras, region: np.ndarray) -> bool:
     """Return whether a region ``[h,w]`` shows things several times as far away as the rest of the picture."""
-    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLES))], camera)
+    (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // MAX_SAMPLE_GAUSSIANS))], camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(1)
     x, y = pixels[inside].astype(int).T
     hit, depths = region[y, x], depths[inside]

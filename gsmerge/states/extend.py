@@ -27,7 +27,7 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 # Earlier Gaussians that are looked up in new views; share that these see at the least; and of the foremost, the most
 # that colours may differ from pictures, over that from random pixels: .4 to .7 in one world, .85 to 1.1 in others
-SAMPLES, SEEN, UNLIKE = 10_000, 0.02, 0.8
+SAMPLE_GAUSSIANS, SEEN, UNLIKE = 10_000, 0.02, 0.8
 OTHER_WORLD = "the pictures of this batch do not show the earlier Gaussians: a .gsm is for one world, begin another"
 
 
@@ -101,7 +101,7 @@ def _shows(views: Scene, gaussians: Gaussians) -> bool:
     if not len(views):
         return True
     rows = np.ones(len(gaussians), bool)
-    check = check_cameras(gaussians, rows, views.cameras, photo_array(views.images), SAMPLES, foremost=True)
+    check = check_cameras(gaussians, rows, views.cameras, photo_array(views.images), SAMPLE_GAUSSIANS, foremost=True)
     return check.share_seen >= SEEN and not check.color_ratio > UNLIKE
 
 

@@ -18,7 +18,7 @@ from gsmerge.compaction.placement import add_views, name_photos
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import atomic_output, atomic_outputs, output_format
 from gsmerge.io.archives import new_member
-from gsmerge.io.cameras.json_files import viewer_cameras_path
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.table import Contents

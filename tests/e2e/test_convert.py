@@ -22,7 +22,7 @@ from gsmerge.geometry import covariances
 from gsmerge.io import CameraFile
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.colmap_model import model_files
-from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import Contents, Format

@@ -15,7 +15,7 @@ from messages import ERROR, says
 from tiny_scene import edited_json
 
 import gsmerge
-from gsmerge.io.cameras.json_files import viewer_cameras, viewer_cameras_path
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 
 Run = Callable[..., Any]
 QUICK = ("--set", "superpixels=40", "--fit", "none", "--set", "checkpoint=none")

@@ -34,7 +34,7 @@ import gsmerge
 from gsmerge.cli.parameters import parse_pairs
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import read_cameras, read_gaussians, read_images
-from gsmerge.io.cameras.json_files import read_dataparser
+from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.crop_file import read_crop

@@ -23,7 +23,7 @@ from gsmerge.kernels.matrices import matmul, solve, transform
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
-SAMPLES = 2000  # triples of matches
+SAMPLE_TRIPLES = 2000  # triples of matches
 TRIALS = 60  # of their similarities, those that are tried in the photos
 CLOSE = 0.25  # distance of matched points, share of their depths, up to which a triple counts it
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
@@ -110,7 +110,7 @@ def _sample_places(matches: KeypointMatches) -> list[Similarity]:
     rng = np.random.default_rng(0)
     p, q = (end.points for end in matches.ends)
     near, far = (camera_depths(end.points, end.viewmats) for end in matches.ends)
-    rows = rng.integers(0, len(matches), (SAMPLES, 3))
+    rows = rng.integers(0, len(matches), (SAMPLE_TRIPLES, 3))
     weights = (1 / (near * far))[rows]
     rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
     moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]

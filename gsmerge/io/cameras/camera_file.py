@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import pose_changes
+from gsmerge.geometry import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_pixels
 from gsmerge.io.photo_files import PhotoArrays, PhotoReader, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
@@ -23,6 +24,7 @@ _MAX_FOCAL_SIDES, _MAX_CENTRE_SIDES = 1e5, 1e3  # of the image's longer side: fo
 _MAX_ROTATION_ERROR = 0.02  # of the entries of R R^T
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes (y up, z backward) <-> OpenCV (y down, z forward)
 
+CENTRED_PX = 1e-3  # by which twice a principal point in the middle may differ from the image's size
 PATCH = 14  # sides of vision transformers' inputs are multiples of it
 _OTHER_SIZE, _WHOLE = 0.1, 1e-3  # share by which a side differs from that of another size; pixels off a whole number
 MAX_NORMALISED_FOCAL = 10.0  # a longer one is in pixels; and no image is that small
@@ -391,3 +393,12 @@ def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
     turns, shifts = ([move[key] for move in moves] for key in ("degrees", "shift"))
     mean, most = (f"{f(turns):.2g} degrees and {100 * f(shifts):.3g} % of the depth" for f in (np.mean, max))
     return f"{mean} on average, {most} at most"
+
+
+def make_similarity(path: Path, matrix: np.ndarray, scale: float) -> Similarity:
+    """Make the similarity of a matrix ``[3,4]`` and the scale after it; SceneError if it is none."""
+    R = matrix[:3, :3]
+    odd = not is_orthonormal(R) or determinant(R) < 0 or not 0 < scale < MAX_NUMBER
+    if odd or not np.all(np.abs(matrix) < MAX_NUMBER):
+        raise SceneError(path, "expected 'transform' to rotate and shift and 'scale' to be positive, found another map")
+    return Similarity(R, scale, scale * matrix[:3, 3], f"moved into the Gaussians' frame by {path.name}", "other")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from plyfile import PlyData
 
+from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import CameraFile, Convention, StoredView, make_camera_file
 from gsmerge.io.formats.ply import open_ply
@@ -75,3 +78,27 @@ class CameraFormat:
         """Convert the cameras that a file stores; SceneError if one of them is invalid."""
         convention = stored.convention or self.convention
         return make_camera_file(path, self.name, convention, stored.views, stored.images, stored.order)
+
+
+@contextmanager
+def number_errors(path: Path, expected: str) -> Iterator[None]:
+    """Turn errors of missing entries, and of values that are no numbers or objects, in the block into a SceneError."""
+    try:
+        yield
+    except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:
+        raise SceneError(path, f"{expected} ({error})") from error
+
+
+def to_number(value: Any) -> float:
+    """Convert a JSON number; TypeError for true, false and null, ValueError for other text."""
+    if isinstance(value, bool):
+        raise TypeError(f"found {str(value).lower()}")
+    return float(value)
+
+
+def to_array(values: Any) -> np.ndarray:
+    """Convert lists of numbers to float64; errors as in :func:`to_number`."""
+    array = np.array(values, np.float64)
+    if bool in set(map(type, np.array(values, object).flat)):
+        raise TypeError("found true or false")
+    return array

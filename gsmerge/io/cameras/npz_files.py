@@ -34,7 +34,7 @@ _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for nam
 _IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
 _MAX_INTRINSIC, _SMALL, _SAME = 1e12, 1e-9, 1e-5
 _MAX_HEADER = 1 << 16  # bytes of an array's header
-_POINTS, _SAMPLES = "world_points", 1000  # of each view, by which poses are read
+_POINTS, _SAMPLE_POINTS = "world_points", 1000  # of each view, by which poses are read
 _KINDS = "biufU"
 
 
@@ -84,7 +84,7 @@ def _are_camera_to_world(path: Path, poses: np.ndarray) -> bool:
     fits = depths is not None and len(depths) == len(poses) and points.shape == (*depths.shape, 3)
     if depths is None or not fits or points.dtype.kind not in "fiu":
         return False
-    few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLES))
+    few = slice(None), slice(None, None, max(1, depths[0].size // _SAMPLE_POINTS))
     z, xyz = (array.reshape(len(poses), depths[0].size, -1)[few].astype(np.float64) for array in (depths, points))
     rotations, shifts = poses[:, None, :3, :3].astype(np.float64), poses[:, None, :3, 3].astype(np.float64)
     with np.errstate(all="ignore"):

@@ -16,9 +16,9 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, motion_matrices
 from gsmerge.io.bounds import read_budget, read_json, read_text
-from gsmerge.io.cameras.camera_file import check_count
-from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
-from gsmerge.io.cameras.json_files import make_similarity, number_errors, transforms_views
+from gsmerge.io.cameras.camera_file import check_count, make_similarity
+from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras, number_errors
+from gsmerge.io.cameras.transforms import transforms_views
 from gsmerge.io.image_names import natural_key
 
 _MODELS = {  # of OpenSfM, by names of lenses that mean the same

@@ -15,15 +15,15 @@ from gsmerge.io.cameras.embedded import SHARP, read_sharp
 from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
 from gsmerge.io.cameras.json_files import (
     FFGS,
-    VIEWER_CAMERAS,
     is_ffgs,
     is_long_lrm,
     read_ffgs,
     read_inria,
     read_long_lrm,
-    read_transforms,
     read_world_mirror,
 )
+from gsmerge.io.cameras.transforms import read_transforms
+from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import MODEL_NAMES
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions
@@ -73,7 +73,7 @@ def _is_camera_folder(folder: Path) -> bool:
 def find_other_cameras(folder: Path) -> Path | None:
     """Find a folder's only file of :data:`_OTHERS` with cameras, or the first that starts as some if none is read."""
     files = sorted(path for path in folder.glob("[!.]*") if path.suffix in _OTHERS and path.name not in INTRINSICS)
-    files = [path for path in files if path.is_file() and not path.name.endswith(VIEWER_CAMERAS)][:_MAX_OTHERS]
+    files = [path for path in files if path.is_file() and not path.name.endswith(ENDING)][:_MAX_OTHERS]
     files = [path for path in files if _holds_cameras(path)] or [*filter(starts_like_poses, files)][:1]
     return files[0] if len(files) == 1 else None
 
@@ -105,7 +105,22 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
         >>> len(cameras), cameras.source
         (5, 'transforms.json')
     """
-    path = Path(path)
+    path = _resolve(Path(path))
+    ending = "" if path.is_dir() else path.suffix.lower().replace(_LOG, ".txt")
+    source = CameraSource(path, scene, folder)
+    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if chosen is None:
+        check_unknown(path)
+        raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
+    return chosen.cameras(source)
+
+
+def _resolve(path: Path) -> Path:
+    """Return the file of cameras that a path means, or the folder of a format of several files.
+
+    That is the one in a folder, and the folder of a COLMAP model or of keyframes that a file belongs to. SceneError
+    where there is none.
+    """
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if path.is_dir() and not _is_camera_folder(path):
@@ -114,24 +129,23 @@ def read_cameras(path: StrPath, *, scene: str | None = None, folder: Path | None
             check_layout(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = inside
-    if not path.is_dir():
-        check_layout(path)
-        check_file(path)
-        if path.suffix == ".json" and is_keyframes(path.parent) and _KEYFRAME in CameraSource(path).object:
-            path = path.parent
-        in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
-        if path.suffix in (".bin", ".txt") and (in_model or not _LISTS_POSES(path)):
-            if not is_colmap(path.parent):
-                check_unknown(path)
-                raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
-            path = path.parent
-    ending = "" if path.is_dir() else path.suffix.lower().replace(_LOG, ".txt")
-    source = CameraSource(path, scene, folder)
-    chosen = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
-    if chosen is None:
+    return path if path.is_dir() else _folder_of(path) or path
+
+
+def _folder_of(path: Path) -> Path | None:
+    """Return the folder of the model or the keyframes that a file belongs to; None if it stands for itself."""
+    check_layout(path)
+    check_file(path)
+    if path.suffix == ".json":
+        one_of_many = is_keyframes(path.parent) and _KEYFRAME in CameraSource(path).object
+        return path.parent if one_of_many else None
+    in_model = path.with_suffix(".bin").name in MODEL_NAMES and is_colmap(path.parent)
+    if path.suffix not in (".bin", ".txt") or (not in_model and _LISTS_POSES(path)):
+        return None
+    if not is_colmap(path.parent):
         check_unknown(path)
-        raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
-    return chosen.cameras(source)
+        raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
+    return path.parent
 
 
 def read_all_cameras(path: Path) -> Iterator[CameraFile]:

@@ -42,7 +42,8 @@ PLACES = (  # in a folder, besides the frames
 )  # fmt: skip
 SIGMA, OPACITY = 0.6, 0.7  # of a Gaussian: pixels, 0 to 1
 _GREY = 128
-_SAMPLES, _SAME = 1000, 0.05  # pixels of a view that are looked up in the next one, and relative difference of depths
+_SAMPLE_PIXELS = 1000  # of a view that are looked up in the next one
+_SAME = 0.05  # relative difference of depths that agree
 # With right poses 1.9 times as many pixels agree, or more, as with wrong ones, on each of 15 captures
 _AGREE, _MORE = 0.2, 1.5
 _PIXEL_BYTES = 11  # that are kept of a pixel until it is unpacked, at most: a float64 and three colours
@@ -142,7 +143,7 @@ def _check_poses(path: Path, depths: np.ndarray, cameras: CameraFile) -> None:
 def _agreement(depths: np.ndarray, cameras: CameraFile) -> float:
     """Return the share of some pixels that lie at the depth of the next view."""
     (count, height, width), poses = depths.shape, cameras.viewmats
-    some = slice(None, None, max(1, height * width // _SAMPLES))
+    some = slice(None, None, max(1, height * width // _SAMPLE_PIXELS))
     views = zip(depths, np.zeros((*depths.shape, 3), np.uint8), cameras.Ks, poses, strict=True)
     points = np.stack([_pack(*view).unpack(some).means for view in views])
     after = (np.arange(count) + 1) % count

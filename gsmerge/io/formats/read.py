@@ -26,7 +26,7 @@ MIN_FINITE = 0.002  # of the rows: the rest of a file tells nothing about the sc
 MAX_HARMONIC = 1e6  # pictures of it can still be squared and summed in float32
 FREED_ROWS = 1 << 17  # after which the pages of large columns leave memory
 _MIN_JUDGED = 100  # Gaussians whose scales say something
-_SCALE_SAMPLES = 20_000  # of them that are looked at
+_SCALE_GAUSSIANS = 20_000  # of them that are looked at
 _MAX_WIDTH = 0.25  # share of the scene's width from which on standard deviations are wrong
 # The same in units of the width over the root of the number of Gaussians: sound files have 0.3 to
 # 2, linear scales that are taken for logarithms 10 to 1,000.
@@ -420,7 +420,7 @@ def _describe_odd_scales(means: np.ndarray, scales: np.ndarray, valid: np.ndarra
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
     if len(rows) < _MIN_JUDGED:
         return ""
-    sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_SAMPLES)])
+    sample = np.asarray(rows[:: max(1, len(rows) // _SCALE_GAUSSIANS)])
     low, high = np.quantile(gather(means, sample).astype(np.float64), (0.05, 0.95), axis=0)
     width, sizes = float((high - low).max()), gather(scales, sample)
     size = float(np.median(sizes.max(1)))

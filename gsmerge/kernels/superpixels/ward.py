@@ -14,7 +14,7 @@ from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.kernels.superpixels.regions import NUM_PIXELS, ROW, region_rows
 
 INVERSE, HEIGHT = 6, 7  # columns of a region's row: 1 / n, and the cost at which it came to be
-NUM_SAMPLES = 4096  # edges whose costs tell where to put the first ceiling
+SAMPLE_EDGES = 4096  # edges whose costs tell where to put the first ceiling
 TIE_BREAK = 1e-7  # squared colour; what the kernel adds to equal costs, so that flat pictures merge many pairs a round
 
 
@@ -44,7 +44,7 @@ def _first_ceiling(pairs, rows, share):
     Measured on photos that were over-segmented by 1.5 to 3: the share of edges that are cheaper than that merge at the
     start is close to the share of regions that disappear.
     """
-    step = max(1, len(pairs) // NUM_SAMPLES)
+    step = max(1, len(pairs) // SAMPLE_EDGES)
     costs = np.empty(len(pairs) // step, np.float32)
     merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
     rank = min(int(share * len(costs)), len(costs) - 1)

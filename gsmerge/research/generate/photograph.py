@@ -18,7 +18,7 @@ from gsmerge.research.generate.textures import Picture, pyramid
 
 FAR = 1e6  # depth of pixels without a surface
 NEAR_PLANE = 1e-3
-SAMPLES = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
+SAMPLE_RAYS = 2  # rays per pixel and axis for the colours; depth is that of the pixel's centre
 KEY_MAPS, KEY_SIZE = 5, 640  # shadow maps of the direct light, several for soft shadows, and their side, pixels
 AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # the same for the light from all sides
 BEHIND = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel

@@ -18,7 +18,7 @@ from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_
 from gsmerge.research.generate.objects import room
 from gsmerge.research.generate.photograph import (
     FAR,
-    SAMPLES,
+    SAMPLE_RAYS,
     Float,
     Hits,
     LitStage,
@@ -183,7 +183,7 @@ def _find_stage(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tupl
 def _photo(scene: LitStage, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
     """Take a photo with the errors of lens, sensor and exposure."""
     rng = np.random.default_rng(seed)
-    linear = radiance(scene, pose, lens, SAMPLES)
+    linear = radiance(scene, pose, lens, SAMPLE_RAYS)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
     y, x = np.mgrid[: lens.height, : lens.width] + 0.5
     away = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)

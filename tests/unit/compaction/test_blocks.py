@@ -138,8 +138,8 @@ def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
 
 
 def test_large_scenes_are_cut(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.facts.partition.WHOLE_GAUSSIANS", 1800)
-    monkeypatch.setattr("gsmerge.facts.partition.BLOCK_GAUSSIANS", 1440)
+    monkeypatch.setattr("gsmerge.plan.WHOLE_GAUSSIANS", 1800)
+    monkeypatch.setattr("gsmerge.plan.BLOCK_GAUSSIANS", 1440)
     assert count_blocks(scene) == 3
     assert count_blocks(scene, levels=2) == 1
 

@@ -16,7 +16,7 @@ from tiny_scene import FLIP, save_json
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
-from gsmerge.io.cameras.json_files import read_dataparser
+from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 
 C2W = np.linalg.inv(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))

@@ -8,7 +8,7 @@ import scenes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsmerge.facts.partition import (
+from gsmerge.compaction.partition import (
     SHARED,
     Covisibility,
     count_factors,
@@ -19,8 +19,8 @@ from gsmerge.facts.partition import (
     partition_views,
     see,
     split_points,
-    usual_blocks,
 )
+from gsmerge.plan import usual_blocks
 from gsmerge.types import Cameras, Scene
 
 
@@ -179,6 +179,6 @@ def test_blocks_that_see_the_same_need_more_gaussians(two_sides: Scene) -> None:
 
 
 def partition_of(*owns: list[int]) -> list:
-    from gsmerge.facts.partition import Block
+    from gsmerge.compaction.partition import Block
 
     return [Block(tuple(own), ()) for own in owns]

@@ -18,24 +18,14 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 
 GRID = 24  # cells along the longer side of a view's depth map
-SAMPLES = 120  # cells of a view that are looked up in all others, at most
+SAMPLE_CELLS = 120  # cells of a view that are looked up in all others, at most
 SAME_DEPTH = 0.15  # share by which a point may lie behind the depth of a cell that shows it
 SHARED = 0.25  # views of neighbours that a block takes in addition, a share of its own
 SLACK = 0.2  # share by which blocks may differ from equal sizes
 SWEEPS = 8  # exchanges of views between blocks, at most
 TOGETHER = 32  # points of a view that are looked up together: few cameras may see any of them
 POINTS = 1024  # the same where owners are searched
-BLOCK_GAUSSIANS = 8_000_000  # of a block's own views, of an automatic number of blocks
-WHOLE_GAUSSIANS = 20_000_000  # up to which a scene is in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same in views, where those of different blocks see little of each other
 MOST_CUT = 1 / 3  # of what views share: where blocks cut more, one piece is better
-
-
-def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the usual number of blocks for an aligned scene, or an upper bound if the number of views decides."""
-    if num_gaussians > WHOLE_GAUSSIANS:
-        return -(-num_gaussians // BLOCK_GAUSSIANS)
-    return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
 def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
@@ -89,7 +79,7 @@ def measure_covisibility(scene: Scene) -> Covisibility:
         return np.where(valid[view] & (z > 0), z, np.inf)
 
     depths = np.stack(parallel_map(one_depth, range(len(scene)))).reshape(-1, len(rows), len(columns))
-    stride = slice(None, None, max(1, len(picked) // SAMPLES))
+    stride = slice(None, None, max(1, len(picked) // SAMPLE_CELLS))
     samples = [means[view, stride][valid[view, stride]] for view in range(len(scene))]
 
     frustums = make_frustums(cameras, depths)

@@ -1,0 +1,53 @@
+"""How a program moved its cameras into the Gaussians' world: nerfstudio's file beside the scene, or Metashape's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsmerge.geometry import Similarity
+from gsmerge.io.bounds import read_json
+from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
+from gsmerge.io.cameras.camera_format import number_errors, to_array, to_number
+from gsmerge.kernels.matrices import invert, matmul
+
+DATAPARSER = "dataparser_transforms.json"
+
+
+def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
+    """Read the similarities that a nerfstudio ``dataparser_transforms.json`` may mean, or Metashape's file of cameras.
+
+    The file says how cameras were moved into the Gaussians' world: X' = scale (transform [X; 1]). ``transform`` starts
+    from the world of the capture. Poses of a ``transforms.json`` with ``applied_transform`` (and ``applied_scale``)
+    have been moved by that already, so it is undone. Which reading is right has to be measured. SceneError if the file
+    lacks a rotation, shift and positive scale.
+    """
+    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
+    path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+    if path is None:
+        from gsmerge.io.cameras.programs import read_metashape_world  # few files need it
+
+        world = read_metashape_world(cameras) if cameras is not None and cameras.suffix == ".xml" else None
+        return [] if world is None else [world, replace(world, scale=1.0, shift=world.shift / world.scale)]
+    data = read_json(path)
+    with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
+        moved = _square(data["transform"])
+        scale = to_number(data["scale"])
+    frames = [make_similarity(path, moved, scale)]
+    camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
+    if isinstance(camera_data, dict) and "applied_transform" in camera_data:
+        with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
+            applied = _square(camera_data["applied_transform"])
+            factor = to_number(camera_data.get("applied_scale") or 1)
+            frames.append(make_similarity(path, matmul(moved, invert(applied)), scale / factor))
+    return frames
+
+
+def _square(values: Any) -> np.ndarray:
+    matrix = to_array(values)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.all(np.abs(matrix) < MAX_NUMBER):
+        raise ValueError(f"found shape {list(matrix.shape)}, or numbers that are not finite")
+    return np.concatenate([matrix[:3], [[0.0, 0, 0, 1]]])
