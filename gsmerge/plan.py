@@ -149,7 +149,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
     ``checkpoint``: networks to use instead of those that the options name.
     """
-    scene, reference, size = prepared.scene, prepared.reference, prepared.size
+    scene, size = prepared.scene, prepared.size
     _check_photos(prepared, options)
     keeps = keeps_input(size, options)
     target = KEPT_PSNR if keeps and size.rendered else options.budget.target_psnr
@@ -164,28 +164,17 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         agreement = prepared.agreement
         asked, options = options, resolve_budget(size, options, agreement)
         segment = _resolve_superpixels(options.segment, agreement, EFFORTS[options.effort])
-        clean_options = options.clean
-        if "sky" in clean_options.drops and reference.name == RENDERS:
-            note("drop sky: no photo is used that could say where the sky is, so it stays")
-            left = ",".join(name for name in clean_options.drops if name != "sky")
-            clean_options = replace(clean_options, drop=left or None)
+        clean_options = _resolve_clean(options.clean, prepared)
         decode = resolve_decode(options, size)
         if decode.k != options.decode.k and decode.max_k > USUAL_K:
             note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
         options = replace(options, decode=decode)
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
-        choices = choose_for_scene(
-            size, replace(options, segment=segment), num_input=num_input, num_reserved=len(unseen), keeps=keeps
-        )
-        limits = choices.limits
+        counted = replace(options, segment=replace(options.segment, superpixels=segment.superpixels))
+        choices = choose_for_scene(size, counted, num_input=num_input, num_reserved=len(unseen), keeps=keeps)
+        limits, pairs = choices.limits, checkpoint is None and choices.merges_pairs
         fit = _fit_photos(prepared, options, choices.fit)
-        pairs = checkpoint is None and choices.merges_pairs
-        if pairs:  # these show no more than the merged Gaussians are made of: small steps, and nothing to judge by
-            factor = PLACED_STEPS if reference.placed else RENDERS_STEPS
-            tuning = replace(fit.tuning.scaled(factor), max_ratio=math.inf)  # strokes of the input are wanted
-            fit = replace(fit, judged=False, tuning=tuning)
-        if pairs and reference.placed and fit.fit == "none" != options.fit.fit:
-            note(NO_FIT)
+        fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
         few = f"superpixels: the {size.num_gaussians:,} Gaussians are few, so {segment.superpixels} is a share of"
         note(f"{few} the photos' pixels, up to half of the Gaussians")
@@ -447,6 +436,15 @@ def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, e
     return replace(options, rectangles=rectangles, early_sweeps=sweeps)
 
 
+def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
+    """Keep the sky, with a note, where no photo is used that shows it."""
+    if "sky" not in options.drops or prepared.reference.name != RENDERS:
+        return options
+    note("drop sky: no photo is used that could say where the sky is, so it stays")
+    left = ",".join(name for name in options.drops if name != "sky")
+    return replace(options, drop=left or None)
+
+
 def _merge_unseen(
     prepared: Prepared, options: CompactOptions, segment: SegmentOptions, clean_options: CleanOptions
 ) -> tuple[Gaussians, int | None]:
@@ -519,6 +517,18 @@ def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) ->
     free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
     moves = free and fit.fit == "full" and prepared.reference.of_views
     return replace(fit, photo_scale=scale, move_cameras=moves)
+
+
+def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
+    """Fill in small steps for a fit to renders: these show no more than the merged Gaussians are made of.
+
+    Nothing is there to judge it by, and strokes of the input are wanted.
+    """
+    placed = prepared.reference.placed
+    if placed and fit.fit == "none" != options.fit.fit:
+        note(NO_FIT)
+    tuning = replace(fit.tuning.scaled(PLACED_STEPS if placed else RENDERS_STEPS), max_ratio=math.inf)
+    return replace(fit, judged=False, tuning=tuning)
 
 
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 Models that predict poses write Gaussians and cameras that differ a little. A pose for each view follows from its
 pixels and their Gaussians alone; the photos show much later which of the two was wrong
-(``gsmerge/facts/align_views.py``).
+(``gsmerge/facts/move_poses.py``).
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import ReadHints, exporter_names, make_hints
 from gsmerge.scene.files import SceneFiles, find_scene_files
-from gsmerge.scene.read import align_scene, read_gaussian_file
+from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
 from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
@@ -172,6 +172,23 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
             facts |= {} if camera_file is None else {"num_views": len(camera_file), "camera_format": camera_file.source}
         return facts | {"alignment_problem": str(error)}
     facts |= {name: (path := getattr(load.files, name)) and str(path) for name in ("cameras", "images")}
+    facts |= _describe_scene(load, is_result=is_result)
+    if shows_nothing(load.scene):
+        return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
+    if load.recovery is None or load.alignment is None:
+        return facts | {"alignment_problem": load.problem}
+    return facts | {
+        "width": load.scene.cameras.width,
+        "height": load.scene.cameras.height,
+        "per_pixel": load.recovery.best.layout.per_pixel,
+        "num_missing": load.pixel_scene().num_missing,
+        "alignment": asdict(load.alignment),
+        "rows": load.recovery.description,
+    }
+
+
+def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
+    """Describe a scene that was read: its views, what they see of it, and what compact would make of it."""
     scene, sight, num_sky_views = load.scene, None, 0
     if len(scene):
         gaussians = scene.gaussians
@@ -179,33 +196,25 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         sight = check_cameras(gaussians, stored, scene.cameras, images)
         means = gaussians.means[stored & np.isfinite(gaussians.means).all(1)]
         num_sky_views = len(sky_regions(means, scene.cameras, images))
-    facts |= {"notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene)], "num_views": len(load.views.used)}
-    facts |= {"camera_format": load.cameras and load.cameras.source}
-    facts |= {"coverage": coverage(scene), "sight": sight and asdict(sight)}
-    if is_result and len(scene):
-        shown = count_views_in_world(scene.finite_gaussians, scene.cameras)
-        facts["num_unseen"] = int((shown == 0).sum())
-    facts |= {"num_sky_views": num_sky_views, "compact": estimate(scene, CompactOptions())}
-    agreement = _measure_agreement(scene)
-    facts |= {"auto": _describe_auto(scene, agreement), "agreement": agreement and agreement.to_dict()}
-    odd = unlike_captures(scene.finite_gaussians)
-    facts["notes"] += [] if odd is None else [odd]
-    facts["notes"] += [agreement.doubt] if agreement is not None and agreement.doubt else []
-    if not is_result:
-        is_known = load.scene.aligned or any(exporter.is_marked for exporter in load.exporters)
-        facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
-    if shows_nothing(scene):
-        return facts | {"alignment_problem": str(nothing_left(files.ply)), "compact": None, "auto": None}
-    if load.recovery is None or load.alignment is None:
-        return facts | {"alignment_problem": load.problem}
-    return facts | {
-        "width": scene.cameras.width,
-        "height": scene.cameras.height,
-        "per_pixel": load.recovery.best.layout.per_pixel,
-        "num_missing": load.pixel_scene().num_missing,
-        "alignment": asdict(load.alignment),
-        "rows": load.recovery.description,
+    agreement, odd = _measure_agreement(scene), unlike_captures(scene.finite_gaussians)
+    doubts = [odd, None if agreement is None else agreement.doubt]
+    facts: dict[str, Any] = {
+        "notes": [*load.notes, *missing_notes(scene), *_photo_notes(scene), *filter(None, doubts)],
+        "num_views": len(load.views.used),
+        "camera_format": load.cameras and load.cameras.source,
+        "coverage": coverage(scene),
+        "sight": sight and asdict(sight),
+        "num_sky_views": num_sky_views,
+        "compact": estimate(scene, CompactOptions()),
+        "auto": _describe_auto(scene, agreement),
+        "agreement": agreement and agreement.to_dict(),
     }
+    if is_result and len(scene):
+        facts["num_unseen"] = int((count_views_in_world(scene.finite_gaussians, scene.cameras) == 0).sum())
+    if not is_result:
+        is_known = scene.aligned or any(exporter.is_marked for exporter in load.exporters)
+        facts["exporter"] = exporter_names(load.exporters) if is_known else f"not known: {load.info.layout}"
+    return facts
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:

@@ -29,12 +29,12 @@ class LeftOut:
 
     rest: Prepared  # The scene of the other views
     photos: Photos  # Of the views that are left out
-    covered: np.ndarray  # [v,h,w] bool, their pixels that show what the other views see
+    seen: np.ndarray  # [v,h,w] bool, their pixels that show what the other views see
 
     @property
     def shares(self) -> np.ndarray:
         """Share ``[v]`` of each photo that the other views see."""
-        return self.covered.mean((1, 2))
+        return self.seen.mean((1, 2))
 
     @property
     def rows(self) -> Gaussians:
@@ -43,7 +43,7 @@ class LeftOut:
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
         """Return the PSNR (dB) ``[v]`` of canonical Gaussians on what each photo shows of the rest."""
-        views = enumerate(self.covered)
+        views = enumerate(self.seen)
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
     def reduce(self, count: int) -> int:

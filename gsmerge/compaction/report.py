@@ -19,8 +19,8 @@ class Covered:
     """PSNR where the input covers the input views, which lacks some of their pixels.
 
     Args:
-        share: Share of the scored pixels that the input covers: those that have a row of the file or, where pixels are
-            not known, in which it is opaque by half.
+        share: Share of the scored pixels that the input covers: where a file lacks rows of some pixels those that have
+            one, and otherwise those in which it is opaque by half.
         before: Mean PSNR (dB) of these pixels rendered from the input.
         after: The same from the result.
     """

@@ -11,7 +11,7 @@ from weakref import ReferenceType
 
 import numpy as np
 
-from gsmerge.compaction.new_views import SIDE, Trial
+from gsmerge.compaction.new_views import SIDE, NewViews, Trial
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
@@ -268,58 +268,74 @@ def make_result(
     input_score = measure_input(prepared, plan) if plan.before is None else plan.before
     before = None if input_score is None else input_score.psnr
     on_files = measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
-    rendered = prepared.reference.name == RENDERS
-    comparable = prepared.reference.of_views and not plan.clean.hiding
-    pictures = OWN_PHOTOS if prepared.reference.name == PHOTOS else prepared.reference.name
     measured = [
         measure_besides(
             input_score, on_files, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan
         )
         for candidate in (best, *levels)
     ]
-
-    def report(
-        candidate: Candidate, besides: tuple[Covered | None, PhotoFiles | None], seconds: Mapping[str, float], name: str
-    ) -> CompactReport:
-        covered, photo_files = besides
-        counts, record = (prepared.input_scene.num_gaussians, len(candidate.gaussians)), candidate.record
-        shown = None if rendered else candidate.psnr
-        made = CompactReport(
-            *counts, dict(seconds), before, shown, record.choices, record.notes, plan.settings, peak_memory(),
-            covered=covered, psnr_reference=None if before is None else prepared.reference.name,
-            photo_files=photo_files,
-        )  # fmt: skip
-        if prepared.doubt is not None:
-            choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
-            made = replace(made, psnr_before=None, psnr_after=None, covered=None, photo_files=None, choices=choices)
-            return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
-        compared = (covered.before, covered.after) if covered else (before, shown)
-        worse = describe_loss(name, *compared, pictures) if comparable else None
-        if rendered and candidate is best and not plan.clean.hiding:  # coarser levels are meant to differ
-            worse = describe_distance(candidate.psnr)
-        return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
-
     names = {**run.seconds, **seconds}
     seconds = {name: run.seconds.get(name, 0.0) + seconds.get(name, 0.0) for name in names}
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # the last stage, after those of the candidates
-    main = report(best, measured[0], seconds, "the result")
+    main = _report(best, prepared, plan, before, measured[0], seconds, 0)
     choices, notes = run.choices | main.choices | search["choices"], [*run.notes, *search["notes"], *main.notes]
-    new_views = None
-    if trial is not None and prepared.agreement is not None and before is not None and main.psnr_after is not None:
-        own = (main.covered.before, main.covered.after) if main.covered else (before, main.psnr_after)
-        new_views = trial.predict(*own, prepared.agreement.confirmed)
-    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
-    if new_views is not None and is_large and main.worse is None and new_views.high < 0:
-        worse = f"new views of the result are expected to be {-new_views.gain:.1f} dB worse than those of the input"
+    new_views, worse = _expect_new_views(main, prepared, trial)
+    if worse is not None:
         main, notes = replace(main, worse=worse), [*notes, worse]
     main = replace(main, choices=choices, notes=notes, unmet=search["unmet"], new_views=new_views)
     coarser = tuple(
         CompactResult(
             candidate.gaussians,
-            report(candidate, measured[i], candidate.record.seconds, f"level {i}"),
+            _report(candidate, prepared, plan, before, measured[level], candidate.record.seconds, level),
             candidate.cameras,
         )
-        for i, candidate in enumerate(levels, 1)
+        for level, candidate in enumerate(levels, 1)
     )
     return CompactResult(best.gaussians, main, best.cameras, coarser)
+
+
+def _report(
+    candidate: Candidate,
+    prepared: Prepared,
+    plan: Plan,
+    before: float | None,
+    besides: tuple[Covered | None, PhotoFiles | None],
+    seconds: Mapping[str, float],
+    level: int,
+) -> CompactReport:
+    """Report on one level of detail, given the PSNR of the input ``before``; 0 is the result itself."""
+    reference, record, (covered, photo_files) = prepared.reference, candidate.record, besides
+    rendered = reference.name == RENDERS
+    shown = None if rendered else candidate.psnr
+    made = CompactReport(
+        prepared.input_scene.num_gaussians, len(candidate.gaussians), dict(seconds), before, shown, record.choices,
+        record.notes, plan.settings, peak_memory(), covered=covered,
+        psnr_reference=None if before is None else reference.name, photo_files=photo_files,
+    )  # fmt: skip
+    if prepared.doubt is not None:
+        choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
+        made = replace(made, psnr_before=None, psnr_after=None, covered=None, photo_files=None, choices=choices)
+        return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
+    worse = None
+    if rendered and level == 0 and not plan.clean.hiding:  # coarser levels are meant to differ
+        worse = describe_distance(candidate.psnr)
+    elif reference.of_views and not plan.clean.hiding:
+        name, pictures = f"level {level}" if level else "the result", reference.name
+        compared = (covered.before, covered.after) if covered else (before, shown)
+        worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures)
+    return made if worse is None else replace(made, notes=[*made.notes, worse], worse=worse)
+
+
+def _expect_new_views(
+    main: CompactReport, prepared: Prepared, trial: Trial | None
+) -> tuple[NewViews | None, str | None]:
+    """Predict new views by a trial; also say so where a result that is not said to be worse makes them worse."""
+    before, after = (main.covered.before, main.covered.after) if main.covered else (main.psnr_before, main.psnr_after)
+    if trial is None or prepared.agreement is None or before is None or after is None:
+        return None, None
+    expected = trial.predict(before, after, prepared.agreement.confirmed)
+    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= SIDE  # smaller pictures say little
+    if not is_large or main.worse is not None or expected.high >= 0:
+        return expected, None
+    return expected, f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"

@@ -269,7 +269,7 @@ def measure_curve(
         weights, min_gain = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain
     else:
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
-        photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.covered[seen]]
+        photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
         prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
     quick = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())  # nothing grows
     points: list[CurvePoint] = []

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsmerge.evidence.places import SIDE, find_places
+from gsmerge.evidence.offsets import SIDE, find_offsets
+from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, SIZES, Comparer, fisher_z, measure_noise
-from gsmerge.evidence.shown import Shown
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.runtime.threads import parallel_map
 
@@ -67,14 +67,14 @@ class Assigner:
     ``show`` makes pictures of the views of a size: small ones, and larger ones where these do not decide.
     """
 
-    def __init__(self, show: Callable[[int], Shown], candidates: Candidates) -> None:
+    def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
         small = show(SIZES[-1])
         self.candidates, self._show = candidates, show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self.judged = self._comparer.measure_contrast() > FLAT
 
     @cached_property
-    def shown(self) -> Shown:
+    def shown(self) -> ViewPictures:
         """What the views show, large enough for parts to be looked up."""
         return self._show(SIDE)
 
@@ -95,10 +95,10 @@ class Assigner:
         Returns how alike they are, from 1 on, 0 where it was taken from elsewhere, and None where parts do not tell.
         """
         photo = turn_picture(self.candidates.read(assignment.photo), assignment.turn)
-        places = find_places(self.shown, view, np.ascontiguousarray(photo))
-        if places is None or places.verdict is None:
+        offsets = find_offsets(self.shown, view, np.ascontiguousarray(photo))
+        if offsets is None or offsets.verdict is None:
             return None
-        return 1 + max(places.alike, 0.0) if places.verdict else 0.0
+        return 1 + max(offsets.alike, 0.0) if offsets.verdict else 0.0
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
         """Return the photos that names or order give to views, and whether what they show confirms each.
@@ -171,16 +171,16 @@ class Assigner:
         if not views or not photos:
             return {}
         step, tags = -(-len(photos) // AT_ONCE), self.candidates.tags
-        places = set(range(0, len(photos), step))
+        offsets = set(range(0, len(photos), step))
         while True:
-            scores = self.score(photos[place] for place in sorted(places))
+            scores = self.score(photos[place] for place in sorted(offsets))
             best = scores.best()
             likely = {view: np.argsort(-best[view], kind="stable")[:ALIKE] for view in views}
             near = {photos.index(scores.photos[column]) for ids in likely.values() for column in ids}
             around = {place + away for place in near for away in range(1 - step, step)} & set(range(len(photos)))
-            if around <= places:
+            if around <= offsets:
                 break
-            places, step = places | around, 1
+            offsets, step = offsets | around, 1
         return {
             view: [
                 Assignment(scores.photos[column], scores.turn(view, scores.photos[column], tags[scores.photos[column]]))
@@ -192,7 +192,7 @@ class Assigner:
 
 
 def assign_photos(
-    show: Callable[[int], Shown],
+    show: Callable[[int], ViewPictures],
     candidates: Candidates,
     named: Sequence[int | None],
     *,

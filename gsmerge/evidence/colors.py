@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
+from gsmerge.evidence.pictures import Pairs
 from gsmerge.evidence.scores import stands_out
-from gsmerge.evidence.shown import Pairs
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.runtime.threads import parallel_map
 

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmerge.evidence.shown import LEAST, Shown, fit_size
+from gsmerge.evidence.pictures import LEAST, ViewPictures, fit_size
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import TURNS, blur, turn_back
@@ -59,7 +59,7 @@ class _Filters:
 class Comparer:
     """Correlations of any number of photos, in all turns, with what the views of a scene show."""
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: ViewPictures) -> None:
         self.views = len(shown)
         self._small = small = [shown.shrink(side) for side in SIZES]
         width, height = small[0].weights.shape[2:0:-1]
@@ -97,7 +97,7 @@ class Comparer:
         return out
 
 
-def _make_filters(small: Shown, quarters: Sequence[int]) -> _Filters:
+def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     """Turn pictures back as photos may be stored that show them, by some ``quarters`` and mirrored."""
     turns = tuple(turn + mirrored for mirrored in (0, TURNS // 2) for turn in quarters)
     products, weights, lengths = [], [], []

@@ -26,8 +26,8 @@ from gsmerge.evidence.colors import (
     plain_blocks,
     tone_blocks,
 )
+from gsmerge.evidence.pictures import Pairs, pair_photos, show_views
 from gsmerge.evidence.scores import MARGIN, signed_ranks
-from gsmerge.evidence.shown import Pairs, pair_photos, show_views
 from gsmerge.facts.photo_change import PhotoChange, change_large
 from gsmerge.facts.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.facts.views import camera_kinds
@@ -60,7 +60,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     order = find_orders(pairs, given)
     pairs = pairs.with_photos(np.where(order[:, None, None, None], pairs.photos[..., ::-1], pairs.photos))
     images = [photo[..., ::-1] if wrong else photo for photo, wrong in zip(scene.images, order, strict=True)]
-    right = find_shown(scene, given, images)
+    right = find_matching_views(scene, given, images)
     if _has_other_look(scene, pairs, right or given, images):
         problem = "the scene has another look than its photos: its own colours are kept"
         note(f"{problem}; --set look=photos gives it that of the photos")
@@ -72,14 +72,14 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     tones = find_tones(pairs, right)
     changes = [PhotoChange(bool(wrong), curve) for wrong, curve in zip(order, tones, strict=True)]
     _note_tones(scene, changes, right)
-    covers, pictures = np.zeros(scene.images.shape[:3], bool), None
+    hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.aligned:
-        covers, pictures = _find_covers(scene, changes)
-        _note_covers(scene, covers, right)
-    changed = [view for view in right if covers[view].any() or changes[view]]
+        hidden, pictures = _find_hidden(scene, changes)
+        _note_hidden(scene, hidden, right)
+    changed = [view for view in right if hidden[view].any() or changes[view]]
     if changed:
         choose(photos_changed=[scene.names[view] for view in changed])
-    return _replace_others(scene, changes, covers, pictures, right), tuple(right)
+    return _replace_others(scene, changes, hidden, pictures, right), tuple(right)
 
 
 def find_orders(pairs: Pairs, views: Sequence[int]) -> np.ndarray:
@@ -129,7 +129,7 @@ def _group(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
 
-def find_shown(scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray]) -> list[int]:
+def find_matching_views(scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray]) -> list[int]:
     """Find which of some views their ``photos [h,w,3]`` show; see :mod:`gsmerge.evidence.assign`.
 
     None where all together are no more alike than wrong pairs. Layers of one camera have one photo.
@@ -157,8 +157,8 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int], ph
         blocks = cut_blocks(part)
         solid = blocks.solid
         matrix = fit_map(blocks.photos[solid], blocks.pictures[solid], np.ones(solid.sum()))
-        return bool(find_shown(scene, views, [map_colors(matrix, photo).clip(0, 1) for photo in photos]))
-    return _is_mapped(part.exchange()) and bool(find_shown(scene, views, photos))
+        return bool(find_matching_views(scene, views, [map_colors(matrix, photo).clip(0, 1) for photo in photos]))
+    return _is_mapped(part.exchange()) and bool(find_matching_views(scene, views, photos))
 
 
 def _is_mapped(pairs: Pairs) -> bool:
@@ -205,20 +205,20 @@ def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Seq
     )
 
 
-def _note_covers(scene: PicturedScene, covers: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which of some photos something covers the scene, ``covers [v,h,w]``."""
-    covered = [view for view in views if covers[view].any()]
-    if not covered:
+def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
+    """Note in which of some photos something covers the scene, ``hidden [v,h,w]``."""
+    with_hidden = [view for view in views if hidden[view].any()]
+    if not with_hidden:
         return
-    most = 100 * max(float(covers[view].mean()) for view in covered)
+    most = 100 * max(float(hidden[view].mean()) for view in with_hidden)
     note(
-        f"{len(covered)} of {len(views)} photos show in part what their Gaussians do not (up to {most:.0f} % of a"
+        f"{len(with_hidden)} of {len(views)} photos show in part what their Gaussians do not (up to {most:.0f} % of a"
         " photo: a mask, a mark, a finger, another look or camera?): the Gaussians' colours take its place,"
-        f" --set look=scene everywhere: {list_some([scene.names[view] for view in covered])}"
+        f" --set look=scene everywhere: {list_some([scene.names[view] for view in with_hidden])}"
     )
 
 
-def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
+def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
     """Find the pixels ``[v,h,w]`` where changed photos differ from their own rows, and what these show ``[v,h,w,3]``.
 
     Pixels without a row are as the nearest with one. Only where the rows' base colours differ are each view's own
@@ -236,46 +236,48 @@ def _find_covers(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         for view in views:
             known = scene.stored[view] & inside[view] & rows.known  # what spills over from beside says nothing
             pictures[view] = rows.picture
-            covers[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
+            hidden[view] = differ(view, rows.picture, known) & differ(view, rows.drawing, known)
 
     inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     pictures = row_pictures(scene)
     known = scene.stored & (scene.gaussians.opacities.reshape(inside.shape) > FAINT) & inside
-    covers = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
-    picture_rows(scene, differ_drawn, np.asarray((covers | ~inside).any((1, 2))))
-    return covers, pictures
+    hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], known[view]), range(len(scene))))
+    picture_rows(scene, differ_drawn, np.asarray((hidden | ~inside).any((1, 2))))
+    return hidden, pictures
 
 
 def _replace_others(
     scene: PicturedScene,
     changes: Sequence[PhotoChange],
-    covers: np.ndarray,
+    hidden: np.ndarray,
     pictures: np.ndarray | None,
     views: Sequence[int],
 ) -> PicturedScene:
-    """Change photos at both sizes; where ``covers [v,h,w]`` and but in ``views`` they become what Gaussians show.
+    """Change photos at both sizes; where ``hidden [v,h,w]`` and but in ``views`` they become what Gaussians show.
 
     That is ``pictures [v,h,w,3]``; None: drawings. What stands in for photos that do not exist counts.
     """
     others = sorted({*range(len(scene))} - {*views})
-    covers[others] = True
+    hidden[others] = True
     if scene.masks is not None:
-        covers |= ~scene.masks
+        hidden |= ~scene.masks
         absent = sorted({*others} - {*scene.photo_views})
         if absent:
             masks = scene.masks.copy()
             masks[absent] = True
             scene = replace(scene, masks=None if masks.all() else masks)
-    covered = np.flatnonzero(covers.any((1, 2)))
-    if len(covered) == 0 and not any(changes):
+    with_hidden = np.flatnonzero(hidden.any((1, 2)))
+    if len(with_hidden) == 0 and not any(changes):
         return scene
     changes = list(changes)
-    if len(covered):
+    if len(with_hidden):
         drawn = (
-            render(scene.gaussians, scene.cameras[covered]).images.clip(0, 1) if pictures is None else pictures[covered]
+            render(scene.gaussians, scene.cameras[with_hidden]).images.clip(0, 1)
+            if pictures is None
+            else pictures[with_hidden]
         )
-        for view, colors in zip(covered, drawn, strict=True):
-            changes[view] = replace(changes[view], cover=covers[view], colors=colors)
+        for view, colors in zip(with_hidden, drawn, strict=True):
+            changes[view] = replace(changes[view], cover=hidden[view], colors=colors)
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     return replace(scene, images=images, large_photos=large)

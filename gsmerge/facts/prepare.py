@@ -8,11 +8,11 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gsmerge.facts.align_views import align_views
 from gsmerge.facts.compare_photos import compare_photos
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.facts.exposure import equalise_exposure
 from gsmerge.facts.holes import fill_holes
+from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.place_cameras import (
     NO_VIEWS,
     add_judges,
@@ -181,7 +181,7 @@ def _prepare_pixels(
     given = _with_photos(given, scene, repeated)
     scene = equalise_exposure(scene, reference.score_views, options.exposure)
     fixed, always = options.poses == "fixed", options.poses == "free"
-    moved = None if fixed else align_views(scene, reference.score_views, always=always)
+    moved = None if fixed else move_poses(scene, reference.score_views, always=always)
     return Prepared(given, moved or scene, frame, reference, repeated, moved is not None, scene.gaussians[:0])
 
 

@@ -54,13 +54,13 @@ def _with_empty(photos: Photos, scene: PicturedScene) -> Photos:
 def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float, str | None]:
     """Choose the size of photos in a fit as a multiple of the views' size, at least 1; also say why it is reduced."""
     wanted, largest = options.photo_scale, largest_scale(scene)
-    covered = options.fit == "full" and options.half_res_part < 1
+    allowed = options.fit == "full" and options.half_res_part < 1
     if wanted == "auto":
-        worth = covered and auto and largest >= MIN_AUTO_SCALE
+        worth = allowed and auto and largest >= MIN_AUTO_SCALE
         return (min(largest, AUTO_SCALE) if worth else 1.0), None
     if wanted == 1:
         return 1.0, None
-    if not covered:
+    if not allowed:
         return 1.0, f"photo_scale {wanted:g} is 1: larger photos need the full fit, with steps on photos of full size"
     if wanted > largest * (1 + ALIKE):
         return largest, f"photo_scale {wanted:g} is {largest:.3g}: the photos are no larger"

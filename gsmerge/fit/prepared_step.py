@@ -16,7 +16,7 @@ from gsmerge.kernels.raster import image_loss
 from gsmerge.kernels.raster.project import CAMERA, CONIC, SUMS, TILE
 from gsmerge.kernels.raster.step import PHASES, PIECE, STEP, fit_phase
 from gsmerge.kernels.signature import FilledTable
-from gsmerge.raster.tiled_view import MANY, MANY_EACH, aligned_rows
+from gsmerge.raster.tiled_view import MANY, MANY_EACH, cache_line_rows
 from gsmerge.runtime.threads import parallel_map
 
 SPARE = 1.25  # times the intersections of a view for which there is no room yet
@@ -49,7 +49,7 @@ class StepTables:
         self.gaussians |= {name: np.empty(n, np.int32) for name in ("ids", "order")}
         self.gaussians |= {name: np.empty(n, np.uint64) for name in ("keys", "spare")}
         self.gaussians |= {name: np.zeros(size, np.float32) for name, size in OF_STEP.items()}
-        self.gaussians |= {"conics": aligned_rows(n, CONIC), "num_kept": np.empty(-(-n // PIECE), np.int64)}
+        self.gaussians |= {"conics": cache_line_rows(n, CONIC), "num_kept": np.empty(-(-n // PIECE), np.int64)}
         self.gaussians |= {name: getattr(self.state, name) for name in OF_STATE}
         self.gaussians |= {name: getattr(self.state.splats, name) for name in OF_SPLATS}
         self._make_room(1)

@@ -39,8 +39,8 @@ from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
-from gsmerge.scene.held_out import place_camera_file
-from gsmerge.scene.read import Loaded, SceneViews, place_cameras_in_scene, read_gaussian_file
+from gsmerge.scene.held_out import read_into_frame
+from gsmerge.scene.read import Loaded, SceneViews, move_cameras_to_scene, read_gaussian_file
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
@@ -252,7 +252,7 @@ def _path_cameras(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, li
 def _place_file(file: Path, load: Loaded) -> Cameras:
     """Read the cameras of a path into the frame of a scene; cameras without a size get that of the scene."""
     cameras = load.views.cameras
-    stored = read_cameras(file) if load.cameras is None else place_camera_file(load, file)[0]
+    stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
     return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
@@ -271,7 +271,7 @@ def _read(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     plys = [read_gaussians(path, opacity=options.opacity) for path in paths[1:]]
     same_file = like.ply == files.ply
     rows = first if same_file else read_gaussian_file(like, opacity="auto", hints=AUTO)
-    own = place_cameras_in_scene(rows, like, hints=options.hints, photos=photos)
+    own = move_cameras_to_scene(rows, like, hints=options.hints, photos=photos)
     load = _with_views(own, inside=photos)
     if options.overlay is not None and load is not own:
         load = replace(load, notes=(*load.notes, "overlay: these views count, so it says nothing of photos"))

@@ -36,17 +36,7 @@ FASTER = 1.2  # times, from which on the headline says it
 def view_page(data: ViewData) -> str:
     """Make the HTML page of a scene and its results."""
     photos = any(view.photo is not None for view in data.views)
-    picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = (
-        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}] if photos else []
-    )
-    sources += [
-        {
-            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
-            "dropped": side.dropped, "seen": side.seen, "support": None if side.support is None else f"support-{i}",
-        }
-        for i, side in enumerate(data.sides)
-    ]  # fmt: skip
+    sources = _sources(data, photos)
     right = min(int(photos) + 1, len(sources) - 1)
     left = max(right - 1, 0)
     stills = [
@@ -67,13 +57,7 @@ def view_page(data: ViewData) -> str:
         f"support-{i}": base64_text(side.support) for i, side in enumerate(data.sides) if side.support is not None
     }
     places = range(min(len(data.sides) - 1, 1), len(data.sides))
-    results: list[dict[str, Any]] = [
-        {
-            "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
-            "figures": figures(data, place),
-        }
-        for place in places
-    ]  # fmt: skip
+    results = [_result(data, place) for place in places]
     by_size = sorted(places, key=lambda place: data.sides[place].num_gaussians)
     return render_template(
         "view.html",
@@ -109,6 +93,29 @@ def view_page(data: ViewData) -> str:
         splats=splats,
         engine=engine and base64_text(engine),
     )
+
+
+def _sources(data: ViewData, photos: bool) -> list[dict[str, Any]]:
+    """List what the sides of a page may show: the photos if there are some, and each scene."""
+    picture = "own colours" if data.reference == ROW_COLORS else "photo"
+    sources: list[dict[str, Any]] = (
+        [{"name": picture, "splats": None, "count": 0, "dropped": {}, "seen": {}, "support": None}] if photos else []
+    )
+    return sources + [
+        {
+            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians,
+            "dropped": side.dropped, "seen": side.seen, "support": None if side.support is None else f"support-{i}",
+        }
+        for i, side in enumerate(data.sides)
+    ]  # fmt: skip
+
+
+def _result(data: ViewData, place: int) -> dict[str, Any]:
+    """Describe a result in the words and figures of a page."""
+    return {
+        "headline": _unbroken(headline(data, place)), "speed": speed(data, place), "words": size_words(data, place),
+        "figures": figures(data, place),
+    }  # fmt: skip
 
 
 def headline(data: ViewData, place: int = 1) -> str:

@@ -152,7 +152,7 @@ def _visible(
     return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
 
 
-def aligned_rows(count: int, width: int) -> Array:
+def cache_line_rows(count: int, width: int) -> Array:
     """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row spans two."""
     line = 16
     buffer = np.empty(count * width + line, np.float32)
@@ -163,7 +163,7 @@ def aligned_rows(count: int, width: int) -> Array:
 def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
     """Return conics, depths and tile boxes of the listed Gaussians."""
     m = len(ids)
-    conics, depths = aligned_rows(m, projection.CONIC), np.empty(m, np.float32)
+    conics, depths = cache_line_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
 
     def project(span: tuple[int, int]) -> None:

@@ -16,9 +16,9 @@ import numpy as np
 
 from gsmerge import alignment
 from gsmerge.errors import SceneError
-from gsmerge.evidence.places import correlate_parts
+from gsmerge.evidence.offsets import correlate_parts
+from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import stands_out
-from gsmerge.evidence.shown import Shown
 from gsmerge.io.cameras.camera_file import CameraFile, missing_intrinsics
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import list_images
@@ -86,7 +86,7 @@ def list_fits(size: Size) -> list[GridFit]:
     return [GridFit(size, crops, trim) for crops in (False, True) for trim in dict.fromkeys(trims)]
 
 
-def choose_fit(shown: Shown, photos: Sequence[np.ndarray | None], fits: Sequence[GridFit]) -> GridFit:
+def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[GridFit]) -> GridFit:
     """Choose how photos ``[h,w,3]`` that show the views were brought to their grid: of equals the first."""
     views = [view for view, photo in enumerate(photos) if photo is not None]
 

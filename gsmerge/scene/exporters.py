@@ -106,6 +106,7 @@ _NORMALS = ("nx", "ny", "nz")
 # What users have to add, or what is lost
 _NAME_CAMERAS = "read right with cameras, or with those that its grid shows"
 _NO_PIXELS = "unaligned: without pixels"
+_IF_GRID_SHOWS = "read right where the rows show their grid, else unaligned"
 _WITH_CAMERAS = "unaligned; photos are used where cameras are named"
 # Place of a trained scene, and what brings its cameras
 _TRAINED = "iteration_*/point_cloud.ply", "cameras.json of the run has the cameras: give its folder, or name it"
@@ -308,7 +309,7 @@ _EXPORTERS = (
         (
             Model(
                 "Splatter Image", "a copy of the demo's `utils/vis_utils.py`",
-                "opacities above 0.08, scales made larger, turned for a viewer; no cameras", _NO_PIXELS,
+                "opacities above 0.08, scales made larger, turned for a viewer; no cameras", _IF_GRID_SHOWS,
             ),
         ),
         "logit", "view-major", ("pruned", "full"), ("same", "scaled", "other"), degrees=(1,),
@@ -316,7 +317,9 @@ _EXPORTERS = (
     Exporter(
         "lgm",
         (
-            Model("LGM", "3DTopia/LGM be6a87f", "an object of four views that are not kept, and a film", _NO_PIXELS),
+            Model(
+                "LGM", "3DTopia/LGM be6a87f", "an object of four views that are not kept, and a film", _IF_GRID_SHOWS
+            ),
             Model("GRM", "justimyhxu/GRM 0d4efb1", "an object, turned for a viewer", "read right with cameras"),
             Model(
                 "GS-LRM", "Intern-Nexus/gs-lrm-unofficial 2c2b68d, with LGM's saving code", "no cameras",

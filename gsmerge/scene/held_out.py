@@ -48,7 +48,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     path = Path(cameras)
     if not path.exists():
         raise SceneError(path, "expected cameras of held-out views, found nothing")
-    camera_file, shared = place_camera_file(load, path)
+    camera_file, shared = read_into_frame(load, path)
     shared |= _repeated(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:
@@ -73,7 +73,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     )
 
 
-def place_camera_file(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
+def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
     """Read a camera file into the frame of a scene's Gaussians; also map its views to those of the scene.
 
     Frame and convention are chosen as in :func:`read_held_out`.

@@ -18,9 +18,9 @@ import numpy as np
 from gsmerge.alignment import ESTIMATED
 from gsmerge.errors import SceneError
 from gsmerge.evidence.assign import Assigner, Assignment, Candidates, assign_photos
-from gsmerge.evidence.places import SIDE, correlate_parts
+from gsmerge.evidence.offsets import SIDE, correlate_parts
+from gsmerge.evidence.pictures import ViewPictures, show_views
 from gsmerge.evidence.scores import stands_out
-from gsmerge.evidence.shown import Shown, show_views
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.embedded import SHARP
 from gsmerge.io.cameras.read import CHUNK, read_cameras
@@ -311,7 +311,7 @@ def assign_to_views(
 
     masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
 
-    def show(side: int) -> Shown:
+    def show(side: int) -> ViewPictures:
         return show_views(replace(scene, masks=masks), side)[views]
 
     assigned = assign_photos(show, candidates, named, exact=proposal.exact, stored=stored)

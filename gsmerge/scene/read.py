@@ -61,7 +61,7 @@ from gsmerge.scene.photos import (
     stored_photos,
     without_photo,
 )
-from gsmerge.scene.rows import color_from_photos, place_rows, set_rotations, use_depths
+from gsmerge.scene.rows import color_from_photos, set_rotations, sort_rows, use_depths
 from gsmerge.scene.views import (
     check_masks,
     cut_bars,
@@ -433,7 +433,7 @@ def _make_load(
     """
     camera_file, layout, views = result.camera_file, result.layout, list(result.views)
     names = () if camera_file is None else camera_file.names
-    gaussians, pixel_ids, missing, more = place_rows(ply, result)
+    gaussians, pixel_ids, missing, more = sort_rows(ply, result)
     cameras, images = result.cameras, result.images
     if views != list(range(len(cameras))):
         cameras, images = cameras[views], images[views] if len(images) else images
@@ -484,7 +484,7 @@ def _unaligned_note(hints: ReadHints) -> str:
     return f"{note}; only the layouts of {hints.exporter} were tried, as given; --hint exporter=auto tries all"
 
 
-def place_cameras_in_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
+def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Move a file's cameras into the frame of the Gaussians if pixels or colours show it; else keep them.
 
     ``photos`` that were named and cannot be read raise an error; with False photos are left out. SceneError if named

@@ -56,7 +56,7 @@ def use_depths(scene: Scene, camera_file: CameraFile, layout: Layout, unit: floa
     return full, [*notes, *[filled] * (count > 0)]
 
 
-def place_rows(
+def sort_rows(
     ply: GaussianFile, result: AlignmentResult
 ) -> tuple[Gaussians, np.ndarray | None, np.ndarray | None, list[str]]:
     """Sort rows by the pixels of the grid; return Gaussians, ``pixel_ids``, ``missing`` and notes.

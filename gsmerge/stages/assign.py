@@ -27,7 +27,7 @@ from gsmerge.types import Gaussians, Groups, Scene
 
 # Share of pixels with a centre: of captures in voxels six with .97 and more gain by projection, two with .93 and .95
 # lose 1.5 and 5 dB
-MIN_COVERED = 0.96
+MIN_WITH_CENTRE = 0.96
 
 
 @stage("members")
@@ -41,7 +41,7 @@ def assign(scene: Scene, groups: Groups, *, draws: bool = True) -> Members:
     if scene.aligned:
         return scene_members(scene)
     pixels, fronts = (None, None) if draws else find_pixels(scene)
-    if pixels is None or fronts is None or (fronts >= 0).mean() < MIN_COVERED:
+    if pixels is None or fronts is None or (fronts >= 0).mean() < MIN_WITH_CENTRE:
         pixels, fronts = owner_pixels(find_owners(scene, groups), groups), None
     if not (pixels >= 0).any():
         raise UsageError(

@@ -60,7 +60,7 @@ def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
     looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
     depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))
-    seen = _see(cameras, depths), _see(between, [look[:2] for look in looks]).where_covered()
+    seen = _see(cameras, depths), _see(between, [look[:2] for look in looks]).where_seen()
 
     def continue_surfaces(view: int) -> Gaussians:
         return _continue_surfaces(looks[view], between[[view]], seen, outside, fitted.shN.shape[1])
@@ -92,7 +92,7 @@ class Seen:
     farthest: np.ndarray  # [c,h,w] mean camera z, the farthest around, as far as new Gaussians reach
     clear: np.ndarray  # [c,h,w] bool, where little is
 
-    def where_covered(self) -> Seen:
+    def where_seen(self) -> Seen:
         """Return a copy that says nothing where it is clear, as what a camera between photos sees."""
         return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
 

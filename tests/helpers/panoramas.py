@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.evidence.shown import Shown
+from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster.photos import shrink_pictures
 
@@ -33,10 +33,10 @@ def take_photos(views: np.ndarray, seed: int = 0) -> np.ndarray:
     return (gains * views + 0.03 * rng.standard_normal(views.shape).astype(np.float32)).clip(0, 1)
 
 
-def show(views: np.ndarray, side: int, weights: np.ndarray | None = None) -> Shown:
+def show(views: np.ndarray, side: int, weights: np.ndarray | None = None) -> ViewPictures:
     """Views as Gaussians of ``weights [v,h,w]`` show them, of ``side`` pixels."""
     weights = np.ones(views.shape[:3], np.float32) if weights is None else weights
-    whole = Shown(np.where(weights[..., None] > 0, views, 0), weights, drawn=True)
+    whole = ViewPictures(np.where(weights[..., None] > 0, views, 0), weights, drawn=True)
     return whole if side >= WIDTH else whole.shrink(side)
 
 

@@ -39,13 +39,13 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     _check(scenes, paths)
     registration = register(scenes)
     names = _names(paths)
-    used = [i for i, place in enumerate(registration.places) if place is not None]
+    used = [i for i, place in enumerate(registration.similarities) if place is not None]
     if len(used) < 2:
         problem = f"expected files that show one place, found no two of {len(paths)}"
         remedy = "give photos that overlap by half, name their folder with --images"
         remedy += ", or compact each file by itself"
         raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
-    moved = [move_scene(scenes[i], place) for i in used if (place := registration.places[i]) is not None]
+    moved = [move_scene(scenes[i], place) for i in used if (place := registration.similarities[i]) is not None]
     counts = [registration.matches[i] for i in used]
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
     notes = [f"{joined}, by {min(counts)} to {max(counts)} keypoints each"]
@@ -53,7 +53,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     notes += [f"{name} {left_out}" for i, name in enumerate(names) if i not in used]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append("some files have no photos, so none are used; name the folder of all with --images")
-    facts = [_facts(*entry) for entry in zip(paths, registration.places, registration.matches, strict=True)]
+    facts = [_facts(*entry) for entry in zip(paths, registration.similarities, registration.matches, strict=True)]
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 

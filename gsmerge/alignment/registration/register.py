@@ -41,15 +41,15 @@ ROUNDS = 3  # of choosing the matches of a pair that agree, and moving it by the
 DAMPING = Damping(steps=40, first=1e-4, ease=0.1, brake=10.0, most=1e6, min_gain=1e-9)
 SIZE = 7  # numbers of a step: turn, shift, logarithm of the scale
 
-Places = Sequence[Similarity | None]
-_Fit = tuple[Places, tuple[float, np.ndarray, np.ndarray]]  # with the cost there, its curvature and its slope
+Similarities = Sequence[Similarity | None]
+_Fit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]  # with the cost there, its curvature and its slope
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
     """Similarity from each scene's frame to that of the first scene of the largest connected set."""
 
-    places: tuple[Similarity | None, ...]  # of each scene; None where it is not connected
+    similarities: tuple[Similarity | None, ...]  # of each scene; None where it is not connected
     matches: tuple[int, ...]  # keypoints of each that agree with those of others
 
 
@@ -64,17 +64,17 @@ def register(scenes: Sequence[Scene]) -> Registration:
     ids = combinations(range(count), 2)
     pairs = [match_photos((a, b), photos[a], photos[b], size) for a, b in ids]
     links = [link for link in parallel_map(connect, pairs) if link is not None]
-    places = _chain(links, count)
-    inside = [pair for _, pair in links if all(places[scene] is not None for scene in pair.scenes)]
+    similarities = _chain(links, count)
+    inside = [pair for _, pair in links if all(similarities[scene] is not None for scene in pair.scenes)]
     spread = DEPTH_SPREAD
     for loose in LOOSE if inside else ():
-        kept = [pair.select(_squares(places, pair, spread) < loose * AGREE) for pair in inside]
-        places = _refine(places, kept, spread)
-        inside, spread = _measure_spreads(places, inside)
-    agreeing = [pair.select(_squares(places, pair, spread) < AGREE) for pair in inside]
+        kept = [pair.select(_squares(similarities, pair, spread) < loose * AGREE) for pair in inside]
+        similarities = _refine(similarities, kept, spread)
+        inside, spread = _measure_spreads(similarities, inside)
+    agreeing = [pair.select(_squares(similarities, pair, spread) < AGREE) for pair in inside]
     matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
-    unit = _unit(photos, places)
-    rounded = tuple(None if place is None else round_place(place, unit) for place in places)
+    unit = _unit(photos, similarities)
+    rounded = tuple(None if place is None else round_place(place, unit) for place in similarities)
     return Registration(rounded, tuple(matches))
 
 
@@ -92,14 +92,14 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     trials = _sample_places(matches)
     misses = [_squares((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
     scores = [(1 - squares / AGREE).clip(0).sum() for squares in misses]
-    places: Places = (trials[int(np.argmax(scores))], IDENTITY)
+    similarities: Similarities = (trials[int(np.argmax(scores))], IDENTITY)
     agree = misses[int(np.argmax(scores))] < AGREE
     for _ in range(ROUNDS):
         if agree.sum() < MIN_MATCHES // 2:
             return None
-        places = _refine(places, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
-        agree = _squares(places, pair, DEPTH_SPREAD) < AGREE
-    place = places[0]
+        similarities = _refine(similarities, [pair.select(agree)], DEPTH_SPREAD, fixed=1)
+        agree = _squares(similarities, pair, DEPTH_SPREAD) < AGREE
+    place = similarities[0]
     if place is None or agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(matches)):
         return None
     return place, matches.select(agree)
@@ -120,9 +120,9 @@ def _sample_places(matches: KeypointMatches) -> list[Similarity]:
     return [Similarity(rotations[i], float(scales[i]), shifts[i], kind="other") for i in best]
 
 
-def _between(places: Places, scenes: Sequence[int]) -> Similarity:
+def _between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
     """Return the similarity from the frame of the first of two placed scenes to the second's."""
-    first, second = (places[scene] for scene in scenes)
+    first, second = (similarities[scene] for scene in scenes)
     assert first is not None
     assert second is not None
     return apply_after(invert_place(second), first)
@@ -172,24 +172,26 @@ def _residuals(place: Similarity, end: End, other: End, pixels: float, spread: f
     return _Residuals(moved, values, matmul(by_camera, turns))
 
 
-def _squares(places: Places, matches: KeypointMatches, spread: float) -> np.ndarray:
+def _squares(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
     """Return the squared residual ``[m]`` of each match: the larger one of both directions."""
-    both = [(residuals.values**2).sum(1) for residuals in _both_ways(places, matches, spread)]
+    both = [(residuals.values**2).sum(1) for residuals in _both_ways(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
-def _both_ways(places: Places, matches: KeypointMatches, spread: float) -> list[_Residuals]:
+def _both_ways(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
     first, second = matches.ends
-    there = _between(places, matches.scenes)
+    there = _between(similarities, matches.scenes)
     return [
         _residuals(there, first, second, matches.spread, spread),
         _residuals(invert_place(there), second, first, matches.spread, spread),
     ]
 
 
-def _measure_spreads(places: Places, matches: Sequence[KeypointMatches]) -> tuple[list[KeypointMatches], float]:
+def _measure_spreads(
+    similarities: Similarities, matches: Sequence[KeypointMatches]
+) -> tuple[list[KeypointMatches], float]:
     """Measure errors robustly; return the matches with that of keypoints, and that of the logarithms of depths."""
-    values = [_both_ways(places, pair, DEPTH_SPREAD)[0].values for pair in matches]
+    values = [_both_ways(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     lengths = [pair.spread * np.sqrt((errors[:, :2] ** 2).sum(1)) for pair, errors in zip(matches, values, strict=True)]
     ratios = np.abs(np.concatenate(values)[:, 2]) * DEPTH_SPREAD
     spread = NORMAL * float(lower_median(ratios))
@@ -201,50 +203,52 @@ def _measure_spreads(places: Places, matches: Sequence[KeypointMatches]) -> tupl
 # All scenes
 
 
-def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Places:
+def _chain(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Place the largest connected set by its strongest links, in the frame of its first scene."""
     strength = [0] * count
     for _, pair in links:
         for scene in pair.scenes:
             strength[scene] += len(pair)
-    best: Places = []
+    best: Similarities = []
     for start in sorted(range(count), key=lambda scene: -strength[scene]):
-        places = _chain_from(start, links, count)
-        if _num_placed(places) > _num_placed(best):
-            best = places
+        similarities = _chain_from(start, links, count)
+        if _num_connected(similarities) > _num_connected(best):
+            best = similarities
     first = next(place for place in best if place is not None)
     back = invert_place(first)
     return [place and (IDENTITY if place is first else apply_after(back, place)) for place in best]
 
 
-def _num_placed(places: Places) -> int:
-    return sum(place is not None for place in places)
+def _num_connected(similarities: Similarities) -> int:
+    return sum(place is not None for place in similarities)
 
 
-def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Places:
+def _chain_from(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Place scenes in the frame of ``start``, each by its strongest link to a scene already placed."""
-    places: list[Similarity | None] = [None] * count
-    places[start] = IDENTITY
+    similarities: list[Similarity | None] = [None] * count
+    similarities[start] = IDENTITY
     while True:
-        ends = [link for link in links if sum(places[scene] is not None for scene in link[1].scenes) == 1]
+        ends = [link for link in links if sum(similarities[scene] is not None for scene in link[1].scenes) == 1]
         if not ends:
-            return places
+            return similarities
         place, pair = max(ends, key=lambda link: len(link[1]))
         a, b = pair.scenes
-        first = places[a]
-        second = places[b]
+        first = similarities[a]
+        second = similarities[b]
         if second is not None:
-            places[a] = apply_after(second, place)
+            similarities[a] = apply_after(second, place)
         elif first is not None:
-            places[b] = apply_after(first, invert_place(place))
+            similarities[b] = apply_after(first, invert_place(place))
 
 
-def _refine(places: Places, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None) -> Places:
+def _refine(
+    similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, fixed: int | None = None
+) -> Similarities:
     """Move all placed scenes but ``fixed`` (None: the first) until matches agree best, by damped Gauss-Newton steps."""
-    placed = [i for i, place in enumerate(places) if place is not None]
+    placed = [i for i, place in enumerate(similarities) if place is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
 
-    def fit(near: Places) -> _Fit:
+    def fit(near: Similarities) -> _Fit:
         return near, _normal_equations(near, matches, spread, free)
 
     def step(state: _Fit, damping: float) -> _Fit | None:
@@ -258,7 +262,7 @@ def _refine(places: Places, matches: Sequence[KeypointMatches], spread: float, f
             moved[i] = apply_after(current_places[i] or IDENTITY, _make_step(vector))
         return fit(moved)
 
-    return descend(fit(places), lambda state: state[1][0], step, DAMPING)[0]
+    return descend(fit(similarities), lambda state: state[1][0], step, DAMPING)[0]
 
 
 def _make_step(step: np.ndarray) -> Similarity:
@@ -269,7 +273,7 @@ def _make_step(step: np.ndarray) -> Similarity:
 
 
 def _normal_equations(
-    places: Places, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
+    similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return cost (Cauchy's), curvature and slope with respect to the steps of the free scenes."""
     size = len(free) * SIZE
@@ -278,8 +282,8 @@ def _normal_equations(
     cost = 0.0
     columns = {scene: slice(i * SIZE, (i + 1) * SIZE) for i, scene in enumerate(free)}
     for pair in matches:
-        there = _between(places, pair.scenes)
-        ways = _both_ways(places, pair, spread)
+        there = _between(similarities, pair.scenes)
+        ways = _both_ways(similarities, pair, spread)
         for way, place, residuals in zip((0, 1), (there, invert_place(there)), ways, strict=True):
             squares = (residuals.values**2).sum(1)
             weights = 1 / (1 + squares / DOUBT)
@@ -307,8 +311,8 @@ def _by_step(slopes: np.ndarray, points: np.ndarray, place: Similarity) -> np.nd
     return np.concatenate([matmul(by_point, turns), by_point, by_scale], 2)
 
 
-def _unit(photos: Sequence[Sequence[Photo]], places: Places) -> float:
+def _unit(photos: Sequence[Sequence[Photo]], similarities: Similarities) -> float:
     """Return the power of two nearest to the median depth of the points of the first placed scene."""
-    first = next(scene_photos for scene_photos, place in zip(photos, places, strict=True) if place is not None)
+    first = next(scene_photos for scene_photos, place in zip(photos, similarities, strict=True) if place is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
     return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

@@ -106,7 +106,7 @@ def test_without_photos_base_colours_are_compared(parts: list[Scene]) -> None:
 @pytest.mark.slow
 def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     """Places are rounded, and what moves keypoints by a rounding error moves no place."""
-    places = register(parts[:2]).places
+    places = register(parts[:2]).similarities
     assert places[1].scale == round(places[1].scale, DIGITS)
     find = keypoints._describe
 
@@ -115,7 +115,7 @@ def test_the_last_bits_do_not_matter(parts: list[Scene], monkeypatch: pytest.Mon
         return pixels * (1 + 2e-16), descriptors
 
     monkeypatch.setattr(keypoints, "_describe", shaken)
-    other = register(parts[:2]).places[1]
+    other = register(parts[:2]).similarities[1]
     for name in ("rotation", "scale", "shift"):
         assert np.array_equal(getattr(other, name), getattr(places[1], name))
 

@@ -9,7 +9,7 @@ import pytest
 from panoramas import cut_views, show, shrunk, take_photos
 
 from gsmerge.evidence.assign import AT_ONCE, Assigner, Assignment, Candidates, assign_photos
-from gsmerge.evidence.places import SIDE, find_places
+from gsmerge.evidence.offsets import SIDE, find_offsets
 from gsmerge.kernels.pictures import turn_back
 
 VIEWS = 6
@@ -90,15 +90,15 @@ def test_some_frames_of_a_film(views: np.ndarray, photos: list[np.ndarray]) -> N
 
 def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarray]) -> None:
     shown = show(views, SIDE)
-    own = find_places(shown, 2, photos[2])
+    own = find_offsets(shown, 2, photos[2])
     assert own is not None
     assert own.verdict is True
     beside = np.roll(photos[2], 8, 1)
-    moved = find_places(shown, 2, beside)
+    moved = find_offsets(shown, 2, beside)
     assert moved is not None
     assert moved.verdict is False
     assert moved.together > moved.here
-    assert find_places(show(views, 32), 2, photos[2]) is None  # too small for parts
+    assert find_offsets(show(views, 32), 2, photos[2]) is None  # too small for parts
 
 
 def test_scores_are_kept(views: np.ndarray, photos: list[np.ndarray]) -> None:

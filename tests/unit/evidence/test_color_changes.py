@@ -21,7 +21,7 @@ from gsmerge.evidence.colors import (
     plain_blocks,
     tone_blocks,
 )
-from gsmerge.evidence.shown import Pairs, Shown
+from gsmerge.evidence.pictures import Pairs, ViewPictures
 
 Change = Callable[[np.ndarray], np.ndarray]
 
@@ -31,7 +31,7 @@ def pair(change: Change, noise: float = 0.0) -> Pairs:
     photos = shrunk(cut_views(4), 96)
     grain = noise * np.random.default_rng(0).standard_normal(photos.shape)
     pictures = (change(photos) + grain).clip(0, 1).astype(np.float32)
-    return Pairs(photos, Shown(pictures, np.ones(photos.shape[:3], np.float32), drawn=True))
+    return Pairs(photos, ViewPictures(pictures, np.ones(photos.shape[:3], np.float32), drawn=True))
 
 
 def gamma(photos: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_faint_blocks_are_not_compared() -> None:
     pairs = pair(gamma)
     weights = np.ones(pairs.photos.shape[:3], np.float32)
     weights[:, :36] = 0.01
-    blocks: Blocks = cut_blocks(Pairs(pairs.photos, Shown(pairs.shown.pictures, weights, drawn=True)))
+    blocks: Blocks = cut_blocks(Pairs(pairs.photos, ViewPictures(pairs.shown.pictures, weights, drawn=True)))
     errors = blocks.errors().reshape(blocks.solid.shape)
     assert np.isnan(errors[:, :4]).all()
     assert np.isfinite(errors[:, 5:]).all()

@@ -7,6 +7,7 @@ import pytest
 from panoramas import cut_views, show, take_photos
 from scipy.stats import wilcoxon
 
+from gsmerge.evidence.pictures import ViewPictures, average, fit_size
 from gsmerge.evidence.scores import (
     MARGIN,
     SIZES,
@@ -17,12 +18,11 @@ from gsmerge.evidence.scores import (
     signed_ranks,
     stands_out,
 )
-from gsmerge.evidence.shown import Shown, average, fit_size
 from gsmerge.kernels.pictures import TURNS, turn_back, turn_picture
 from gsmerge.raster.photos import shrink_pictures
 
 
-def correlate_slowly(shown: Shown, view: int, upright: np.ndarray) -> float:
+def correlate_slowly(shown: ViewPictures, view: int, upright: np.ndarray) -> float:
     """Weighted correlation of local contrasts, the mean of all sizes, pixel by pixel."""
     out, most = [], fit_size(upright.shape[1::-1], SIZES[-1])
     for side in SIZES:

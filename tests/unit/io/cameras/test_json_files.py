@@ -27,7 +27,7 @@ from tiny_scene import (
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.kernels.elementary import arctan2
-from gsmerge.scene.held_out import place_camera_file
+from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import load_scene
 
 
@@ -191,7 +191,7 @@ def test_other_cameras_of_the_capture_are_moved_with_them(tmp_path: Path) -> Non
     trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     write_transforms(tmp_path / "path.json", replace(SMOOTH, names=("x.png", "y.png", "z.png")))
-    placed, shared = place_camera_file(load_scene(tmp_path), tmp_path / "path.json")
+    placed, shared = read_into_frame(load_scene(tmp_path), tmp_path / "path.json")
     assert shared == {}
     expected = SMOOTH.w2c
     expected[:, :3, :3] = expected[:, :3, :3] @ TURN.T

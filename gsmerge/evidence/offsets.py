@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.evidence.pictures import ViewPictures
 from gsmerge.evidence.scores import MARGIN, NORMAL, find_contrast, fisher_z
-from gsmerge.evidence.shown import Shown
 from gsmerge.raster.photos import shrink_pictures
 
 SIDE = 256  # pixels of the longer side of both pictures
@@ -23,7 +23,7 @@ NEAR_PIXELS = 3  # pixels to which parts moved alike: what different depths leav
 
 
 @dataclass(frozen=True)
-class Places:
+class PhotoOffsets:
     """How many parts of a photo that say where they are lie in their places, and how many elsewhere."""
 
     here: int
@@ -43,7 +43,7 @@ class Places:
         return False if self.elsewhere - self.here > np.sqrt(self.elsewhere + self.here) else None
 
 
-def correlate_parts(shown: Shown, view: int, photo: np.ndarray) -> np.ndarray:
+def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.ndarray:
     """Return Fisher's z of the correlations ``[n]`` of a photo's parts with those in the same places of a view."""
     weight = shown.weights[view]
     height, width = weight.shape
@@ -57,7 +57,7 @@ def correlate_parts(shown: Shown, view: int, photo: np.ndarray) -> np.ndarray:
     return fisher_z(add(near * own) / np.sqrt(np.maximum(add(near * near) * add(own * own), 1e-12)))
 
 
-def find_places(shown: Shown, view: int, photo: np.ndarray) -> Places | None:
+def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
     """Look up the parts of an upright ``photo [h,w,3]`` in a view of ``shown``, which has up to :data:`SIDE` pixels.
 
     None if these are so few that there are no parts.
@@ -76,7 +76,7 @@ def find_places(shown: Shown, view: int, photo: np.ndarray) -> Places | None:
     moves = moves[np.abs(moves).max(1) > SAME]
     together = (np.abs(moves[:, None] - moves).max(2) <= NEAR_PIXELS).sum(1).max(initial=0)
     alike = float(scores[:, scores.shape[1] // 2].mean())
-    return Places(int(decided.sum()) - len(moves), len(moves), int(together), alike)
+    return PhotoOffsets(int(decided.sum()) - len(moves), len(moves), int(together), alike)
 
 
 def _look_up(photo: np.ndarray, picture: np.ndarray, weight: np.ndarray) -> np.ndarray:

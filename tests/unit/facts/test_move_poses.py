@@ -11,7 +11,7 @@ import scenes
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.compact import build_cleaned
-from gsmerge.facts.align_views import align_views
+from gsmerge.facts.move_poses import move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
 from gsmerge.geometry import motion_matrices, motion_vectors, pose_changes, project, quat_to_rotmat
@@ -57,14 +57,14 @@ def test_moved_gaussians_stay_at_their_pixels(scene: Scene) -> None:
 
 
 def test_views_that_agree_are_left_alone(scene: Scene) -> None:
-    assert align_views(scene, VIEWS) is None
+    assert move_poses(scene, VIEWS) is None
 
 
 @pytest.mark.parametrize("views", [slice(None), slice(1, 2)], ids=["all", "one"])
 def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None:
     wrong = motions.disagreeing(scene, views=views)
     before = worst_error(wrong, scene)
-    found = align_views(wrong, VIEWS)
+    found = move_poses(wrong, VIEWS)
     degrees, distance = worst_error(found, scene)
     assert degrees < 0.25 * before[0]
     assert distance < 0.25 * before[1]
@@ -74,7 +74,7 @@ def test_views_are_moved_to_where_they_agree(views: slice, scene: Scene) -> None
 
 def test_views_that_are_left_out_stay(scene: Scene) -> None:
     wrong = motions.disagreeing(scene)
-    found = align_views(wrong, range(4))
+    found = move_poses(wrong, range(4))
     last = slice(4 * scene.pixels_per_view, None)
     np.testing.assert_allclose(found.cameras.viewmats[4], wrong.cameras.viewmats[4], atol=1e-12)
     np.testing.assert_allclose(found.gaussians.means[last], wrong.gaussians.means[last], atol=1e-6)
@@ -126,7 +126,7 @@ def test_the_same_with_one_thread(scene: Scene) -> None:
     wrong, found = motions.disagreeing(scene), []
     for threads in (1, 2):
         with use_threads(threads):
-            found.append(align_views(wrong, VIEWS))
+            found.append(move_poses(wrong, VIEWS))
     np.testing.assert_array_equal(found[0].cameras.viewmats, found[1].cameras.viewmats)
     np.testing.assert_array_equal(found[0].gaussians.means, found[1].gaussians.means)
 
@@ -134,11 +134,11 @@ def test_the_same_with_one_thread(scene: Scene) -> None:
 @pytest.mark.parametrize("size", [(12, 8), (40, 1)])
 def test_nothing_can_be_told_of_tiny_photos(size: tuple[int, int]) -> None:
     tiny = scenes.make_scene(scenes.room(), scenes.arc(3, *size))
-    assert align_views(tiny, range(3), always=True) is None
+    assert move_poses(tiny, range(3), always=True) is None
 
 
 def test_one_view_agrees_with_itself(scene: Scene) -> None:
-    assert align_views(scenes.take_views(scene, [0]), [0], always=True) is None
+    assert move_poses(scenes.take_views(scene, [0]), [0], always=True) is None
 
 
 def test_no_motion_in_common() -> None:

@@ -23,7 +23,7 @@ LEAST = 1 / 255  # opacity below which a rasterizer draws nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ViewPictures:
     """Small pictures of what the Gaussians show in v views."""
 
     pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], transparency divided out; 0 where nothing is shown
@@ -33,12 +33,12 @@ class Shown:
     def __len__(self) -> int:
         return len(self.pictures)
 
-    def __getitem__(self, views: Sequence[int]) -> Shown:
+    def __getitem__(self, views: Sequence[int]) -> ViewPictures:
         """Return the pictures of some views."""
         ids = list(views)
         return replace(self, pictures=self.pictures[ids], weights=self.weights[ids])
 
-    def shrink(self, side: int) -> Shown:
+    def shrink(self, side: int) -> ViewPictures:
         """Average the pictures by their weights to at most ``side`` pixels of the longer side."""
         width, height = fit_size(self.weights.shape[2:0:-1], side)
         weights = shrink_pictures(self.weights, width, height)
@@ -50,7 +50,7 @@ class Pairs:
     """Photos of v views, and what the Gaussians show there."""
 
     photos: np.ndarray  # [v,h,w,3] of the pictures' size
-    shown: Shown
+    shown: ViewPictures
 
     def __len__(self) -> int:
         return len(self.photos)
@@ -96,7 +96,7 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
     return Pairs(photos_of(photos, scene.cameras, level).images, shown)
 
 
-def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS) -> Shown:
+def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUSSIANS) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views, in any frame.
 
     Where rows belong to pixels these are the colours of some of them, else drawings of a sample of all Gaussians.
@@ -110,7 +110,7 @@ def show_views(scene: Scene, side: int | None = None, samples: int = SAMPLE_GAUS
     return shown if inside is None else replace(shown, weights=shown.weights * (inside == 1))
 
 
-def _show_rows(scene: Scene, side: int) -> Shown:
+def _show_rows(scene: Scene, side: int) -> ViewPictures:
     """Return the colours of rows, every so many columns and lines."""
     some = _every(scene.cameras, side)
     grid = len(scene), scene.cameras.height, scene.cameras.width
@@ -118,7 +118,7 @@ def _show_rows(scene: Scene, side: int) -> Shown:
     if scene.masks is not None:
         weights = weights * scene.masks[some]
     colors = sh0_to_rgb(scene.gaussians.sh0.reshape(*grid, 3)[some]).clip(0, 1)
-    return Shown(colors, weights.astype(np.float32), drawn=False)
+    return ViewPictures(colors, weights.astype(np.float32), drawn=False)
 
 
 def _every(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
@@ -128,10 +128,10 @@ def _every(cameras: Cameras, side: int) -> tuple[slice, slice, slice]:
     return slice(None), pixels, pixels
 
 
-def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> Shown:
+def draw_views(gaussians: Gaussians, cameras: Cameras, side: int) -> ViewPictures:
     """Draw canonical Gaussians, and divide their transparency out."""
     blank = blank_photos(cameras, max(1.0, max(cameras.width, cameras.height) / side))
     drawn = photo_errors(gaussians, blank, lambda _, image, left: (image, 1 - left))
     images, opacities = map(np.stack, zip(*drawn, strict=True))
     pictures = np.divide(images, opacities[..., None], out=np.zeros_like(images), where=opacities[..., None] > LEAST)
-    return Shown(pictures.clip(0, 1), opacities, drawn=True)
+    return ViewPictures(pictures.clip(0, 1), opacities, drawn=True)

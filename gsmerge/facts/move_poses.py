@@ -71,7 +71,7 @@ class _Evidence:
     flows: np.ndarray  # [p] median distance from where the given poses show them, pixels of the views
 
 
-def align_views(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
+def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     ``views`` are the views whose photos show the scene; other views stay. With ``always`` even small errors are
