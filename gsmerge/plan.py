@@ -20,7 +20,7 @@ from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
-from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions, changed_settings, decided_settings
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
@@ -316,7 +316,7 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     """
     budget = options.budget
     # networks and other methods alone seldom come so near
-    asked = budget.quality is not None or options.decided(lambda one: one.counts or one.replaces)
+    asked = budget.quality is not None or decided_settings(options, lambda one: one.counts or one.replaces)
     return not (asked or scene.aligned or (budget.auto and not scene.rendered))
 
 
@@ -336,14 +336,14 @@ def _can_merge_pairs(scene: SceneSize, options: CompactOptions, networks: str) -
 
     Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
     """
-    usual = not options.changed(lambda one: one.acts_on == "superpixels" and not one.counts)
+    usual = not changed_settings(options, lambda one: one.acts_on == "superpixels" and not one.counts)
     ours = options.method == OURS and networks == "none"
     return ours and (scene.num_views == 0 or (usual and scene.rendered))
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     """Return whether a scene is merged by positions and colours only: it has no views, and no option needs one."""
-    return len(scene) == 0 and not options.decided(lambda one: one.replaces)
+    return len(scene) == 0 and not decided_settings(options, lambda one: one.replaces)
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
@@ -477,8 +477,8 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     decode = options.decode
     if decode.k != AUTO:
         return decode
-    asked = options.budget.quality is not None or options.changed(lambda one: one.counts)
-    other = options.decided(lambda one: one.replaces)
+    asked = options.budget.quality is not None or changed_settings(options, lambda one: one.counts)
+    other = decided_settings(options, lambda one: one.replaces)
     fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
     return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)

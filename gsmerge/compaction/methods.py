@@ -16,7 +16,7 @@ from gsmerge.pipeline import build
 from gsmerge.plan import Plan, stands_alone
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
-from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions, changed_settings, decided_settings
 from gsmerge.settings.setting import names_of
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Gaussians, Scene
@@ -88,13 +88,13 @@ def check_method(options: CompactOptions, scene: Scene) -> tuple[Method, list[st
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")
     if "pixels" in method.needs and not scene.aligned:
         raise UsageError(f"{place}: expected one Gaussian per pixel, found an unaligned scene; give another method")
-    unused = [name for name in options.changed(lambda one: not one.common) if name not in method.uses]
+    unused = [name for name in changed_settings(options, lambda one: not one.common) if name not in method.uses]
     return method, [f"{place} does not use {', '.join(unused)}"] if unused else []
 
 
 def _unused_alone(options: CompactOptions) -> list[str]:
     """Note changed settings that have no effect on a scene without views."""
-    unused = options.decided(lambda one: one.acts_on and not one.counts)
+    unused = decided_settings(options, lambda one: one.acts_on and not one.counts)
     return [f"without cameras these are not used: {', '.join(unused)}"] if unused else []
 
 

@@ -104,21 +104,11 @@ class CompactOptions(Settings):
         for name in self.budget.searching if self.method != OURS else ():
             raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
 
-    def changed(self, is_one: Callable[[Setting], Any]) -> list[str]:
-        """Return the flat names of settings with a declaration as asked for whose values are not the defaults."""
-        values, declared = self.to_dict(), flat_settings(CompactOptions)
-        return [name for name, one in declared.items() if is_one(one) and values[name] != one.default]
-
-    def decided(self, is_one: Callable[[Setting], Any]) -> list[str]:
-        """Return those of the changed settings whose values are not neutral: they leave less to the scene."""
-        values, declared = self.to_dict(), flat_settings(CompactOptions)
-        return [name for name in self.changed(is_one) if values[name] not in declared[name].neutral]
-
     @property
     def whole_only(self) -> list[str]:
         """Names of the settings in use that require the scene in one piece."""
-        values, names = self.to_dict(), self.changed(lambda one: one.whole == "name")
-        for name in self.changed(lambda one: one.whole == "value"):
+        values, names = self.to_dict(), changed_settings(self, lambda one: one.whole == "name")
+        for name in changed_settings(self, lambda one: one.whole == "value"):
             names += [f"{name} {part.strip()}" for part in str(values[name]).split(",")]
         return names
 
@@ -149,3 +139,15 @@ class CompactOptions(Settings):
         if unknown:
             raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(all_settings))}")
         return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})
+
+
+def changed_settings(options: CompactOptions, is_one: Callable[[Setting], Any]) -> list[str]:
+    """Return the flat names of settings with a declaration as asked for whose values are not the defaults."""
+    values, declared = options.to_dict(), flat_settings(CompactOptions)
+    return [name for name, one in declared.items() if is_one(one) and values[name] != one.default]
+
+
+def decided_settings(options: CompactOptions, is_one: Callable[[Setting], Any]) -> list[str]:
+    """Return those of the changed settings whose values are not neutral: they leave less to the scene."""
+    values, declared = options.to_dict(), flat_settings(CompactOptions)
+    return [name for name in changed_settings(options, is_one) if values[name] not in declared[name].neutral]

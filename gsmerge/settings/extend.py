@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import CompactOptions, changed_settings
 from gsmerge.settings.setting import Settings, setting
 
 SUFFIX = ".gsm"  # of the file of a state
@@ -27,6 +27,6 @@ def batch_settings(settings: Mapping[str, Any]) -> tuple[CompactOptions, ExtendO
     given = {"effort": "draft"} | dict(settings)
     extend_options = ExtendOptions(**{name: given.pop(name) for name in names if name in given})
     options = CompactOptions().with_settings(given)
-    for name in options.changed(lambda one: not one.in_batches):
+    for name in changed_settings(options, lambda one: not one.in_batches):
         raise ValueError(f"{name}: go with a whole scene, not with views that come one after the other; use compact")
     return options, extend_options
