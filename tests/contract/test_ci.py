@@ -172,12 +172,6 @@ def test_templates_ask_for_calls_that_are_there(form: Path) -> None:
             COMMANDS[name].make_context(name, arguments)  # raises where an argument is wrong
 
 
-def test_the_changelog_has_the_version() -> None:
-    sections = re.findall(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
-    assert re.fullmatch(rf"{re.escape(__version__)} \(\d{{4}}-\d\d-\d\d\)", sections[1])
-    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-
-
 def test_wheels_are_built_for_the_platforms_that_the_guide_names_and_tried_there() -> None:
     text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
     platforms = re.findall(r"for platform in (.+); do", text)[0].split()

@@ -38,4 +38,4 @@ def test_a_file_holds_what_python_returns(
     written = gsmerge.read_ply(tmp_path / "a.ply").gaussians
     assert np.array_equal(written.means, result.gaussians.means.astype(np.float32))
     if scene == "one_photo":  # a draft of one photo has four for each superpixel, unless their number is asked for
-        assert result.report.settings["k"] == settings.get("k", 4 if "budget" not in settings else 1)
+        assert result.report.options["k"] == settings.get("k", 4 if "budget" not in settings else 1)
