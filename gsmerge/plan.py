@@ -20,7 +20,7 @@ from gsmerge.facts.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
-from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions, changed_settings, decided_settings
+from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import (
     AUTO_SHARE,
@@ -315,8 +315,7 @@ def keeps_input(scene: SceneSize, options: CompactOptions) -> bool:
     Gaussians, one of many small ones a few. Measurements are in docs/internals/notebook.md.
     """
     budget = options.budget
-    # networks and other methods alone seldom come so near
-    asked = budget.quality is not None or decided_settings(options, lambda one: one.counts or one.replaces)
+    asked = options.decides_count or options.replaces_stages  # which seldom come so near
     return not (asked or scene.aligned or (budget.auto and not scene.rendered))
 
 
@@ -336,14 +335,13 @@ def _can_merge_pairs(scene: SceneSize, options: CompactOptions, networks: str) -
 
     Settings of superpixels other than their numbers, which say how many Gaussians there will be, ask for superpixels.
     """
-    usual = not changed_settings(options, lambda one: one.acts_on == "superpixels" and not one.counts)
     ours = options.method == OURS and networks == "none"
-    return ours and (scene.num_views == 0 or (usual and scene.rendered))
+    return ours and (scene.num_views == 0 or (scene.rendered and not options.changes_superpixels))
 
 
 def stands_alone(scene: Scene, options: CompactOptions) -> bool:
     """Return whether a scene is merged by positions and colours only: it has no views, and no option needs one."""
-    return len(scene) == 0 and not decided_settings(options, lambda one: one.replaces)
+    return len(scene) == 0 and not options.replaces_stages
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
@@ -412,7 +410,7 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         taken = f"at most {most:,} Gaussians are taken, {text} of the input"
         more = f"more would not show new views better, as {why}; --set fill=true takes all"
         note(f"budget {budget.budget}: {taken}: {more}")
-        usual = options.segment.superpixels == SHARE and options.decode.k == AUTO
+        usual = options.changed_counts == ["budget"]
         if usual and agreement.share <= FEWEST:  # as without a budget
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
@@ -477,11 +475,10 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     decode = options.decode
     if decode.k != AUTO:
         return decode
-    asked = options.budget.quality is not None or changed_settings(options, lambda one: one.counts)
-    other = decided_settings(options, lambda one: one.replaces)
+    asked = options.budget.quality is not None or options.changed_counts
     fits = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
     lone = scene.aligned and scene.num_cameras == 1
-    return replace(decode, k=LONE_K if lone and not (asked or other or fits) else USUAL_K)
+    return replace(decode, k=LONE_K if lone and not (asked or options.replaces_stages or fits) else USUAL_K)
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:

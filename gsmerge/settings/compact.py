@@ -105,6 +105,26 @@ class CompactOptions(Settings):
             raise ValueError(f"method {self.method}: expected a budget or superpixels, got {name}")
 
     @property
+    def changed_counts(self) -> list[str]:
+        """Names of the settings in use that say how many Gaussians there may be."""
+        return changed_settings(self, lambda one: one.counts)
+
+    @property
+    def decides_count(self) -> bool:
+        """Whether settings decide how many Gaussians there are, and not the scene."""
+        return self.budget.quality is not None or bool(decided_settings(self, lambda one: one.counts))
+
+    @property
+    def replaces_stages(self) -> bool:
+        """Whether a method, networks or a recipe take the place of the stages' own formulas."""
+        return bool(decided_settings(self, lambda one: one.replaces))
+
+    @property
+    def changes_superpixels(self) -> bool:
+        """Whether settings say how superpixels are cut, merged and decoded, other than how many there are."""
+        return bool(changed_settings(self, lambda one: one.acts_on == "superpixels" and not one.counts))
+
+    @property
     def whole_only(self) -> list[str]:
         """Names of the settings in use that require the scene in one piece."""
         values, names = self.to_dict(), changed_settings(self, lambda one: one.whole == "name")
