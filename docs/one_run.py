@@ -39,7 +39,7 @@ LINE = 120  # characters of a line of the page
 WATCHED = {
     "gsmerge.scene.read": ("align",),
     "gsmerge.compaction.compact": ("make_plan", "make_result"),
-    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
+    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "fill"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # of the picture: its pixels for each of a photo, for a title, between panels
 DARK, BORDER = 0.45, (255, 255, 255)  # how much of the photo is left under ellipses; colours are RGB
@@ -208,7 +208,7 @@ def head(run: Run) -> str:
             "[conventions](../reference/conventions.md) explain names and words.",
         ),
         text(
-            "Every list gives arrays with shape and type, and the values of one row. The row is that of",
+            "Lists give arrays with shape and type, and the values of one row. The row is that of",
             f"pixel ({X}, {Y}) of view {VIEW}, or of what this pixel has become.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
@@ -297,7 +297,8 @@ def plan_section(run: Run) -> str:
     return "\n\n".join([
         "## 3. make_plan: every decision",
         text(
-            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`. No later step reads an option.",
+            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`. Later steps never see",
+            "`CompactOptions`.",
         ),
         "\n".join([
             entry("limits.per_view", limits.per_view),
@@ -336,22 +337,26 @@ def build_section(run: Run) -> str:
     size = int(np.diff(features.starts)[at])
     own = np.flatnonzero(matches.clusters == matches.clusters[at])
     faint = int((features.gains < 1).sum())
-    report = fitted.report
+    report, filled = fitted.report, made["fill"]
+    before = {mean.tobytes() for mean in fitted.gaussians.means}
+    replaced = [row for row, mean in enumerate(filled.gaussians.means) if mean.tobytes() not in before]
     return "\n\n".join([
         "## 4. build: the arrows",
         text(
-            "[`pipeline.py`](../../gsmerge/pipeline.py) calls one file of `stages/` after another, and then `fit/`.",
-            "The names of functions begin the lines.",
+            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` before the",
+            "last. Functions begin the lines. Not shown are `assign` (a row belongs to the superpixel of its pixel)",
+            "and `refine` (networks stay out).",
         ),
         "\n".join([
             entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
             entry("encode, correct: features.means", features.means, at),
-            entry("features.covars", features.covars, (at, [0, 1, 2], [0, 1, 2]), 4) + " (the diagonal)",
-            entry("features.gains", features.gains, at),
+            entry("encode, correct: features.covars", features.covars, (at, [0, 1, 2], [0, 1, 2]), 4) + " (diagonal)",
+            entry("encode, correct: features.gains", features.gains, at),
             entry("match: clusters", matches.clusters, at),
             entry("merge: features.means", merged.means, run.merged),
             entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
             entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
+            entry("fill: gaussians.means", filled.gaussians.means, replaced[0]) + " (a new one)",
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
@@ -385,6 +390,9 @@ def build_section(run: Run) -> str:
                 report.accepted and report.method == "full",
             ),
         ),
+        text(
+            f"**`fill`** moves faint Gaussians, here {len(replaced)}, to where cameras between the photos see nothing.",
+        ),
     ])  # fmt: skip
 
 
@@ -408,7 +416,7 @@ def result_section(run: Run) -> str:
         text(
             f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",
             say(
-                "They show the photos better than the input does, whose depths are wrong here and there.",
+                "They show the photos better than the input, whose depths are wrong here and there.",
                 report.psnr_after > report.psnr_before,
             ),
             "The fit has seen these photos, so the report also says how much PSNR views gain that no photo shows. It",

@@ -28,8 +28,8 @@ from gsmerge.settings.stages import (
     USUAL_K,
     CleanOptions,
     DecodeOptions,
+    MatchMethod,
     MatchOptions,
-    Method,
     SegmentOptions,
 )
 from gsmerge.stages.assign import merge_unseen
@@ -102,6 +102,7 @@ class Plan:
     seed: int  # Everything random depends on it alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+    free_poses: bool = False  # Whether cameras are asked to move, and not only where that is needed
     new_views: bool = False  # Whether the quality of new views is estimated
     before: PhotoScore | None = None  # Of the input, where photos and not pixels decide the count
 
@@ -172,7 +173,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         unseen, num_input = _merge_unseen(prepared, options, segment, clean_options)
         counted = replace(options, segment=replace(options.segment, superpixels=segment.superpixels))
         choices = choose_for_scene(size, counted, num_input=num_input, num_reserved=len(unseen), keeps=keeps)
-        limits, pairs = choices.limits, checkpoint is None and choices.merges_pairs
+        limits, pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
         fit = _fit_photos(prepared, options, choices.fit)
         fit = _fit_renders(prepared, options, fit) if pairs else fit
     if keeps and has_few_rows(size):
@@ -202,6 +203,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
         seed=options.seed,
         checkpoint=checkpoint,
         settings=replace(options, budget=asked.budget).to_dict() | {"fit_steps": fit.steps},
+        free_poses=options.prepare.poses == "free",
         # without a fit no photo has been seen, and what own photos say is true of others
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
@@ -214,11 +216,11 @@ class SceneChoices:
     blocks: int  # Parts in which the scene is compacted; at most, where many views alone ask for them
     decode: DecodeOptions  # Gaussians per group
     limits: CountLimits  # Limits of the number of Gaussians
-    match: Method  # Of merging across views
+    match: MatchMethod  # Of merging across views
     checkpoint: str  # Name of the networks to load; "none"
     fit: FitOptions  # With the steps that are taken
     keeps_input: bool  # see :func:`keeps_input`
-    merges_pairs: bool  # see :func:`_can_merge_pairs`
+    may_merge_pairs: bool  # Whether neighbours are merged pair by pair unless networks are handed to the plan
 
     def settings(self, options: CompactOptions) -> dict[str, Any]:
         """Return all settings by flat name, with the values that the plan chose."""

@@ -408,7 +408,10 @@ def _smooth_columns(u: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> n
 
 
 def _find_mixed(points: np.ndarray) -> list[_View]:
-    """Find views whose rows lie side by side, pixel by pixel; none where rows have no such order."""
+    """Find views whose rows lie side by side, pixel by pixel; none where rows have no such order.
+
+    MVSplat's script with its far cut writes such rows, which nothing else aligns where its cameras are not named.
+    """
     lags = np.arange(1, _MAX_MIXED + 1)
     starts = np.linspace(0, len(points) - _MAX_MIXED - 1, _LOOKED_AT).astype(int)
     steps = [float(np.median(np.linalg.norm(points[starts + lag] - points[starts], axis=1))) for lag in lags]

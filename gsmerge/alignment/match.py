@@ -43,7 +43,7 @@ from gsmerge.types import Cameras
 _SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
 _SHOWN_GAUSSIANS = 200  # Gaussians of a view that it is judged by
 
-Place = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
+GridLayout = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class RowSource:
         return [first, *(first if skip else other for skip, other in zip(alike, others, strict=True))]
 
 
-def match_views(source: RowSource, places: Sequence[Place]) -> list[GridReading]:
+def match_views(source: RowSource, places: Sequence[GridLayout]) -> list[GridReading]:
     """Fit views to the file's cameras in the places in which rows show pixels; in other conventions if none fits."""
     errors = [_projective_error(source, *place) for place in places]
     far = _AS_SHOWN * max(min(errors, default=0.0), AS_NEAR_PX)

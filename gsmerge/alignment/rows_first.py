@@ -44,7 +44,7 @@ from gsmerge.alignment.layouts import (
     subsample,
     view_orders,
 )
-from gsmerge.alignment.match import Place, RowSource, match_views, refine
+from gsmerge.alignment.match import GridLayout, RowSource, match_views, refine
 from gsmerge.alignment.score import AS_NEAR_PX, SHUFFLED_MARGIN, score_layout
 from gsmerge.errors import SceneError
 from gsmerge.geometry import IDENTITY, Similarity
@@ -183,7 +183,7 @@ def _find_pixels(source: RowSource, named: Sequence[Grid]) -> Recovery | None:
     return found
 
 
-def _rounds(source: RowSource, named: Sequence[Grid]) -> Iterator[list[Place]]:
+def _rounds(source: RowSource, named: Sequence[Grid]) -> Iterator[list[GridLayout]]:
     """Yield places of the rows: by their number, where they follow the cameras, and where they show a grid."""
     from gsmerge.alignment.row_grid import find_layouts  # few files come here
 
@@ -203,7 +203,7 @@ def _rounds(source: RowSource, named: Sequence[Grid]) -> Iterator[list[Place]]:
     yield from _lacking_places(source, named)
 
 
-def _lacking_places(source: RowSource, named: Sequence[Grid]) -> Iterator[list[Place]]:
+def _lacking_places(source: RowSource, named: Sequence[Grid]) -> Iterator[list[GridLayout]]:
     """Yield the places of rows that lack pixels at random, in grids that files name or networks have."""
     from gsmerge.alignment.dropped_rows import find_dropped_grid  # few files come here
 
@@ -244,7 +244,7 @@ def _may_lack_pixels(source: RowSource, grids: Sequence[Grid]) -> bool:
     return enough and len(source.ply.gaussians) < most
 
 
-def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[Place]]:
+def _follow_cameras(source: RowSource, grids: Sequence[Grid]) -> Iterator[list[GridLayout]]:
     """Yield the place of rows that lack pixels and follow the cameras, as exporters move or misread them.
 
     Rows cannot always show them alone: where a border and each faint pixel are missing, no line is whole.

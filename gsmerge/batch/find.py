@@ -18,7 +18,7 @@ from gsmerge.scene.files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_p
 from gsmerge.scene.no_gaussians import find_remedy
 from gsmerge.settings.extend import SUFFIX
 
-Place = tuple[Path, Path | None]  # a scene, and the folder that was named; None where it was the scene itself
+NamedScene = tuple[Path, Path | None]  # a scene, and the folder that was named; None where it was the scene itself
 MAX_FOLDERS = 100_000  # without a scene, after the last one; a link to a system's folders leads to more
 _JOB_BYTES = 700  # of memory for each scene of a list
 DEPTH_NAMES = {Path(place).parts[0] for place in (*depth_maps.PLACES, depth_maps.FRAMES)}
@@ -42,11 +42,11 @@ def main_file(scene: Path) -> Path:
 
 
 def find_scenes(arguments: Sequence[str], out: Path) -> Iterator[Path]:
-    """Yield the scenes of :func:`find_places`."""
-    return (scene for scene, _ in find_places(arguments, out))
+    """Yield the scenes of :func:`find_named_scenes`."""
+    return (scene for scene, _ in find_named_scenes(arguments, out))
 
 
-def find_places(arguments: Sequence[str], out: Path) -> Iterator[Place]:
+def find_named_scenes(arguments: Sequence[str], out: Path) -> Iterator[NamedScene]:
     """Yield the scenes among the arguments, in order, sorted within each; a scene may come twice.
 
     A folder that cannot be read counts as a scene: reading it says why. SceneError if an argument does not exist, has
@@ -69,7 +69,7 @@ def find_places(arguments: Sequence[str], out: Path) -> Iterator[Place]:
             raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
 
 
-def _require_some(scenes: Iterator[Place], argument: str, where: str) -> Iterator[Place]:
+def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:
     """Yield the scenes; SceneError if there are none."""
     first = next(scenes, None)
     if first is None:
@@ -94,7 +94,7 @@ class _Search:
     seen: set[str] = field(default_factory=set)  # real paths
     num_empty: int = 0  # folders since the last scene
 
-    def walk(self, folder: Path) -> Iterator[Place]:
+    def walk(self, folder: Path) -> Iterator[NamedScene]:
         """Yield the scenes in a folder, or the folder itself if it has a scene file of a usual name."""
         for inside, names, folders in self.folders(folder):
             if names is None:
@@ -156,7 +156,7 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
         return True
 
 
-def _matches(pattern: str, search: _Search) -> Iterator[Place]:
+def _matches(pattern: str, search: _Search) -> Iterator[NamedScene]:
     for name in dict.fromkeys(sorted(_expand(pattern, search))):
         path = Path(name)
         if os.path.isdir(path):
@@ -182,7 +182,7 @@ def _expand(pattern: str, search: _Search) -> Iterator[str]:
             yield from names
 
 
-def _listed(file: Path, search: _Search) -> Iterator[Place]:
+def _listed(file: Path, search: _Search) -> Iterator[NamedScene]:
     """Yield the scenes of a list, with paths relative to its folder; a missing scene fails when it is read."""
     budget, lines = read_budget(file), dict[str, None]()
     for line in read_lines(file):

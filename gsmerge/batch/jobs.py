@@ -11,7 +11,7 @@ from string import Formatter
 from typing import Any, Protocol
 
 from gsmerge import __version__
-from gsmerge.batch.find import find_places, main_file, scene_plys
+from gsmerge.batch.find import find_named_scenes, main_file, scene_plys
 from gsmerge.compaction.files import Outputs, compact_files
 from gsmerge.errors import UsageError
 from gsmerge.io import OUTPUT_FORMATS
@@ -157,7 +157,7 @@ def find_jobs(arguments: Sequence[str], out: Path, options: BatchOptions, result
     jobs: list[Job] = []
     owners: dict[str, str] = {}
     inputs: set[str] = set()
-    for scene, within in find_places(arguments, out):
+    for scene, within in find_named_scenes(arguments, out):
         real = os.path.realpath(main_file(scene))
         if real in inputs or real in results:
             continue

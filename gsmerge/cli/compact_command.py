@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from gsmerge.scene.files import SceneFiles
     from gsmerge.scene.read import Loaded
 
-VIEWED = (".ply", ".spz", ".sog", ".splat", ".glb")  # endings that a page shows
 STREAMED_LEVELS = 3  # of a lod-meta.json: the coarsest, a sixteenth, is there at once
 MORE = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that say something about Feature Gaussians, too
@@ -81,6 +80,8 @@ def look(args: opt.Args) -> None:
         raise UsageError(f"{args.output}: exists already; {words} shows it, --overwrite makes it anew")
     loads = list["Loaded"]()
     _compact(args, loads.append)
+    from gsmerge.io.formats.table import VIEWED
+
     if args.dry_run or args.output.suffix.lower() not in VIEWED:
         return
     from gsmerge.cli.view_command import view
@@ -156,7 +157,7 @@ def _compact(args: opt.Args, on_read: Callable[[Loaded], None] | None = None) ->
 def _say_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, shown: bool) -> None:
     """Print the report of a run; TargetError if a target is missed. Unless a page is ``shown``, say how to look."""
     from gsmerge.compaction.report import curve_lines, level_lines, result_table, summary_line
-    from gsmerge.io.formats.table import find_format
+    from gsmerge.io.formats.table import VIEWED, find_format
 
     doubts = [document["worse"], document["input"]["left_out"] if args.strict else None]
     say_notes([note for note in document["notes"] if note not in doubts], quiet=args.silent)

@@ -81,8 +81,8 @@ def check_format(output: Path, options: FileOptions) -> None:
     """Raise UsageError if an output's ending is unknown, its package is missing, or it does not fit the options."""
     from gsmerge.io import output_format
 
-    ending = output_format(output, levels=True, cameras=True).ending
-    if options.columns == "full" and (ending != ".ply" or not options.normals):
+    columns = output_format(output, levels=True, cameras=True).columns
+    if options.columns == "full" and not (columns and options.normals):
         raise UsageError(f"columns full: expected an output as .ply, with normals, got {output.name}")
 
 

@@ -30,8 +30,7 @@ from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.frame import Frame, scene_frame
 from gsmerge.pipeline import start
 from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices, make_plan
-from gsmerge.raster import contributions, tile_view
-from gsmerge.raster import prepare as prepare_splats
+from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.metrics import describe_loss
 from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
 from gsmerge.raster.tiled_view import Splats
@@ -42,7 +41,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import parse_share, share_text
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import part_settings
+from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import AUTO_SHARE
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
@@ -136,7 +135,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class BlockStart:
     """A block whose views are merged but whose Gaussians are not fitted yet."""
 
     block: Block
@@ -148,7 +147,9 @@ class Part:
     on_files: float | None  # the same on the files of photos that were changed, dB
 
 
-def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame) -> Part:
+def start_part(
+    piece: Scene, block: Block, covisibility: Covisibility, options: CompactOptions, frame: Frame
+) -> BlockStart:
     """Merge the views of a block, and keep the start Gaussians that belong to the block."""
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
@@ -156,7 +157,7 @@ def start_part(piece: Scene, block: Block, covisibility: Covisibility, options: 
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
     scores = measure_input(prepared, plan), measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
     count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
-    return Part(block, decoded.gaussians[keep], count, prepared, plan, *scores)
+    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, *scores)
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
@@ -181,7 +182,7 @@ def without_gaussians(prepared: Prepared) -> Prepared:
     return replace(prepared, reference=reference, scene=scene, input_scene=input_scene)
 
 
-def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
+def each_part(parts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
     """Yield arguments for one call per part: the part and its ``values``; then release its files."""
     for number, part in enumerate(parts):
         yield part, *values, number
@@ -189,7 +190,7 @@ def each_part(parts: Sequence[Part], *values: Any) -> Iterator[tuple[Any, ...]]:
             free_scene(scene)
 
 
-def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
+def fit_part(part: BlockStart, everything: tuple[Gaussians, np.ndarray], growth: float, number: int) -> Gaussians:
     """Fit all Gaussians that the views of a block may see; return the fitted Gaussians of block ``number``.
 
     ``everything``: canonical Gaussians of all blocks, and the block of each. ``growth``: final number of Gaussians
@@ -208,7 +209,7 @@ def fit_part(part: Part, everything: tuple[Gaussians, np.ndarray], growth: float
     return fitted.gaussians[owners[rows[fitted.report.origins]] == number]
 
 
-def score_part(part: Part, gaussians: Gaussians, _: int) -> Scores:
+def score_part(part: BlockStart, gaussians: Gaussians, _: int) -> Scores:
     """Measure the PSNR (dB) of the whole result on a block's scored photos.
 
     Also on the pixels that the input covers, and on photos as their files have them.
@@ -218,7 +219,7 @@ def score_part(part: Part, gaussians: Gaussians, _: int) -> Scores:
     return psnr, *measure_besides(part.before, part.on_files, gaussians, part.prepared, part.plan)
 
 
-def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed: int) -> Gaussians:
+def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart], seed: int) -> Gaussians:
     """Fit the Gaussians at seams, which views of several blocks show, again to the photos that show them.
 
     All other Gaussians stay unchanged. Before this step a Gaussian was fitted beside its own block's version of the
@@ -251,9 +252,11 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part], seed
     return Gaussians(**columns)
 
 
-def find_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[Part]) -> tuple[np.ndarray, list[list[int]]]:
+def find_seams(
+    joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart]
+) -> tuple[np.ndarray, list[list[int]]]:
     """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of them."""
-    total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), prepare_splats(joined)
+    total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), make_splats(joined)
     views: list[list[int]] = [[] for _ in parts]
     for number, _, weights in _view_weights(splats, parts):
         total += weights
@@ -279,7 +282,7 @@ def join_views(chosen: Sequence[tuple[PicturedScene, list[int]]]) -> PicturedSce
     return PicturedScene.of(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
 
 
-def _view_weights(splats: Splats, parts: Sequence[Part]) -> Iterator[tuple[int, int, np.ndarray]]:
+def _view_weights(splats: Splats, parts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray]]:
     """Yield block, view, and the blending weights ``[n]`` of all Gaussians in it, for each block's own views."""
     for number, part in enumerate(parts):
         own_views, repeated = set(part.block.own), part.prepared.repeated
@@ -314,7 +317,7 @@ def block_options(
     so each view is fitted as often as in one piece. ``most``: Gaussians of all blocks together; None: as many as
     ``superpixels`` and K give.
     """
-    settings: dict[str, Any] = {**part_settings(CompactOptions), "budget": None}
+    settings: dict[str, Any] = {**piece_settings(CompactOptions), "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
@@ -341,7 +344,7 @@ def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility
 
 
 def join_reports(
-    scene: Scene, gaussians: Gaussians, parts: Sequence[Part], scores: Sequence[Scores], options: CompactOptions
+    scene: Scene, gaussians: Gaussians, parts: Sequence[BlockStart], scores: Sequence[Scores], options: CompactOptions
 ) -> CompactReport:
     """Report the whole scene: mean PSNR of the blocks weighted by views, sums of seconds, all notes."""
     run, sizes = current_record(), [len(part.block.own) for part in parts]
@@ -371,7 +374,7 @@ def join_reports(
 
 
 def _join_besides(
-    parts: Sequence[Part], scores: Sequence[Scores], sizes: Sequence[int]
+    parts: Sequence[BlockStart], scores: Sequence[Scores], sizes: Sequence[int]
 ) -> tuple[Covered | None, PhotoFiles | None]:
     """Average over blocks the scores of covered pixels, and on files of photos; a block without has its others.
 

@@ -96,7 +96,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": choices.blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if choices.merges_pairs else None if distributed else limits.per_view,
+        "superpixels_per_view": 0 if choices.may_merge_pairs else None if distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit_of(settings | {"fit": choices.fit.fit}),
         "fit_steps": choices.fit.steps,

@@ -15,7 +15,7 @@ from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan, make_plan
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.settings.setting import part_settings
+from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Gaussians, PicturedScene
 
 LEAST_VIEWS = 4  # with photos: fewer are alone when one is left out
@@ -53,7 +53,7 @@ class LeftOut:
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
         """Plan a run on the rest: as ``plan``, but for what is decided by the whole scene, and for ``settings``."""
-        settings = plan.settings | part_settings(CompactOptions, trial=True) | settings
+        settings = plan.settings | piece_settings(CompactOptions, trial=True) | settings
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
         return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
 

@@ -174,9 +174,8 @@ def _move_views(prepared: Prepared, cameras: Cameras) -> Prepared:
 
 def _note_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
     """Add a note on how far each camera was moved."""
-    input_scene, cause = prepared.input_scene, "poses are free"
-    if plan.settings["poses"] == "auto":
-        cause = "the photos of some views agree only under other poses"
+    input_scene = prepared.input_scene
+    cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
     depth = scene_depth(prepared.scene) * prepared.frame.unit
     moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
     choose(poses=moves)

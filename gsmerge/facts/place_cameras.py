@@ -12,7 +12,7 @@ from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.raster import contributions, prepare, render, tile_view
+from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
@@ -247,7 +247,7 @@ def _look(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 def _shares_seen(sample: Gaussians, viewmats: np.ndarray, near: float) -> np.ndarray:
     """Measure how much of each Gaussian's opacity each candidate shows, ``[c,n]`` float32."""
-    splats, K = prepare(sample), _lens(PROBE)
+    splats, K = make_splats(sample), _lens(PROBE)
 
     def one_view(viewmat: np.ndarray) -> np.ndarray:
         sums, _ = contributions(tile_view(splats, viewmat, K, PROBE, PROBE, near=near))

@@ -17,7 +17,7 @@ import numpy as np
 from gsmerge.facts.views import camera_kinds, subset
 from gsmerge.geometry import camera_depths, sh0_to_rgb
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.photos import COVERED, WHOLE, blank_photos
 from gsmerge.runtime.record import note
@@ -77,7 +77,7 @@ def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], wante
 def _picture(scene: Scene, views: np.ndarray) -> RowPicture:
     """Draw the Gaussians of all ``views`` of one camera, and choose between the drawing and their colours."""
     part = subset(scene, views.tolist())
-    tiled = tile_view(prepare(part.gaussians), **blank_photos(part.cameras).camera(0))
+    tiled = tile_view(make_splats(part.gaussians), **blank_photos(part.cameras).camera(0))
     seen = view_colors(tiled)
     drawing, transmittance = blend(tiled, seen, np.zeros(3, np.float32))
     colors = sh0_to_rgb(part.gaussians.sh0[:, 0])

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.frame import scene_frame
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.raster import contributions, prepare, tile_view
+from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
@@ -30,7 +30,7 @@ def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
 
     A view shows a Gaussian that has a blending weight of at least 1/255 in some pixel, the least that a fit keeps.
     """
-    splats = prepare(gaussians)
+    splats = make_splats(gaussians)
     pictures = blank_photos(cameras, max(LEVEL, max(cameras.width, cameras.height) / SIDE))
 
     def is_shown(view: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.fit.photo_sizes import exposure_gains, holdout_psnr, training_weights
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.geometry import rgb_to_sh0, sh0_to_rgb
-from gsmerge.raster import composite, prepare, tile_view
+from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.runtime.threads import in_turn, parallel_map
@@ -35,7 +35,7 @@ class Drawn:
 
 def draw(gaussians: Gaussians, photos: Photos) -> Drawn:
     """Render the Gaussians into every photo and keep the blending weights."""
-    splats = prepare(gaussians)
+    splats = make_splats(gaussians)
 
     def one_view(view: int) -> tuple[ViewWeights, np.ndarray]:
         tiled = tile_view(splats, **photos.camera(view))

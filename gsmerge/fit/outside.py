@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.geometry import depths_inside, middle_depth, project, step_outside
 from gsmerge.kernels.raster.project import TILE
-from gsmerge.raster import Splats, prepare, tile_view
+from gsmerge.raster import Splats, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, depth_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
 from gsmerge.raster.photos import Photos, blank_photos
@@ -90,7 +90,7 @@ def look_outside(scene: Scene, start: Gaussians, photos: Photos, options: FitOpt
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
     near, far = np.resize([np.quantile(some, (0.5, LAST)) for some in depths], (len(placed), 2)).T
     near, far = NEAREST * near, FARTHEST * far
-    views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), prepare(rows)
+    views, drawn = blank_photos(placed, min(2, photos.width / LEAST_WIDTH)), make_splats(rows)
 
     def look(view: int) -> np.ndarray:
         depths, left = blend_depths(_tile(drawn, views, view, near[view]), far[view])

@@ -15,7 +15,7 @@ from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.survey import photo_error, survey_photos, visible_mask
-from gsmerge.raster import prepare
+from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.record import choose, stage
 from gsmerge.settings.fit import FitOptions
@@ -70,7 +70,7 @@ def fit(gaussians: Gaussians, job: FitJob) -> tuple[Gaussians, FitReport | None]
         return gaussians, None
     fitted, report = _choose_fit(gaussians, job)
     if report is not None and job.outside is not None:
-        report = replace(report, fog=score_fog(prepare(fitted), job.outside))
+        report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
     return fitted, report
 
 

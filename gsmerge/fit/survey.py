@@ -11,7 +11,7 @@ from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
 from gsmerge.geometry import project
-from gsmerge.raster import contributions, prepare, tile_view
+from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.composite import survey
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photo_errors, render_photos
 from gsmerge.runtime.threads import in_turn
@@ -102,7 +102,7 @@ def visible_mask(gaussians: Gaussians, photos: Photos, min_weight: float) -> np.
 
 def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
     """Return each Gaussian's largest blending weight ``[n]`` over photos, and whether it is in some frustum ``[n]``."""
-    splats = prepare(gaussians)
+    splats = make_splats(gaussians)
 
     def one_view(view: int) -> tuple[np.ndarray, np.ndarray]:
         tiled = tile_view(splats, **photos.camera(view))

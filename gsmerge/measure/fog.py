@@ -18,7 +18,7 @@ from gsmerge.facts.views import pick_views
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_depths, middle_depth, step_outside
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.raster import Splats, prepare, render, tile_view
+from gsmerge.raster import Splats, make_splats, render, tile_view
 from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
@@ -85,7 +85,7 @@ def measure_fog(
     Returns one :class:`Fog` by name of the result and kind of camera, of :data:`CAMERAS` and "all"; its figures are
     means over the pixels of all pictures of the kind. ``near`` is the near plane of the pictures, world units.
     """
-    first, splats = prepare(reference), {name: prepare(result) for name, result in results.items()}
+    first, splats = make_splats(reference), {name: make_splats(result) for name, result in results.items()}
     pictures: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}
     outside = list(outside_cameras(reference, cameras))
     for number, (kind, camera, depth) in enumerate(outside):

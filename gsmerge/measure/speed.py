@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.facts.views import pick_views
 from gsmerge.measure.sizes import zoom_cameras
-from gsmerge.raster import prepare, render, tile_view
+from gsmerge.raster import make_splats, render, tile_view
 from gsmerge.raster.weights import view_weights
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Cameras, Gaussians
@@ -84,7 +84,7 @@ def time_render(gaussians: Gaussians, view: Cameras, near: float) -> float:
 
 def overdraw(gaussians: Gaussians, cameras: Cameras, near: float) -> float:
     """Measure the mean number of Gaussians blended into a pixel, which determines the render time."""
-    splats, entries = prepare(gaussians), 0
+    splats, entries = make_splats(gaussians), 0
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
     for view in range(len(cameras)):
         tiled = tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=near)

@@ -10,13 +10,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge import __version__
 from gsmerge.facts.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.io.formats.table import VIEWER
 from gsmerge.pages.data import PageView, ViewData
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.types import Cameras
@@ -29,6 +29,7 @@ PICTURES = "default-src 'none'; img-src data:; style-src {style}; script-src {sc
 # Spark decodes in WebAssembly, sorts in a worker, and has both as data: addresses in its own text
 SOLID = f"{PICTURES} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY = "{policy}"  # stands for it in the templates until the hashes are known
+VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
 NONE = "-"  # in place of a figure
 FASTER = 1.2  # times, from which on the headline says it
 

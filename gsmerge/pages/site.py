@@ -15,12 +15,12 @@ from gsmerge.geometry import middle_depth
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.arrays import read_new_views
 from gsmerge.io.formats.sog import file_order, sog_bytes
-from gsmerge.io.formats.table import VIEWER, Contents
+from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
 from gsmerge.pages.marks import MORE
-from gsmerge.pages.page import base64_text, camera_numbers, data_uri, describe_gain, render_template
+from gsmerge.pages.page import VIEWER, base64_text, camera_numbers, data_uri, describe_gain, render_template
 from gsmerge.pages.splats import pack_support
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
@@ -32,6 +32,7 @@ POLICY = (
 )
 NAMES = {"scene": "scene.sog", "engine": "spark-three.bin", "poster": "poster.webp", "licences": "LICENSES.txt"}
 MAX_VIEWS = 64  # of which the page knows where they stood
+REST = 43_000  # bytes of a page besides: its scripts, licences, and the picture and textures of one Gaussian
 LONGEST_TITLE = 255  # bytes of a title, which is a file's name, at most
 LICENSED = ("spark", "three", "fflate")
 
@@ -50,6 +51,11 @@ def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> 
     for file, content in files.items():
         file.write_bytes(content)
     return {path: list(files)}
+
+
+def least_bytes() -> int:
+    """Count the bytes of a page besides those of its Gaussians, at least: the viewer as text, and the rest."""
+    return int(4 / 3 * VIEWER.stat().st_size) + REST
 
 
 def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:

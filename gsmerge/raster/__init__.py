@@ -15,7 +15,7 @@ alone, and what is summed over tiles is summed in the order of the tiles.
 
 from gsmerge.raster.composite import Rendering, composite, contributions, splat_adjoint
 from gsmerge.raster.images import render, render_in_turn
-from gsmerge.raster.tiled_view import Splats, TiledView, prepare, tile_view
+from gsmerge.raster.tiled_view import Splats, TiledView, make_splats, tile_view
 
 __all__ = [
     "Rendering",
@@ -23,7 +23,7 @@ __all__ = [
     "TiledView",
     "composite",
     "contributions",
-    "prepare",
+    "make_splats",
     "render",
     "render_in_turn",
     "splat_adjoint",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
-from gsmerge.raster.tiled_view import Array, Splats, TiledView, pieces, prepare, tile_ranges
+from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Array as AnyArray
 from gsmerge.types import Cameras, Gaussians, as_array
@@ -155,7 +155,7 @@ def prepare_views(gaussians: Gaussians, cameras: Cameras) -> tuple[Splats, Array
     """
     cameras = cameras.numpy()
     origin = cameras.centres.astype(np.float64).mean(0) if len(cameras) else np.zeros(3)
-    return prepare(gaussians, origin), cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+    return make_splats(gaussians, origin), cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
 
 def draw_views(

@@ -20,7 +20,7 @@ from gsmerge.raster.composite import (
     view_colors,
 )
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, prepare, tile_view
+from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Array, Cameras, Gaussians, Scene, like
 
@@ -150,7 +150,7 @@ def seen_weights(scene: Scene) -> np.ndarray:
 
 def tile_views(scene: Scene, use: Callable[[int, TiledView], None]) -> None:
     """Call ``use(view, tiled)`` with every view, tiled, in parallel if memory allows."""
-    splats, cameras = prepare(scene.gaussians), scene.cameras
+    splats, cameras = make_splats(scene.gaussians), scene.cameras
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> None:

@@ -14,7 +14,7 @@ from gsmerge.geometry import sh0_to_rgb
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import psnr
-from gsmerge.raster.tiled_view import Splats, prepare, tile_view
+from gsmerge.raster.tiled_view import Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -176,7 +176,7 @@ def photo_errors(
     ``colors [n,3]`` replace the harmonics. ``keep`` returns for a view the mask ``[n]`` of the Gaussians to draw, and
     ``tiles`` the mask ``[tile_height,tile_width]`` of the tiles to complete; None: all.
     """
-    splats = gaussians if isinstance(gaussians, Splats) else prepare(gaussians)
+    splats = gaussians if isinstance(gaussians, Splats) else make_splats(gaussians)
 
     def one_view(view: int) -> Score:
         shown, complete = (None if choose is None else choose(view) for choose in (keep, tiles))

@@ -76,7 +76,7 @@ def _spread_origin(means: Array) -> Array:
     return centre if np.abs(centre).max() > 16 * spread else np.zeros(3)
 
 
-def prepare(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
+def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     """Convert Gaussians to float32 splats for the kernels, copying only what needs conversion.
 
     Means may be float64, for scenes in geographic coordinates: ``origin [3]`` is the world point

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.foreign import check_layout, find_unread
+from gsmerge.io.cameras.foreign import check_program, find_unread
 from gsmerge.io.cameras.read import (
     CHUNK,
     find_cameras,
@@ -238,7 +238,7 @@ def named_path(path: StrPath | None) -> Path | None:
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if not os.path.isdir(path):
-        check_layout(Path(path))
+        check_program(Path(path))
         check_file(Path(path))
     return Path(path)
 

@@ -28,7 +28,7 @@ from gsmerge.settings.stages import (
 )
 
 OURS = "gsmerge"  # the method that is no plugin
-EFFORTS = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
+EFFORT_NAMES = ("draft", "fast", "default", "best")  # what each means: gsmerge.plan
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # names that are no files
 # Settings under one name; what is set besides goes before. "paper": the superpixel merging paper's own chain: 12,000
 # superpixels of 476 x 476 pixels by BASS from saliency seeds, networks whose outputs are absolute, matching by latents
@@ -74,7 +74,7 @@ class CompactOptions(Settings):
         whole="value", replaces=True)  # fmt: skip
     effort: str = setting("default", "Quality for time: best is sharper and takes three times as "
         "long; fast and draft take less than half.",
-        "It decides what their own settings leave open.", choices=EFFORTS)  # fmt: skip
+        "It decides what their own settings leave open.", choices=EFFORT_NAMES)  # fmt: skip
     checkpoint: str = setting("auto", "Trained networks that correct the analytic stages: a file, shipped, paper, "
         "none, or auto: the shipped networks where they improve the result.",
         "They do if no fit follows; a draft or a fast run uses only their decoder heads.",
@@ -86,7 +86,7 @@ class CompactOptions(Settings):
         "analytic stages.")  # fmt: skip
     new_views: bool | None = setting(None, "Estimate what a new viewpoint gains, from photos that a short fit leaves "
         "out.", "By default where at least four views have photos, but not in a draft or without a fit.",
-        in_part=False)  # fmt: skip
+        in_piece=False)  # fmt: skip
     seed: int = setting(0, "Seed of all random numbers.",
         "Runs with one seed are bit-identical.", least=0, common=True)  # fmt: skip
     threads: int | None = setting(None, "Threads; the result does not depend on their number.", least=1,
@@ -134,7 +134,7 @@ class CompactOptions(Settings):
 
     @property
     def uncut(self) -> list[str]:
-        """Names of the settings in use with which a scene is not cut unless blocks are asked for."""
+        """Names of the settings in use that keep a scene in one piece, while views of it may still come in batches."""
         values, declared = self.to_dict(), flat_settings(CompactOptions)
         return [f"{name} {values[name]}" for name, one in declared.items() if values[name] in one.uncut]
 

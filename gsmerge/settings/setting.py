@@ -18,7 +18,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 T = TypeVar("T")
 MOST_THREADS = 1024  # each takes memory, even if it never has work
-KEPT = "as it is"  # of a value that a run of a part of a scene takes: the whole scene's
+KEPT = "as it is"  # of a value that a run of a piece of a scene takes: the whole scene's
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 
 
@@ -44,13 +44,13 @@ class Setting:
     # Of a group: whether its settings say how views become superpixels, or what views are used for besides
     acts_on: Literal["", "views", "superpixels"] = ""
     common: bool = False  # whether every method uses it, baselines too
-    # Whether a value other than the default needs the scene in one piece, and what messages call it: "name", or "value"
-    # for name and value; and values for which a scene is not cut unless blocks are asked for
+    # Whether a value other than the default needs the whole scene, and what messages call it: "name", or "value" for
+    # name and value; and values that keep a scene in one piece, while views of it may still come in batches
     whole: Literal["", "name", "value"] = ""
     uncut: tuple[Any, ...] = ()
-    # The value in a run of a part of a scene: a block, a batch of views; and in one that tries settings on some views,
+    # The value in a run of a piece of a scene: a block, a batch of views; and in one that tries settings on some views,
     # where that is another one
-    in_part: Any = KEPT
+    in_piece: Any = KEPT
     in_trial: Any = KEPT
     shown: str | None = None  # the default in words, where the program chooses it
     metavar: str | None = None  # form of the values on the command line
@@ -207,11 +207,11 @@ def names_of(options: type, is_one: Callable[[Setting], Any]) -> tuple[str, ...]
     return tuple(name for name, declared in flat_settings(options).items() if is_one(declared))
 
 
-def part_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
-    """Return by flat name what settings are in a run of a part of a scene, or in a ``trial`` on some of its views."""
+def piece_settings(options: type, *, trial: bool = False) -> dict[str, Any]:
+    """Return by flat name what settings are in a run of a piece of a scene, or in a ``trial`` on some of its views."""
     declared = flat_settings(options)
     values = {
-        name: one.in_trial if trial and one.in_trial is not KEPT else one.in_part for name, one in declared.items()
+        name: one.in_trial if trial and one.in_trial is not KEPT else one.in_piece for name, one in declared.items()
     }
     return {name: value for name, value in values.items() if value is not KEPT}
 

@@ -16,7 +16,7 @@ Exposure = Literal["auto", "fixed", "per-photo"]
 Unseen = Literal["drop", "keep"]
 Look = Literal["auto", "scene", "photos"]
 Extent = Literal["auto", "photos"]
-Method = Literal["overlap", "aabb", "none"]
+MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "bass-adaptive", "slic", "grid")
@@ -39,10 +39,10 @@ class PrepareOptions(Settings):
     poses: Poses = setting("auto", "Whether cameras may move: where they are off, never, or always.",
         "`free`: views are moved to where their photos agree, and the fit moves the cameras on; `auto`: where some "
         "view is more than 1.5 pixels off and agrees clearly better elsewhere.", uncut=("free",),
-        in_part="fixed")  # fmt: skip
+        in_piece="fixed")  # fmt: skip
     exposure: Exposure = setting("auto", "Bring photos that differ in exposure or white balance to their mean: where "
         "they differ at random, never, or always.",
-        "The Gaussians of their pixels change with them.", uncut=("per-photo",), in_part="fixed")  # fmt: skip
+        "The Gaussians of their pixels change with them.", uncut=("per-photo",), in_piece="fixed")  # fmt: skip
     unseen: Unseen = setting("drop", "What becomes of Gaussians without a pixel that no view sees.",
         "`drop`: they are left out. `keep`: they are merged among their neighbours, at the rate of the "
         "others.")  # fmt: skip
@@ -101,7 +101,7 @@ class SegmentOptions(Settings):
 class MatchOptions(Settings):
     """Conditions under which Feature Gaussians of different views are merged."""
 
-    match: Method | None = setting(None, "How Feature Gaussians of different views are merged.",
+    match: MatchMethod | None = setting(None, "How Feature Gaussians of different views are merged.",
         "`overlap`: Bhattacharyya coefficient, similar colours, star clusters that cannot chain. `aabb`, as in the "
         "paper (section 4.4): box IoU, similar latents, connected components. By default `overlap`, but `none` in a "
         "draft.", neutral=("none",))  # fmt: skip
@@ -242,7 +242,7 @@ class BlockOptions(Settings):
         "of hundreds of views; auto: beyond 20 million Gaussians, one for every 8 million, and for hundreds of views "
         "that see little of each other.",
         "Memory is that of one block. `auto` counts one Gaussian for each pixel; `none`: one piece.", least=1,
-        metavar="auto|none|NUMBER", in_part="none")  # fmt: skip
+        metavar="auto|none|NUMBER", in_piece="none")  # fmt: skip
     engine: Engine = setting(Engine(), "Where the blocks are compacted.", internal=True)
 
     @property

@@ -19,7 +19,7 @@ from gsmerge.fit.outside import Outside
 from gsmerge.geometry import project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.raster import Splats, TiledView, prepare, tile_view
+from gsmerge.raster import Splats, TiledView, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import stage
@@ -56,7 +56,7 @@ def fill_between(fitted: Gaussians, cameras: Cameras, outside: Outside | None) -
     between, order = _wider(between_cameras(cameras, BESIDE)), np.argsort(fitted.opacities, kind="stable")
     if len(between) == 0:  # all look elsewhere
         return fitted
-    splats = prepare(fitted)
+    splats = make_splats(fitted)
     most = min(int((fitted.opacities < FAINT).sum()), int(SHARE * len(fitted)))
     looks = parallel_map(lambda view: _look(splats, between, view), range(len(between)))
     depths = parallel_map(lambda view: blend_depths(_tile(splats, cameras, view)), range(len(cameras)))

@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.geometry import correlation, project
 from gsmerge.kernels.pictures import blur, sobel
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
@@ -61,7 +61,7 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
 
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return a mask ``[n]`` of Gaussians that have most of their blending weights inside the views' regions."""
-    splats = prepare(gaussians)
+    splats = make_splats(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
         viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)

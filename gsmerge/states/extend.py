@@ -22,7 +22,7 @@ from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.setting import part_settings
+from gsmerge.settings.setting import piece_settings
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # Earlier Gaussians that are looked up in new views; share that these see at the least; and of the foremost, the most
@@ -67,7 +67,7 @@ def extend(
     the size of the first batch's: each has its photo, mended, or what stands in for it. And the report. ValueError if a
     setting is impossible for the scene.
     """
-    options = options.with_settings(part_settings(CompactOptions))
+    options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress):
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)

@@ -28,7 +28,7 @@ from gsmerge.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import part_settings
+from gsmerge.settings.setting import piece_settings
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat
@@ -138,7 +138,7 @@ def extend_features(
         )
     if options.fit.fit != "none":
         raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
-    options = options.with_settings(part_settings(CompactOptions))
+    options = options.with_settings(piece_settings(CompactOptions))
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame)
         plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))

@@ -8,12 +8,14 @@ import numpy as np
 from slow_renderer import turned_cameras
 
 from gsmerge import Gaussians
-from gsmerge.raster import TiledView, prepare, tile_view
+from gsmerge.raster import TiledView, make_splats, tile_view
 
 
 def turned_view(gaussians: Gaussians, **options: Any) -> TiledView:
     cameras = turned_cameras(1).numpy()
-    return tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options)
+    return tile_view(
+        make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height, **options
+    )
 
 
 def normal(*shape: int, seed: int = 0) -> np.ndarray:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry import normalize
 from gsmerge.kernels import elementary
-from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
+from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 
@@ -38,7 +38,7 @@ def test_threads_change_no_bit() -> None:
     results = []
     for count in (1, 3):
         with use_threads(count):
-            tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+            tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
             rendering = render(gaussians, cameras, with_depths=True)
             results.append([
                 tiled.ids, tiled.flatten_ids, tiled.isect_offsets, tiled.conics, rendering.images,
@@ -54,7 +54,7 @@ def test_threads_change_no_bit() -> None:
 def test_order_of_gaussians_does_not_matter(seed: int) -> None:
     gaussians, cameras = scene(300, seed)
     view = cameras.viewmats[0].astype(np.float64), cameras.Ks[0].astype(np.float64)
-    depths = tile_view(prepare(gaussians), *view, WIDTH, HEIGHT).depths
+    depths = tile_view(make_splats(gaussians), *view, WIDTH, HEIGHT).depths
     assume(len(np.unique(depths)) == len(depths))  # of equal depths the first in order is in front
     shuffled = gaussians[np.random.default_rng(seed).permutation(300)]
     assert psnr(render(gaussians, cameras).images[0], render(shuffled, cameras).images[0]) > 90
@@ -66,7 +66,7 @@ def test_leaving_out_is_the_same_as_removing(seed: int) -> None:
     gaussians, cameras = scene(300, seed, degree=2)
     keep = np.random.default_rng(seed).random(300) < 0.5
     view = cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT
-    left, removed = tile_view(prepare(gaussians), *view, keep=keep), tile_view(prepare(gaussians[keep]), *view)
+    left, removed = tile_view(make_splats(gaussians), *view, keep=keep), tile_view(make_splats(gaussians[keep]), *view)
     np.testing.assert_array_equal(composite(left)[0], composite(removed)[0])
     np.testing.assert_array_equal(contributions(left)[0][keep], contributions(removed)[0])
     assert contributions(left)[0][~keep].max() == 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from messages import refuses
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
+from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.01, 0.0100001, 0.5, 1.0, 3.0, 1e3, 1e8, 1e20, 1e30]
 
@@ -33,7 +33,7 @@ def assert_sane(gaussians: Gaussians, cameras: Cameras) -> None:
             assert np.isfinite(drawn).all()
         assert rendering.alphas.min() >= 0
         assert rendering.alphas.max() <= 1
-    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height)
+    tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], cameras.width, cameras.height)
     image, transmittance = composite(tiled, -np.ones((len(gaussians), 3), np.float32))
     assert np.isfinite(image).all()
     assert np.isfinite(transmittance).all()
@@ -90,7 +90,7 @@ def test_many_on_one_spot_at_one_depth() -> None:
     gaussians = make([[0, 0, 1.0]] * n, [[1, 0, 0, 0]] * n, [[0.05] * 3] * n, [0.3] * n)
     assert_sane(gaussians, camera(20, 20))
     # of equal depth: in the order of the rows, until the pixel stops
-    peak = contributions(tile_view(prepare(gaussians), np.eye(4), camera(1, 1).Ks[0], 1, 1))[1]
+    peak = contributions(tile_view(make_splats(gaussians), np.eye(4), camera(1, 1).Ks[0], 1, 1))[1]
     np.testing.assert_allclose(peak[:20], 0.3 * 0.7 ** np.arange(20), rtol=1e-4)
     assert (peak[100:] == 0).all()
 
@@ -100,7 +100,7 @@ def test_more_tiles_than_sixteen_bits_count() -> None:
     K = np.array([[100.0, 0, 0], [0, 100.0, 0], [0, 0, 1]])
     last = (width - 8) / 100, (height - 8) / 100
     gaussians = make([[*last, 1.0], [0.08, 0.08, 1.0]], [[1, 0, 0, 0]] * 2, [[0.01] * 3] * 2, [0.5] * 2)
-    tiled = tile_view(prepare(gaussians), np.eye(4), K, width, height)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), K, width, height)
     assert len(tiled.isect_offsets) == 260 * 260 + 1
     assert tiled.flatten_ids[tiled.isect_offsets[-2] : tiled.isect_offsets[-1]].tolist() == [0]
     assert tiled.flatten_ids[: tiled.isect_offsets[1]].tolist() == [1]
@@ -110,7 +110,7 @@ def test_a_very_wide_image() -> None:
     width = 32767 * 16
     K = np.array([[100.0, 0, 0], [0, 100.0, 0.5], [0, 0, 1]])
     gaussians = make([[(width - 0.5) / 100, 0, 1.0]], [[1, 0, 0, 0]], [[0.01] * 3], [0.5])
-    tiled = tile_view(prepare(gaussians), np.eye(4), K, width, 1)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), K, width, 1)
     assert composite(tiled)[1][0, -1] == pytest.approx(0.5, abs=0.01)
     with refuses(ValueError, "", "524273 x 1"):
-        tile_view(prepare(gaussians), np.eye(4), K, width + 1, 1)
+        tile_view(make_splats(gaussians), np.eye(4), K, width + 1, 1)

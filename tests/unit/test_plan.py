@@ -37,7 +37,7 @@ from gsmerge.plan import (
     steps_for,
 )
 from gsmerge.runtime.record import record_run
-from gsmerge.settings.compact import EFFORTS as NAMES
+from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 
 
 @pytest.fixture(scope="module")

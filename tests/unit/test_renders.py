@@ -122,11 +122,11 @@ def test_counts_and_cameras_are_as_asked_for(scene: Scene) -> None:
 
 def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     size = measure_size(scene)
-    assert choose_for_scene(size, CompactOptions()).merges_pairs
+    assert choose_for_scene(size, CompactOptions()).may_merge_pairs
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
     for settings in ({"max_color": 0.11}, {"segmentation": "slic"}, {"checkpoint": "shipped"}, {"method": "voxel"}):
-        assert not choose_for_scene(size, CompactOptions().with_settings(settings)).merges_pairs
-    assert not choose_for_scene(replace(size, pictures="photos"), CompactOptions()).merges_pairs
+        assert not choose_for_scene(size, CompactOptions().with_settings(settings)).may_merge_pairs
+    assert not choose_for_scene(replace(size, pictures="photos"), CompactOptions()).may_merge_pairs
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:

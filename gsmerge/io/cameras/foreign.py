@@ -43,7 +43,7 @@ CAMERA_PLACES = (
 )  # fmt: skip
 # Of those that are read the first that exists wins; a COLMAP model directly in the folder comes last, because Depth
 # Anything 3 puts one there at the photos' own size. The others matter where none of them is there.
-LAYOUTS = (
+PROGRAMS = (
     *map(Foreign, CAMERA_PLACES),
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
@@ -101,11 +101,11 @@ def check_unknown(path: Path) -> None:
         raise SceneError(path, "expected cameras that are read, found those of a program that is not known", _OWN)
 
 
-def check_layout(place: Path) -> None:
+def check_program(place: Path) -> None:
     """Raise SceneError with the program and its export that is read, if a file, or one below a folder, is not read."""
     if (path := find_unread(place)) is not None:
-        layout = next(layout for layout in LAYOUTS if _is_of(path, layout))
-        raise SceneError(path, f"expected cameras that are read, found those of {layout.program}", layout.remedy)
+        foreign = next(foreign for foreign in PROGRAMS if _is_of(path, foreign))
+        raise SceneError(path, f"expected cameras that are read, found those of {foreign.program}", foreign.remedy)
 
 
 def find_unread(place: Path) -> Path | None:
@@ -114,9 +114,9 @@ def find_unread(place: Path) -> Path | None:
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}
     others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES and scenes.isdisjoint(path.parents)]
-    return next((path for layout in LAYOUTS for path in others if _is_of(path, layout)), None)
+    return next((path for foreign in PROGRAMS for path in others if _is_of(path, foreign)), None)
 
 
-def _is_of(path: Path, layout: Foreign) -> bool:
-    named = layout.remedy and any(map(path.match, layout.files.split())) and path.is_file()
-    return bool(named) and re.search(layout.start, read_start(path).decode("latin-1")) is not None
+def _is_of(path: Path, foreign: Foreign) -> bool:
+    named = foreign.remedy and any(map(path.match, foreign.files.split())) and path.is_file()
+    return bool(named) and re.search(foreign.start, read_start(path).decode("latin-1")) is not None

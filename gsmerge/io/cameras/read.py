@@ -12,7 +12,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile
 from gsmerge.io.cameras.camera_format import CameraFormat, CameraSource, StoredCameras
 from gsmerge.io.cameras.embedded import SHARP, read_sharp
-from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_layout, check_unknown, starts_like_poses
+from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program, check_unknown, starts_like_poses
 from gsmerge.io.cameras.json_files import (
     FFGS,
     is_ffgs,
@@ -126,7 +126,7 @@ def _resolve(path: Path) -> Path:
     if path.is_dir() and not _is_camera_folder(path):
         inside = find_cameras(path) or find_other_cameras(path)
         if inside is None:
-            check_layout(path)
+            check_program(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = inside
     return path if path.is_dir() else _folder_of(path) or path
@@ -134,7 +134,7 @@ def _resolve(path: Path) -> Path:
 
 def _folder_of(path: Path) -> Path | None:
     """Return the folder of the model or the keyframes that a file belongs to; None if it stands for itself."""
-    check_layout(path)
+    check_program(path)
     check_file(path)
     if path.suffix == ".json":
         one_of_many = is_keyframes(path.parent) and _KEYFRAME in CameraSource(path).object

@@ -72,6 +72,7 @@ class Format:
     cameras: Literal["", "inside", "needed"] = ""  # of the views: in a file beside it, inside, or it cannot do without
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # as it holds them
     kept_as: str = ""  # ending of the format as which its Gaussians are read back, if that is another one
+    columns: bool = False  # whether there is a choice which columns of INRIA's it has
     lost: str = "{ending} has no room for harmonics above degree {degree}: left out"
 
     # Its files besides the one that the path names
@@ -95,14 +96,12 @@ class Format:
 
 _page, _model = lazy_functions("gsmerge.pages"), lazy_functions("gsmerge.compaction")
 _SOG = 13.0, 22.0, 36.5, 56.5
-IN_TEXT = 4 / 3  # bytes of base64, as which a page has files in its text, for each of theirs
-VIEWER = Path(__file__).parents[2] / "pages/vendor/spark-three.js.gz"
-PAGE = 43_000  # bytes of a page besides: its scripts, licences, and the picture and textures of one Gaussian
+_IN_TEXT = 4 / 3  # bytes of base64, as which a page has its .sog in its text, for each of the file's
 _READ_BY_PROGRAM = _lazy("splat_transform.read_rows")
 _USD, _REQUIRE_USD = (56.0, 92.0, 152.0, 236.0), _lazy("usd.require_usd")
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
-    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes,
+    each=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True,
     lost="harmonics above degree {degree} are left out: few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
@@ -122,7 +121,7 @@ HTML = Format(
     ".html", "a page with a viewer and the .sog that it shows", None, None, 3,
     write=_page("site.write_output"), levels="", cameras="inside", round_means=_lazy("sog.round_means"),
     kept_as=".sog", site="index.html", beside=_page("site.files_beside"),
-    each=tuple(IN_TEXT * each for each in _SOG), rest=lambda: int(IN_TEXT * VIEWER.stat().st_size) + PAGE,
+    each=tuple(_IN_TEXT * each for each in _SOG), rest=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
 FILES = (  # of endings that end alike the longest first
@@ -172,6 +171,7 @@ BY_PROGRAM = (  # which splat-transform reads in our place
 SEVERAL_USES = (".npz", ".glb")  # endings of files that need not hold Gaussians
 FORMATS = (*FILES, HTML, LEVELS, COLMAP, DEPTHS, STATE, *BY_PROGRAM)
 OUTPUT_FORMATS = tuple(row.ending for row in FILES if row.max_degree >= 0)
+VIEWED = tuple(row.ending for row in FILES if row.max_degree >= 0 and row.read is not None)  # as results in a page
 FOLDERS = {row.folder: row for row in FORMATS if row.folder}  # by the name of an output folder
 SCENE_SUFFIXES = tuple(
     dict.fromkeys(
@@ -243,7 +243,8 @@ def output_format(path: StrPath, *, levels: bool = False, cameras: bool = False)
         raise UsageError(f"{path}: {problem}; write a .ply, and convert it with --cameras")
     if chosen is None or chosen.max_degree < 0:
         read_only = "" if chosen is None else f"{chosen.ending} is read, not written: "
-        endings = join_words((*OUTPUT_FORMATS, *([HTML.ending] if cameras else [])))
+        inside = [row.ending for row in FORMATS if row.cameras == "inside" and row.ending[0] == "."]
+        endings = join_words((*OUTPUT_FORMATS, *(inside if cameras else [])))
         index = f", or the name {INDEX}" if levels else ""
         folder = f", or a folder, or one named {' or '.join(FOLDERS)}" if cameras else ""
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{index}{folder}")

@@ -15,7 +15,7 @@ from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.io.formats.splat_transform import run_program
 from gsmerge.plan import Plan
-from gsmerge.raster import contributions, prepare, tile_view
+from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
@@ -63,7 +63,7 @@ def prune(importance: Callable[[Gaussians, Cameras], np.ndarray], prepared: Prep
 
 def summed_weights(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Sum each Gaussian's blending weights over the pixels of all views, ``[n]`` float64, independent of threads."""
-    splats = prepare(gaussians)
+    splats = make_splats(gaussians)
     viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
 
     def one_view(view: int) -> np.ndarray:

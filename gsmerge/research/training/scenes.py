@@ -12,7 +12,7 @@ from gsmerge.frame import canonicalise
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.pooling import Members, scene_members
-from gsmerge.raster import composite, prepare, tile_view
+from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene, Views
@@ -72,7 +72,7 @@ def coverage(training: TrainingScene, level: float = 1) -> np.ndarray:
 
     def one_view(view: int) -> np.ndarray:
         part = subset(scene, [view])
-        splats = prepare(part.gaussians, np.zeros(3))
+        splats = make_splats(part.gaussians, np.zeros(3))
         views = (tile_view(splats, **photos.camera(photo), near=NEAR_PLANE) for photo in range(len(photos)))
         opacities = np.stack([1 - composite(tiled)[1] for tiled in views])
         seen = visible_pixels(context_points(part, NEAR_PLANE), cameras, NEAR_PLANE, scene.cameras)

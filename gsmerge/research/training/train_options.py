@@ -11,7 +11,7 @@ from gsmerge.fit.loss import LOSS_WINDOW
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.settings.setting import Settings, change_settings, setting
-from gsmerge.settings.stages import SEGMENTATIONS, MatchOptions, Method
+from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions
 
 COUNT: dict[str, Any] = {"least": 1, "most": 10**9}
 FROM_0: dict[str, Any] = {"least": 0, "most": 10**9}
@@ -38,7 +38,7 @@ class TrainOptions(Settings):
         "Two by default, since a full fit starts with 57 % of the usual number.", least=1e-6, most=1,
         filled=True)  # fmt: skip
     segmentation: str = setting("rdseg", "Superpixel method.", choices=SEGMENTATIONS)
-    match: Method = setting("overlap", "Merging across views.",
+    match: MatchMethod = setting("overlap", "Merging across views.",
         "What the networks make of a window is matched in every step.")  # fmt: skip
     overlap: float = setting(0.7, "Least overlap of a match by `overlap`.", **PART)
     iou: float = setting(0.2, "Least intersection over union of the boxes of a match by `aabb`.", **PART)

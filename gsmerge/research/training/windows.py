@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
@@ -114,7 +114,9 @@ def whole_photo(example: Example, photo: int, k: int = 1) -> Window:
 def _rows(example: Example, photo: int, box: Box) -> np.ndarray:
     """Find the ascending rows of the Feature Gaussians that reach into the window or close to it."""
     wide = Box(box.left - BORDER, box.top - BORDER, box.width + 2 * BORDER, box.height + 2 * BORDER)
-    tiled = tile_view(prepare(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR_PLANE)
+    tiled = tile_view(
+        make_splats(example.base, np.zeros(3)), **box_camera(example.photos, photo, wide), near=NEAR_PLANE
+    )
     reached = np.zeros(len(example.base), bool)
     reached[tiled.ids[np.unique(tiled.flatten_ids)]] = True
     return np.flatnonzero(reached)

@@ -11,7 +11,7 @@ from sweeps import sweep
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.kernels import elementary
-from gsmerge.raster import composite, contributions, prepare, render, splat_adjoint, tile_view
+from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
 from gsmerge.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
@@ -79,7 +79,7 @@ def test_needles_match() -> None:
 @sweep("channels", [1, 3, 4, 5, 8], often=2)
 def test_adjoint_matches_the_weights(channels: int) -> None:
     gaussians, cameras = random_gaussians(200, 11), turned_camera()
-    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     image = np.random.default_rng(0).normal(size=(HEIGHT, WIDTH, channels))
     expected = np.einsum("nhw,hwc->nc", reference(gaussians, cameras).weights, image)
     np.testing.assert_allclose(splat_adjoint(tiled, image), expected, atol=0.02)
@@ -88,7 +88,7 @@ def test_adjoint_matches_the_weights(channels: int) -> None:
 
 def test_contributions_match_the_weights() -> None:
     gaussians, cameras = random_gaussians(200, 12), turned_camera()
-    mass, peak = contributions(tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT))
+    mass, peak = contributions(tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT))
     weights = reference(gaussians, cameras).weights
     np.testing.assert_allclose(mass, weights.sum((1, 2)), atol=0.02)
     np.testing.assert_allclose(peak, weights.max((1, 2)), atol=0.01)
@@ -97,6 +97,6 @@ def test_contributions_match_the_weights() -> None:
 def test_any_colours_are_blended_as_they_are() -> None:
     gaussians, cameras = random_gaussians(200, 13), turned_camera()
     colors = np.random.default_rng(0).normal(size=(200, 3)) * 10
-    tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
+    tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], WIDTH, HEIGHT)
     image, _ = composite(tiled, colors)
     assert_alike(image / 10, np.einsum("nhw,nc->hwc", reference(gaussians, cameras).weights, colors) / 10)

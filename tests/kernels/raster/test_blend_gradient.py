@@ -13,7 +13,7 @@ from sweeps import sweep
 from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge import Gaussians
-from gsmerge.raster import TiledView, composite, prepare, tile_view
+from gsmerge.raster import TiledView, composite, make_splats, tile_view
 from gsmerge.raster.composite import view_colors
 from gsmerge.raster.gradient import Gradients, color_gradients, gradients_of
 from gsmerge.runtime.threads import use_threads
@@ -73,7 +73,7 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
 
     def run(count: int) -> list[np.ndarray]:
         with use_threads(count):
-            tiled = tile_view(prepare(gaussians), cameras.viewmats[0], K, size[1], size[0])
+            tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], K, size[1], size[0])
             assert len(tiled.flatten_ids) > 2000
             image, left = composite(tiled)
             colors = view_colors(tiled)

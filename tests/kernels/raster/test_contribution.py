@@ -12,7 +12,7 @@ from slow_renderer import render_arrays
 from sweeps import sweep
 
 from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, settle_row
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 from gsmerge.stages.assign import find_owners, view_owners
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Gaussians, Groups, Scene
@@ -42,7 +42,7 @@ CASES = [(300, 0, 0.5, -3.5, 90), (80, 1, 0.5, -1.0, 200), (400, 2, 3.0, -2.5, 4
 def test_dominant_labels(case: tuple[int, int, float, float, int]) -> None:
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)
-    tiled = tile_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
     values, actual = view_owners(tiled, labels, count)
     sums = superpixel_sums(gaussians, labels)[tiled.ids]
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
@@ -59,7 +59,7 @@ def test_pairs_beyond_the_first_room() -> None:
     gaussians = random_gaussians(400, 7, opacity=3.0, size=0.3)
     gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
     labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
-    tiled = tile_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
     values, actual = view_owners(tiled, labels, HEIGHT * WIDTH)
     sums = superpixel_sums(gaussians, labels)[tiled.ids]
     assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
@@ -74,7 +74,7 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
         gaussians.sh0, gaussians.shN,
     )  # fmt: skip
     even = np.array([[60.0, 0, 32], [0, 60.0, 1], [0, 0, 1]])
-    tiled = tile_view(prepare(middle), np.eye(4), even, 64, 2)
+    tiled = tile_view(make_splats(middle), np.eye(4), even, 64, 2)
     rows = np.repeat(np.array([[0], [1]], np.int32), 64, 1)
     assert view_owners(tiled, rows, 2)[1].tolist() == [0]
     assert view_owners(tiled, 1 - rows, 2)[1].tolist() == [0]

@@ -12,7 +12,7 @@ from slow_renderer import render_arrays
 
 from gsmerge.geometry import quat_to_rotmat
 from gsmerge.kernels.raster.list_weights import collect, spread
-from gsmerge.raster import TiledView, composite, prepare, splat_adjoint, tile_view
+from gsmerge.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
 from gsmerge.raster.weights import ViewWeights, apply, apply_transposed, view_weights
 from gsmerge.types import Gaussians
 
@@ -25,7 +25,7 @@ def of_case(case: tuple[int, int, float]) -> Gaussians:
 
 
 def tile_and_weigh(gaussians: Gaussians) -> tuple[TiledView, ViewWeights]:
-    tiled = tile_view(prepare(gaussians), np.eye(4), K, WIDTH, HEIGHT)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
     return tiled, view_weights(tiled)
 
 

@@ -8,7 +8,7 @@ from slow_renderer import footprints
 
 from gsmerge import Gaussians
 from gsmerge.kernels import elementary
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
@@ -34,7 +34,7 @@ def test_footprints() -> None:
     n, width, height = 300, 60, 40
     gaussians = random_gaussians(n, 0, spread=0.6, depth=3, sizes=1.0)
     K, viewmat = np.array([[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]]), np.eye(4)
-    tiled = tile_view(prepare(gaussians), viewmat, K, width, height)
+    tiled = tile_view(make_splats(gaussians), viewmat, K, width, height)
     positions, covars, depths = slow_footprints(gaussians, viewmat, K, width, height)
     ids = tiled.ids
     mean_x, mean_y, rate_x, slope, rate_y, lnop, first, last = tiled.conics.T.astype(np.float64)
@@ -60,7 +60,7 @@ def test_no_gaussian_that_adds_light_is_missing() -> None:
     n, width, height = 800, 50, 40
     gaussians = random_gaussians(n, 1, spread=2.0, depth=2, sizes=1.5)
     K, viewmat = np.array([[50.0, 0, 25], [0, 50.0, 20], [0, 0, 1]]), np.eye(4)
-    tiled = tile_view(prepare(gaussians), viewmat, K, width, height)
+    tiled = tile_view(make_splats(gaussians), viewmat, K, width, height)
     positions, covars, depths = slow_footprints(gaussians, viewmat, K, width, height)
     conics = np.linalg.inv(covars + 0.3 * np.eye(2))
     ys, xs = np.mgrid[:height, :width] + 0.5

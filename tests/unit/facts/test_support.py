@@ -11,7 +11,7 @@ import scenes
 from gsmerge import Gaussians
 from gsmerge.facts.support import TINT, TINTS, count_views, tint
 from gsmerge.geometry import sh0_to_rgb
-from gsmerge.raster import composite, prepare, tile_view
+from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.types import Cameras
 
@@ -30,7 +30,7 @@ def room(cameras: Cameras) -> Gaussians:
 def test_a_view_counts_where_a_picture_shows_the_gaussian(room: Gaussians, cameras: Cameras) -> None:
     """A white Gaussian among black ones shows its own weights."""
     half = blank_photos(cameras, 2)
-    views = [tile_view(prepare(room), **half.camera(view)) for view in range(len(half))]
+    views = [tile_view(make_splats(room), **half.camera(view)) for view in range(len(half))]
     counts = np.zeros(len(room), int)
     for row in range(len(room)):
         white = np.zeros((len(room), 3), np.float32)

@@ -26,7 +26,7 @@ from gsmerge.fit.outside import (
 )
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry import camera_centres
-from gsmerge.raster import composite, prepare, tile_view
+from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import Photos, render_photos
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.fit import Tuning
@@ -89,7 +89,7 @@ def test_views_see_as_far_as_the_scene_shows_something(outside: Outside, truth: 
     """Against depths drawn from the same cameras, and nothing where it is empty."""
     for view in range(0, len(outside.views), 9):
         limits = outside.limits[view]
-        drawn = composite(tile_view(prepare(truth), **outside.views.camera(view)))
+        drawn = composite(tile_view(make_splats(truth), **outside.views.camera(view)))
         assert drawn[1][np.isinf(limits)].min(initial=1) > 0.8
         solid = np.isfinite(limits) & (limits > 0)
         assert drawn[1][solid].max(initial=0) < 0.15
@@ -124,11 +124,11 @@ def test_gradients_are_those_of_what_is_hidden(outside: Outside, truth: Gaussian
     looked = replace(outside, limits=np.where(np.isinf(outside.limits), np.inf, 0) if empty else far)
     weights = np.full_like(far, 1) if not empty else np.where(np.isinf(looked.limits), np.float32(LIGHT), 0)
     looked = replace(looked, views=replace(outside.views, weights=weights.astype(np.float32)))
-    g = veil_gradients(prepare(spoilt[len(truth) :]), looked, 0)
+    g = veil_gradients(make_splats(spoilt[len(truth) :]), looked, 0)
 
     def loss(change: float) -> float:
         changed = replace(spoilt, opacities=np.append(spoilt.opacities[:-1], np.float32(0.3 + change)))[len(truth) :]
-        tiled = tile_view(prepare(changed), **outside.views.camera(0), near=outside.near[0])
+        tiled = tile_view(make_splats(changed), **outside.views.camera(0), near=outside.near[0])
         hidden = (1 - composite(tiled)[1]) * (1 if empty else 0.75)
         return float((weights[0] * hidden).mean(dtype=np.float64))
 
@@ -142,14 +142,14 @@ def test_what_hides_little_and_what_stands_behind_is_left(outside: Outside, trut
     depth = float((outside.views.viewmats[0, 2] * np.append(curtain.means[0], 1)).sum())
     for limit, count in ((depth / (1 - MARGIN), 0), (0.5 * depth, 0), (8 * depth, 1)):
         looked = replace(outside, limits=np.full_like(outside.limits, limit))
-        assert len(veil_gradients(prepare(curtain), looked, 0).ids) == count
+        assert len(veil_gradients(make_splats(curtain), looked, 0).ids) == count
 
 
 def test_fog_is_the_opacity_far_outside(outside: Outside, truth: Gaussians) -> None:
-    assert score_fog(prepare(truth), outside) == pytest.approx(0, abs=0.01)
-    thick, thin = (score_fog(prepare(with_curtain(truth, opacity)), outside) or 0 for opacity in (0.8, 0.2))
+    assert score_fog(make_splats(truth), outside) == pytest.approx(0, abs=0.01)
+    thick, thin = (score_fog(make_splats(with_curtain(truth, opacity)), outside) or 0 for opacity in (0.8, 0.2))
     assert 0.3 < 2 * thin < thick <= 0.81
-    assert score_fog(prepare(truth), replace(outside, limits=np.zeros_like(outside.limits))) is None
+    assert score_fog(make_splats(truth), replace(outside, limits=np.zeros_like(outside.limits))) is None
 
 
 def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pair, outside: Outside) -> None:
@@ -159,7 +159,7 @@ def test_a_fit_keeps_empty_what_its_start_has_empty(truth: Gaussians, photos: Pa
     start = scenes.spoil(truth)
     whole = replace(outside, views=replace(outside.views, weights=np.isinf(outside.limits).astype(np.float32)))
     fitted, without = (fit_full(start, scenes.run_for(shown, LONG, outside=views))[0] for views in (whole, None))
-    kept, grown = (score_fog(prepare(one), outside) or 0 for one in (fitted, without))
+    kept, grown = (score_fog(make_splats(one), outside) or 0 for one in (fitted, without))
     assert kept < 0.02
     assert grown > 4 * kept
 

@@ -15,7 +15,7 @@ from gsmerge.fit.fit_state import start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.fit.outside import look_outside, score_fog
 from gsmerge.fit.survey import JUDGES, choose_looks, judging_views, score_images, survey_photos, visible_mask
-from gsmerge.raster import composite, contributions, prepare, tile_view
+from gsmerge.raster import composite, contributions, make_splats, tile_view
 from gsmerge.raster.photos import Photos
 from gsmerge.types import SH_C0
 
@@ -30,7 +30,7 @@ def test_stage_takes_the_full_fit(truth: Gaussians, photos: Pair) -> None:
     assert outside is not None
     result, report = fit(start, FitJob(photos, QUICK, seed=4, outside=outside))
     expected, own = fit_full(start, scenes.run_for(photos, QUICK, seed=4, outside=outside))
-    assert report == replace(own, fog=score_fog(prepare(result), outside))
+    assert report == replace(own, fog=score_fog(make_splats(result), outside))
     assert scenes.identical(result, expected)
 
 

@@ -7,7 +7,7 @@ import pytest
 import scenes
 
 from gsmerge.measure.speed import measure_costs, overdraw
-from gsmerge.raster import prepare, tile_view
+from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.weights import view_weights
 from gsmerge.types import Scene
 
@@ -20,7 +20,12 @@ def scene() -> Scene:
 def test_overdraw_counts_what_is_blended(scene: Scene) -> None:
     one = scenes.arc(1)
     tiled = tile_view(
-        prepare(scene.gaussians), one.viewmats[0].astype(np.float64), one.Ks[0].astype(np.float64), 48, 36, near=0.01
+        make_splats(scene.gaussians),
+        one.viewmats[0].astype(np.float64),
+        one.Ks[0].astype(np.float64),
+        48,
+        36,
+        near=0.01,
     )
     assert overdraw(scene.gaussians, one, 0.01) == len(view_weights(tiled).lanes) / (48 * 36)
     assert overdraw(scene.gaussians[:0], one, 0.01) == 0

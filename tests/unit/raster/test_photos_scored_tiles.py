@@ -9,7 +9,7 @@ import scenes
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
 from gsmerge.raster.photos import NEAR_PLANE, scene_photos, score_photos, scored_tiles
-from gsmerge.raster.tiled_view import prepare, tile_view
+from gsmerge.raster.tiled_view import make_splats, tile_view
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def scene() -> Scene:
 
 def test_wanted_tiles_are_drawn_as_in_the_whole(scene: Scene) -> None:
     """Bit for bit, with Gaussians of all sizes, from fewer of them."""
-    rng, splats = np.random.default_rng(0), prepare(scene.gaussians)
+    rng, splats = np.random.default_rng(0), make_splats(scene.gaussians)
     scales = splats.scales * rng.choice([0.2, 1, 30], (len(splats), 1)).astype(np.float32)
     splats = type(splats)(**{**vars(splats), "scales": scales})
     photos = scene_photos(scene)

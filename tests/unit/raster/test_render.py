@@ -8,7 +8,7 @@ import pytest
 from messages import refuse_all
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, prepare, render, render_in_turn, splat_adjoint, tile_view
+from gsmerge.raster import composite, contributions, make_splats, render, render_in_turn, splat_adjoint, tile_view
 from gsmerge.types import SH_C0
 
 FOCAL = 100.0
@@ -57,13 +57,13 @@ def test_no_gaussians_leave_the_background() -> None:
 
 def test_what_is_behind_or_too_faint_is_not_seen() -> None:
     gaussians = balls((0, 0, -1, 0.1, 1, 1), (0, 0, 0.01, 0.1, 1, 1), (0, 0, 1, 0.1, 1 / 256, 1), (9, 0, 1, 0.1, 1, 1))
-    tiled = tile_view(prepare(gaussians), np.eye(4), camera().Ks[0], 21, 11)
+    tiled = tile_view(make_splats(gaussians), np.eye(4), camera().Ks[0], 21, 11)
     assert len(tiled.ids) == 0
     assert len(tiled.flatten_ids) == 0
 
 
 def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
-    tiled = tile_view(prepare(balls((0, 0, 1, 0.02, 0.8, -3.0))), np.eye(4), camera().Ks[0], 21, 11)
+    tiled = tile_view(make_splats(balls((0, 0, 1, 0.02, 0.8, -3.0))), np.eye(4), camera().Ks[0], 21, 11)
     assert composite(tiled)[0].max() == 0
     image, transmittance = composite(tiled, np.array([[-3.0, 0.0, 7.0]]))
     assert image[5, 10].tolist() == pytest.approx([-2.4, 0, 5.6], abs=1e-5)
@@ -71,7 +71,7 @@ def test_negative_colours_are_clamped_but_given_ones_are_not() -> None:
 
 
 def test_left_out_ones_and_other_opacities() -> None:
-    splats = prepare(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
+    splats = make_splats(balls((0, 0, 1, 0.5, 0.5, 1), (0, 0, 2, 1.0, 0.5, 1)))
     alone = tile_view(splats, np.eye(4), camera().Ks[0], 21, 11, keep=np.array([False, True]))
     assert alone.ids.tolist() == [1]
     assert contributions(alone)[1].tolist() == pytest.approx([0, 0.5], abs=1e-5)
@@ -87,14 +87,14 @@ def test_geographic_coordinates_keep_their_detail() -> None:
     viewmats[:, :3, 3] = -shift
     there = Cameras(viewmats, camera().Ks, 21, 11)
     np.testing.assert_allclose(render(moved, there).images, render(rows, camera()).images, atol=1e-5, rtol=0)
-    tiled = tile_view(prepare(moved), viewmats[0], camera().Ks[0], 21, 11)
+    tiled = tile_view(make_splats(moved), viewmats[0], camera().Ks[0], 21, 11)
     np.testing.assert_allclose(composite(tiled)[0], render(rows, camera()).images[0], atol=1e-5)
 
 
 def test_nothing_is_copied_that_need_not_be(torch: Any) -> None:
     gaussians = balls((0, 0, 1, 0.02, 0.8, 1.0), (1, 1, 0, 0.02, 0.8, 1.0))
     for given in (gaussians, gaussians.to("cpu")):
-        splats = prepare(given)
+        splats = make_splats(given)
         assert np.shares_memory(splats.means, gaussians.means)
         assert np.shares_memory(splats.sh0, gaussians.sh0)
 
@@ -150,7 +150,11 @@ def test_every_view_has_its_own_image() -> None:
 
 
 def test_messages() -> None:
-    gaussians, splats, K = balls((0, 0, 1, 0.02, 0.8, 1.0)), prepare(balls((0, 0, 1, 0.02, 0.8, 1.0))), camera().Ks[0]
+    gaussians, splats, K = (
+        balls((0, 0, 1, 0.02, 0.8, 1.0)),
+        make_splats(balls((0, 0, 1, 0.02, 0.8, 1.0))),
+        camera().Ks[0],
+    )
     tiled = tile_view(splats, np.eye(4), K, 21, 11)
     refuse_all(ValueError, [
         (lambda: render(gaussians, camera(), (0.1, 0.2)), "", "background", (0.1, 0.2)),
@@ -206,7 +210,7 @@ def test_lists_end_behind_what_hides_a_tile(monkeypatch: pytest.MonkeyPatch) -> 
     gaussians, cameras = Gaussians.concat([many_balls()[:40], huge]), camera(41, 61)
 
     def draw() -> tuple[list[np.ndarray], list[list[int]]]:
-        tiled = tile_view(prepare(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
+        tiled = tile_view(make_splats(gaussians), cameras.viewmats[0], cameras.Ks[0], 41, 61)
         lists = np.split(tiled.ids[tiled.flatten_ids], tiled.isect_offsets[1:-1])
         return [*composite(tiled), *contributions(tiled)], [part.tolist() for part in lists]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsmerge import CompactOptions
 from gsmerge.compaction.methods import COUNTS
-from gsmerge.settings.setting import names_of, part_settings
+from gsmerge.settings.setting import names_of, piece_settings
 
 
 def test_lists_are_those_of_the_declarations() -> None:
@@ -18,9 +18,9 @@ def test_a_part_leaves_to_the_whole_what_the_whole_decides() -> None:
     """A block or a batch, and a trial, which also leaves out what only the result has."""
     part = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
     only = {"budget": None, "quality": None, "levels": 1, "crop": None, "drop": None, "time_budget": None}
-    assert part_settings(CompactOptions) == part
+    assert piece_settings(CompactOptions) == part
     trial = part | only | {"photo_scale": 1.0, "recipe": None}
-    assert part_settings(CompactOptions, trial=True) == trial
+    assert piece_settings(CompactOptions, trial=True) == trial
     CompactOptions().with_settings(trial)  # all are values that the settings take
 
 

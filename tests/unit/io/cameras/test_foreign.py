@@ -11,7 +11,7 @@ from tiny_scene import Tiny, write_colmap_text, write_transforms
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, write_gaussians
-from gsmerge.io.cameras.foreign import LAYOUTS, find_unread
+from gsmerge.io.cameras.foreign import PROGRAMS, find_unread
 from gsmerge.io.cameras.read import find_cameras, find_other_cameras
 from gsmerge.scene.files import find_scene_files
 
@@ -83,7 +83,7 @@ def test_what_lies_there_is_named_with_what_is_read_of_it(
 
 def test_each_layout_that_is_not_read_is_tried() -> None:
     """And a start other than its own is another file."""
-    programs = {layout.program for layout in LAYOUTS if layout.remedy}
+    programs = {foreign.program for foreign in PROGRAMS if foreign.remedy}
     assert all(any(name in program for _, _, name, _ in FILES) for program in programs)
 
 
