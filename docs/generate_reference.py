@@ -223,7 +223,7 @@ def _list(settings: Iterable[Any]) -> list[str]:
     for one in settings:
         default = "" if one.default is None or one.is_group else f"`{_plain(one.default)}`"
         facts = "; ".join(filter(None, (default, _line(one.values(null=False)) if one.words else "")))
-        text = _line(one.text if one.default is None else one.help)
+        text = _line(one.text)
         lines.append(f"- `{one.name}`{f' ({facts})' if facts else ''}: {text}")
     return lines
 

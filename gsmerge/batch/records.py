@@ -95,6 +95,9 @@ def check_folder(folder: Path) -> int:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS
+        if records.is_symlink():
+            problem = "expected a file of records, found a link, whose target would be changed"
+            raise SceneError(records, problem, "remove it, or name another folder with --output")
         if records.exists():
             check_file(records)  # a pipe waits for its reader
         with records.open("ab") as file:

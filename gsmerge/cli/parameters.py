@@ -49,6 +49,7 @@ METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH",
 REQUIRED = Parameter.empty
 LIST = "help"  # for which --set prints all settings
 SEED = "GSMERGE_SEED"  # of the environment: the seed where a command is given none
+MAX_DIGITS = 1000  # of such a seed, far fewer than Python refuses
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -74,7 +75,9 @@ class Args(SimpleNamespace):
         for name, value in vars(self).items():
             if value and name not in names and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"
-                raise UsageError(f"{flag}: expected a scene with it, {path} holds Feature Gaussians")
+                raise UsageError(
+                    f"{flag}: expected a scene with it, {path} holds Feature Gaussians, whose number --k decides"
+                )
 
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
         """Make settings of classes ``kinds`` from options, ``--set`` and ``changes``; UsageError if one is wrong."""
@@ -188,9 +191,11 @@ def _read_value(text: str) -> list[Any]:
 def _environment_seed() -> dict[str, int]:
     """Return the seed of the environment, if there is one; UsageError if it is no seed."""
     text = os.environ.get(SEED)
-    if text is not None and not text.isdecimal():
-        raise UsageError(f"{SEED}: expected a whole number from 0, got {text!r}")
-    return {} if text is None else {"seed": int(text)}
+    if not text:  # an empty variable is one that is not set
+        return {}
+    if not (text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS):
+        raise UsageError(f"{SEED}: expected a whole number from 0 of at most {MAX_DIGITS} digits, got {text!r:.40}")
+    return {"seed": int(text)}
 
 
 @contextmanager

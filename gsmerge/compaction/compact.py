@@ -71,9 +71,7 @@ def compact(
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a scene of which the facts are known."""
-    plan = add_target(
-        make_plan(prepared, options), prepared
-    )  # options end here
+    plan = add_target(make_plan(prepared, options), prepared)  # options end here
 
     def rebuild(count: int | None) -> Candidate:
         candidate = build_scored(method.build, prepared, plan, count)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compaction.placement import NUM_FULL, add_views, find_placement, name_photos, pad_harmonics, place
+from gsmerge.compaction.placement import NUM_FULL, add_views, find_placement, name_photos, pad_harmonics
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.frame import scene_frame
@@ -68,8 +68,11 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
         stored, unread = _read_cameras(options)
         cameras = None if stored is None else to_cameras(stored)
         if cameras is None and chosen.cameras == "needed":
-            problem = f"expected cameras beside it for {chosen.about.partition(':')[0]}, found none"
-            raise SceneError(options.inputs[0], problem, "name them with --cameras")
+            problem = (
+                f"expected a result's cameras inside or beside it for {chosen.about.partition(':')[0]}, found none"
+            )
+            near = find_scene_files(options.inputs[0]).cameras if options.cameras != NONE else None
+            raise SceneError(options.inputs[0], problem, f"name them with --cameras {near or 'FILE'}")
         count = len(gaussians)
         gaussians, left_out = _clean(gaussians, options, stored)
         if len(gaussians) == 0:

@@ -26,7 +26,6 @@ from gsmerge.compaction.left_out import (
 from gsmerge.compaction.result import Candidate, covers_all, measure_input
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.row_colors import PHOTOS, RENDERS
-from gsmerge.fit import FitOptions
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import Build
@@ -263,7 +262,10 @@ def measure_curve(
     The fits take ``steps`` whatever the plan says. PSNR and SSIM are measured at full size on the photos of
     ``left_out``, or without on blocks that the fits leave out.
     """
-    short = FitOptions(fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, tuning=plan.fit.tuning)
+    short = replace(
+        plan.fit, fit="full", fit_steps=steps, half_res_share=1.0, holdout=HOLDOUT, photo_scale=1.0, time_budget=None,
+        judged=True, move_cameras=False, share=None,
+    )  # fmt: skip
     if left_out is None:
         photos = scene_photos(prepared.scene)[prepared.reference.score_views]
         weights, min_gain = training_weights(photos, HOLDOUT, plan.seed), short.tuning.min_gain

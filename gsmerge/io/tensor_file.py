@@ -35,7 +35,9 @@ def read_tensors(
             head = file.read(num_bytes)
             budget.check_memory(_ARRAY_MEMORY * head.count(b"{") + _COPIES * budget.file_bytes, "arrays")
             header = parse_json(head.decode("utf-8"), budget)
-            metadata = header.get("__metadata__") if isinstance(header, dict) else None
+            metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}
+            if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
+                raise ValueError("metadata that is no text by name")
             del header
             tensors = {
                 name: np.frombuffer(tensor["data"], _TYPES[tensor["dtype"]]).reshape(tensor["shape"])
@@ -45,4 +47,4 @@ def read_tensors(
         reason = f"numbers of type {error.args[0]}" if isinstance(error, KeyError) else str(error)
         reason = next(iter(reason.splitlines()), "out of memory")
         raise SceneError(path, f"expected {what}, could not read it ({reason})", remedy) from error
-    return metadata or {}, tensors
+    return metadata, tensors

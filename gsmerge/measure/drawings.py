@@ -13,6 +13,7 @@ from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.facts.support import count_views_in_world, tint
 from gsmerge.facts.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
+from gsmerge.io.atomic import atomic_outputs
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
@@ -326,13 +327,9 @@ def write_drawing(drawing: Drawing, *, overwrite: bool, progress: Progress) -> d
         pictures = count(drawing.draw(at_once))
         if fps is not None:
             return {"encoding": write_clip(drawing.paths[0], pictures, fps, overwrite=overwrite)}
-        for path, picture in zip(drawing.paths, pictures, strict=True):
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                problem = f"cannot be made ({error.strerror})"
-                raise SceneError(path.parent, problem, "name another with --output") from error
-            save_picture(path, picture, overwrite=overwrite)
+        with atomic_outputs(overwrite=overwrite) as add:
+            for path, picture in zip(drawing.paths, pictures, strict=True):
+                save_picture(add(path), picture, overwrite=overwrite)
     return {}
 
 

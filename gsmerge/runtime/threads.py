@@ -21,6 +21,7 @@ from typing import TypeVar
 import cv2
 
 from gsmerge.errors import UsageError
+from gsmerge.runtime import MOST_THREADS
 
 THREADS = "GSMERGE_THREADS"  # of the environment: how many where nobody says so
 T = TypeVar("T")
@@ -75,12 +76,12 @@ _local, _libraries = _Local(), _Libraries()
 def available_threads() -> int:
     """Return the number in the environment's ``GSMERGE_THREADS``, else of the processors that this process may use.
 
-    UsageError if the variable holds no number.
+    UsageError if the variable holds no such number.
     """
     text = os.environ.get(THREADS)
-    if text is not None:
-        if not text.isdecimal() or int(text) < 1:
-            raise UsageError(f"{THREADS}: expected a number from 1, got {text!r}")
+    if text:  # an empty variable is one that is not set
+        if not (text.isascii() and text.isdecimal() and len(text) < 10 and 1 <= int(text) <= MOST_THREADS):
+            raise UsageError(f"{THREADS}: expected a number from 1 to {MOST_THREADS}, got {text!r:.40}")
         return int(text)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 

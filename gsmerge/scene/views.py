@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.cameras.camera_file import CameraFile, sizes_of, to_cameras, undistort_photos
+from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import match_masks
@@ -46,11 +46,14 @@ _MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its p
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
     """Read a scene's cameras from their file or the ``.ply``, or estimate them; None if there are none.
 
-    If a file has only poses, the focal length is estimated; SceneError if that fails.
+    If a file has only poses, the focal length is estimated; SceneError if that fails. Views that repeat others count
+    once, unless there may be as many rows for each.
     """
     stored = None
     if files.cameras is not None:
         stored = read_cameras(files.cameras, scene=files.ply.stem, folder=files.ply.parent)
+        if len(ply.gaussians) % len(stored):  # otherwise each may have rows of its own
+            stored = drop_repeats(stored)
         if stored.focal is not None:
             return stored
     if stored is None and files.is_state:

@@ -6,18 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from gsmerge.runtime import MOST_THREADS
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.fit import FitOptions
-from gsmerge.settings.setting import (
-    MOST_THREADS,
-    Setting,
-    Settings,
-    change_settings,
-    flat_settings,
-    setting,
-    settings_of,
-)
+from gsmerge.settings.setting import Setting, Settings, change_settings, flat_settings, setting, settings_of
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,

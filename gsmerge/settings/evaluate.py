@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsmerge.settings.setting import MOST_THREADS, Settings, setting
+from gsmerge.runtime import MOST_THREADS
+from gsmerge.settings.setting import Settings, setting
 
 NETS = ("vgg", "alex")
 MAX_ZOOM = 16.0  # and its inverse the least: beyond, pictures have no pixels left or fill the memory

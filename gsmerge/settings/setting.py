@@ -17,7 +17,6 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
-MOST_THREADS = 1024  # each takes memory, even if it never has work
 KEPT = "as it is"  # of a value that a run of a piece of a scene takes: the whole scene's
 PLAIN = {int: "a whole number", float: "a number", bool: "true or false", str: "text", NoneType: "null"}
 

@@ -113,7 +113,8 @@ def batch_line(document: Mapping[str, Any]) -> str:
     """Describe the report of a batch in one line."""
     state = document["state"]
     if document["left_out"]:
-        return f"{state['path']}: unchanged, {state['num_batches']} batches"
+        number = state["num_batches"]
+        return f"{state['path']}: unchanged, {number} batch{'' if number == 1 else 'es'}"
     return (
         f"{state['path']}: batch {state['num_batches']}, {document['num_views']} views,"
         f" {document['num_input']:,} -> {document['num_new']:,} Gaussians; {document['num_gaussians']:,} in all,"

@@ -19,6 +19,7 @@ import numpy as np
 from former_formats import compressed_bytes, spz4_bytes
 from made_gaussians import random_gaussians
 from model_files import long_lrm
+from program_cameras import write_globalsplat, write_metashape, write_opensfm, write_polycam
 from splat_transform_programs import write_set
 from tiny_scene import (
     make_tiny,
@@ -230,6 +231,8 @@ def json_cameras(folder: Path) -> Iterable[bytes]:
     save_json(folder / "f.json", {"camera_angle_x": 0.8, "frames": [{k: f[k] for k in list(f)[:2]} for f in frames]})
     for name in "abcdef":
         yield (folder / f"{name}.json").read_bytes()
+    for write in (write_globalsplat, write_opensfm):
+        yield write(folder).read_bytes()
 
 
 def colmap(write: Callable[..., None]) -> Seeds:
@@ -247,6 +250,43 @@ def pose_list(folder: Path) -> Iterable[bytes]:
     (folder / "camera_poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 0\n")
     (folder / "intrinsic.txt").write_text("20 20 12 8\n")
     yield pack(folder)
+
+
+def pose_lists(folder: Path) -> Iterable[bytes]:
+    """Make lists of poses as TUM, RealEstate10K and Open3D have them."""
+    pose = "1 0 0 0 0 1 0 0 0 0 1 0"
+    yield b"# time x y z q\n1.5 0 0 1 0 0 0 1\n1.6 0 0 2 0 0 0 1\n"
+    yield f"https://a.b/c\n100 .9 .9 .5 .5 0 0 {pose}\n200 .9 .9 .5 .5 0 0 {pose}\n".encode()
+    yield b"0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 1 2\n1 0 0 1\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+
+
+def pose_folder(folder: Path) -> Iterable[bytes]:
+    """Make poses of a file each, with intrinsics in a matrix or as SRN and NSVF have them."""
+    (folder / "pose").mkdir()
+    for view in range(2):
+        (folder / f"pose/{view}.txt").write_text(f"1 0 0 {view}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    yield pack(folder)
+
+
+def polycam(folder: Path) -> Iterable[bytes]:
+    """Make the keyframes of Polycam, a file for each camera."""
+    yield pack(write_polycam(folder))
+
+
+def metashape(folder: Path) -> Iterable[bytes]:
+    """Make a file of Metashape, with and without its world."""
+    path = write_metashape(folder, "<k1>0.1</k1>")
+    yield path.read_bytes()
+    move = (
+        b"<transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>2 4 6</translation><scale>2</scale></transform>"
+    )
+    yield path.read_bytes().replace(b"<chunk>", b"<chunk>" + move)
+
+
+def check_metashape(path: Path) -> None:
+    """Read cameras, and their world."""
+    read_dataparser(path, path)
+    check_cameras(path)
 
 
 def moved(folder: Path) -> Iterable[bytes]:
@@ -327,6 +367,10 @@ TARGETS: dict[str, Target] = {
     "colmap-text": Target("colmap/", colmap(write_colmap_text), check_cameras),
     "colmap-binary": Target("colmap/", colmap(write_colmap_binary), check_cameras),
     "pose-list": Target("poses/camera_poses.txt", pose_list, check_cameras),
+    "pose-lists": Target("a.txt", pose_lists, check_cameras),
+    "pose-folder": Target("pose/", pose_folder, check_cameras),
+    "polycam": Target("keyframes/", polycam, check_cameras),
+    "metashape": Target("a.xml", metashape, check_metashape),
     "long-lrm": Target("moved/opencv_cameras.json", moved, check_cameras),
     "dataparser": Target("moved/transforms.json", dataparser, lambda path: read_dataparser(path, path)),
     "npz": Target("results.npz", arrays, check_arrays),

@@ -92,6 +92,26 @@ class CameraFile:
         return f"CameraFile({len(self)} of {self.path}, {self.source})"
 
 
+def drop_repeats(file: CameraFile) -> CameraFile:
+    """Leave out views with the name, pose and intrinsics of an earlier one; the file itself where it holds images."""
+    keys = [
+        (name, viewmat.tobytes(), K.tobytes())
+        for name, viewmat, K in zip(file.names, file.viewmats, file.Ks, strict=True)
+    ]
+    first = sorted({key: view for view, key in reversed(list(enumerate(keys)))}.values())
+    if len(first) == len(file) or len(file.images) or file.pixel_ids is not None:
+        return file
+    return replace(
+        file,
+        viewmats=file.viewmats[first],
+        Ks=file.Ks[first],
+        widths=file.widths[first],
+        heights=file.heights[first],
+        names=tuple(file.names[view] for view in first),
+        lenses=tuple(file.lenses[view] for view in first) if file.lenses else (),
+    )
+
+
 class StoredView(NamedTuple):
     """One camera of a file, in the convention of the file."""
 

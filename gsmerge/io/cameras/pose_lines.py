@@ -16,7 +16,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry import quat_to_rotmat
-from gsmerge.io.bounds import read_lines
+from gsmerge.io.bounds import MAX_TEXT_BYTES, check_file, read_lines
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, StoredView, check_count, make_pinhole
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras
 from gsmerge.io.cameras.foreign import INTRINSICS, POSE_FOLDERS
@@ -51,9 +51,9 @@ def read_poses(source: CameraSource) -> StoredCameras:
     images. Views of a folder whose matrix is not finite have no camera. SceneError if a line has another number of
     numbers.
     """
-    path, lines = source.path, list(_lines(source.path))
-    columns = len(_words(next(filter(str.strip, lines), "")))
-    rows = _parse(path, lines, (columns,) if columns in (_ROW, _TUM, _RE10K) else _POSE_COLUMNS)
+    path = source.path
+    columns = len(_words(next(filter(str.strip, _lines(path)), "")))
+    rows = _parse(path, _lines(path), (columns,) if columns in (_ROW, _TUM, _RE10K) else _POSE_COLUMNS)
     poses, names = _join_rows(path, rows), [f"{i:06d}" for i in range(len(rows))]
     beside = [path.parent / name for name in INTRINSICS]
     place = next((file for file in beside if file.exists()), None)
@@ -104,8 +104,14 @@ def _files(path: Path) -> list[Path]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Yield the lines of a text file, or of all in a folder; empty ones for comments and the indices of a ``.log``."""
-    for file in _files(path) if path.is_dir() else [path]:
+    """Yield the lines of a text file, or of all in a folder; empty ones for comments and the indices of a ``.log``.
+
+    SceneError if the files of a folder together have more bytes than one may have.
+    """
+    files = _files(path) if path.is_dir() else [path]
+    if sum(map(check_file, files)) > MAX_TEXT_BYTES:
+        raise SceneError(path, f"expected text files of at most {MAX_TEXT_BYTES >> 20} MiB together, found more")
+    for file in files:
         for line in read_lines(file):
             is_other = _OTHER_LINE.match(line) or (file.suffix == ".log" and len(line.split()) == 3)
             yield "" if is_other else line

@@ -13,13 +13,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gsmerge.errors import SceneError
 from gsmerge.geometry import Similarity, motion_matrices
-from gsmerge.io.bounds import read_budget, read_json, read_text
+from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import check_count, make_similarity
 from gsmerge.io.cameras.camera_format import CameraSource, StoredCameras, number_errors
 from gsmerge.io.cameras.transforms import transforms_views
 from gsmerge.io.image_names import natural_key
+from gsmerge.io.xml_files import read_xml
 
 _MODELS = {  # of OpenSfM, by names of lenses that mean the same
     "perspective": "OPENCV", "brown": "OPENCV", "simple_radial": "OPENCV", "radial": "OPENCV",
@@ -27,7 +27,7 @@ _MODELS = {  # of OpenSfM, by names of lenses that mean the same
 }  # fmt: skip
 _SENSORS = {"frame": "OPENCV", "fisheye": "OPENCV_FISHEYE"}  # of Metashape
 _MATRIX = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]  # keys of Polycam
-_ELEMENT_BYTES = 200  # of memory for each "<" of an XML file
+_ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}  # of Metashape
 
 
 def read_opensfm(source: CameraSource) -> StoredCameras:
@@ -98,8 +98,8 @@ def read_metashape_world(path: Path) -> Similarity | None:
     """Read how Metashape places the cameras in its world, in which it may have exported them otherwise; None if not."""
     root, cameras = _metashape_cameras(path)
     component = cameras[0].get("component_id") if cameras else None
-    places = (f".//component[@id='{component}']/transform", "./chunk/transform")
-    move = next((found for place in places if (found := root.find(place)) is not None), None)
+    own = [each for each in root.iter("component") if each.get("id") == component]
+    move = next((found for each in (*own, *root.iter("chunk")) if (found := each.find("transform")) is not None), None)
     if move is None:
         return None
     text = "expected rotation, translation and scale of 'transform' as numbers"
@@ -112,15 +112,8 @@ def read_metashape_world(path: Path) -> Similarity | None:
 
 
 def _metashape_cameras(path: Path) -> tuple[ElementTree.Element, list[ElementTree.Element]]:
-    """Parse a file, and list the cameras that were placed, of the component that has most of them."""
-    text = read_text(path)
-    read_budget(path).check_memory(_ELEMENT_BYTES * text.count("<"), "XML")
-    if "<!DOCTYPE" in text:  # entities could make a short text endless
-        raise SceneError(path, "expected XML as Metashape writes it, found <!DOCTYPE")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise SceneError(path, f"expected XML, found something else ({error})") from error
+    """Parse a file, and list the cameras with a pose, of the component that has most of them."""
+    root = read_xml(path, _ATTRIBUTES)
     cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
     check_count(path, len(cameras))
     largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
@@ -130,7 +123,7 @@ def _metashape_cameras(path: Path) -> tuple[ElementTree.Element, list[ElementTre
 def _metashape_sensor(sensor: ElementTree.Element) -> dict[str, Any]:
     """Return the intrinsics of a sensor, whose principal point counts from the middle."""
     calibration = max(sensor.findall("calibration"), key=lambda entry: entry.get("class") == "adjusted")
-    size = [*calibration.iter("resolution"), *sensor.iter("resolution")][0].attrib
+    size = [*calibration.findall("resolution"), *sensor.findall("resolution")][0].attrib
     width, height = float(size["width"]), float(size["height"])
     numbers = {child.tag: float(child.text or "") for child in calibration if child.tag != "resolution"}
     focal = {"fl_x": numbers["f"] + numbers.get("b1", 0), "fl_y": numbers["f"]}

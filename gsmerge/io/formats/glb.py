@@ -130,10 +130,10 @@ def read_rows(path: Path) -> StoredRows:
     budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
     with _damage(path), path.open("rb") as file, np.errstate(all="ignore"):  # what is not finite is set aside later
         document = _read_document(file, budget)
-        content = _Content(path, file, document, file.tell(), budget.file_bytes)
+        content = _Content(budget, file, document, file.tell(), budget.file_bytes)
         for mesh, place in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
-            parts.append(_read_splats(content, mesh, place, sizes))
+            parts.append(_read_splats(content, mesh, place, sizes, sum(part.count for part in parts)))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote with it")
@@ -171,7 +171,7 @@ class _Values:
 class _Content:
     """The content of a ``.glb`` whose binary chunk, of ``end - start`` bytes, is read part by part."""
 
-    path: Path
+    budget: ReadBudget
     file: IO[bytes]
     document: dict[str, Any]
     start: int
@@ -261,8 +261,13 @@ def _node_matrix(node: dict[str, Any]) -> np.ndarray:
     return matrix
 
 
-def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int]) -> Packed:
-    """Read one primitive, which ``place [4,4]`` moves, and add its bytes to ``sizes`` by attribute."""
+def _read_splats(
+    content: _Content, primitive: dict[str, Any], place: np.ndarray, sizes: dict[str, int], count_before: int
+) -> Packed:
+    """Read one primitive, which ``place [4,4]`` moves, and add its bytes to ``sizes`` by attribute.
+
+    ``count_before``: Gaussians of the primitives before it, which share the file's budget with its own.
+    """
     splats, attributes = primitive["extensions"][NAME], primitive.get("attributes", {})
     kernel, space = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     more = dict(splats.get("extensions") or {})
@@ -270,7 +275,7 @@ def _read_splats(content: _Content, primitive: dict[str, Any], place: np.ndarray
     if more or (kernel, space) != ("ellipse", COLOR_SPACE):
         raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, more or (kernel, space)))})")
     if spz_part is not None:
-        rows, _, _, parts = spz.unpack_rows(content.path, content.packed(spz_part["bufferView"]))
+        rows, _, _, parts = spz.unpack_rows(content.budget, content.packed(spz_part["bufferView"]), count_before)
         sizes.update({name: sizes.get(name, 0) + size for name, size in parts.items()})
         turn = _mover(place, rows.num_higher)
         return replace(rows, unpack=lambda block: turn(rows.unpack(block)))

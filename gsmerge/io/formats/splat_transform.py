@@ -6,6 +6,8 @@ import os
 import shlex
 import shutil
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -59,6 +61,15 @@ def run_program(*words: object) -> None:
         raise GsmergeError(f"{program}: {problem}: {' '.join(reason.split())[:MAX_OUTPUT]}")
 
 
+@contextmanager
+def name_file(path: Path) -> Iterator[None]:
+    """Let errors about what the program wrote, which is temporary, name the file that it was made of or for."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(path, f"{PROGRAM} wrote a file that cannot be used: {error.problem}") from error
+
+
 def read_rows(path: Path) -> StoredRows:
     """Read the finest Gaussians of a file that the program reads.
 
@@ -76,9 +87,10 @@ def read_rows(path: Path) -> StoredRows:
             raise SceneError(path, problem, f"convert it with: {command}") from error
         except GsmergeError as error:
             raise SceneError(path, f"cannot be read by {error}") from error
-        stored = ply.read_rows(made)
-        with ply.open_rows(made, stored.rows) as read:
-            rows = read(slice(None))
+        with name_file(path):
+            stored = ply.read_rows(made)
+            with ply.open_rows(made, stored.rows) as read:
+                rows = read(slice(None))
     alone = path.suffix.lower() == ".ksplat"
     others = [] if alone else [file for file in path.parent.iterdir() if file.is_file() and file != path]
     return replace(

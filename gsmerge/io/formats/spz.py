@@ -89,7 +89,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # others are refused, whatever their size
             file.seek(0)
             packed = file.read()
-    rows, header, extensions, sizes = unpack_rows(path, packed)
+    rows, header, extensions, sizes = unpack_rows(ReadBudget(path, len(packed)), packed)
     axes = _stored_axes(path, extensions) if header.flags & EXTENSIONS_FLAG else PLY_AXES
     turn = arrays.turner(_axes_turn(axes), header.num_higher)
     turned = replace(rows, unpack=lambda block: turn(rows.unpack(block)))
@@ -98,10 +98,15 @@ def read_rows(path: Path) -> arrays.StoredRows:
     return stored if axes == PLY_AXES else replace(stored, notes=notes)
 
 
-def unpack_rows(path: Path, packed: bytes) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
-    """Return the Gaussians in their own axes, header, extensions and bytes by attribute; SceneError if damaged."""
+def unpack_rows(
+    budget: ReadBudget, packed: bytes, count_before: int = 0
+) -> tuple[arrays.Packed, Header, bytes, dict[str, int]]:
+    """Return the Gaussians in their own axes, header, extensions and bytes by attribute; SceneError if damaged.
+
+    ``budget``: of the file that they are in, which has ``count_before`` Gaussians in earlier parts.
+    """
     read = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions = read(path, packed)
+    header, parts, extensions = read(budget, packed, count_before)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     rows = arrays.Packed(
         header.count, header.num_higher, lambda block: _unpack([part[block] for part in parts], header)
@@ -132,8 +137,9 @@ def _axes_turn(axes: str) -> np.ndarray:
     return turn * (1, -1, -1) if axes in _REVERSED else turn
 
 
-def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
-    """Read the header, and check it against the number of bytes of the file."""
+def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int], count_before: int) -> Header:
+    """Read the header, and check all Gaussians so far against the number of bytes of the file."""
+    path = budget.path
     if len(start) < HEADER.size:
         raise SceneError(path, FOUND_EARLY_END, AGAIN)
     magic, *numbers = HEADER.unpack(start)
@@ -143,14 +149,15 @@ def _read_header(path: Path, packed: bytes, start: bytes, versions: Sequence[int
         raise SceneError(path, f"expected .spz of version 1 to 4 and SH degree 0 to {MAX_READ_DEGREE}, found {found}")
     if header.count == 0:
         raise SceneError(path, f"expected Gaussians in {len(packed)} bytes, found none promised")
-    arrays.check_count(ReadBudget(path, len(packed)), header.count, header.num_higher, sum(header.widths))
+    arrays.check_count(budget, count_before + header.count, header.num_higher, sum(header.widths))
     return header
 
 
-def _gzip_parts(path: Path, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
+def _gzip_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
+    path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
-        header = _read_header(path, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
+        header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3), count_before)
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
         extended = header.flags & EXTENSIONS_FLAG
         extensions = stream.decompress(stream.unconsumed_tail, _MAX_EXTENSIONS) if extended else b""
@@ -175,7 +182,7 @@ def problem_at_end(path: Path) -> str | None:
         return None
     try:
         with gzip.open(path) as file:
-            header = _read_header(path, packed, file.read(HEADER.size), (1, 2, 3))
+            header = _read_header(ReadBudget(path, len(packed)), packed, file.read(HEADER.size), (1, 2, 3), 0)
             size = sum(iter(lambda: len(file.read(1 << 20)), 0))
     except (OSError, EOFError, zlib.error) as error:
         return f"its gzip stream is damaged or cut at the end ({error})"
@@ -185,11 +192,11 @@ def problem_at_end(path: Path) -> str | None:
     return f"{extra:,} bytes more than {header.count:,} Gaussians of version {header.version} have"
 
 
-def _zstandard_parts(path: Path, packed: bytes) -> tuple[Header, list[np.ndarray], bytes]:
+def _zstandard_parts(budget: ReadBudget, packed: bytes, count_before: int) -> tuple[Header, list[np.ndarray], bytes]:
     """Read header, parts and extensions of version 4."""
     import zstandard  # few files need it
 
-    header = _read_header(path, packed, packed[: HEADER.size], (4,))
+    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), count_before)
     sizes = [header.count * width for width in header.widths if width]
     try:
         (at,) = TABLE_START.unpack_from(packed, HEADER.size)

@@ -25,7 +25,7 @@ from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
 from gsmerge.io.formats.read import GaussianFile, convert_files
-from gsmerge.io.formats.splat_transform import run_program
+from gsmerge.io.formats.splat_transform import name_file, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.types import Gaussians, StrPath
@@ -84,10 +84,12 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             write_ply(ply, gaussians, sh_degree=min(gaussians.sh_degree, MAX_DEGREE), comments=contents.comments)
         made = Path(folder) / "made" / INDEX
         run_program(*words, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", ITERATIONS, made)
-        _name_by_content(made)
+        with name_file(path):
+            _name_by_content(made)
+            levels = read_index(made).levels
         index.write_bytes(made.read_bytes())
         written = dict[Path, list[Path]]()
-        for chunks in read_index(made).levels:
+        for chunks in levels:
             files = [file for chunk in chunks for file in sorted(chunk.parent.iterdir())]
             places = [path.parent / file.relative_to(made.parent) for file in files]
             name = next(place for place in places if place.name == sog.META) if written else path

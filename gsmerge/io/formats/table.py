@@ -88,6 +88,10 @@ class Format:
     count: Callable[[int, int], int] | None = None  # bytes and degree -> Gaussians; None where their content matters
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int] | None = None  # None: those that ``encode`` returns
 
+    def __post_init__(self) -> None:
+        if self.each and self.max_degree >= 0 and not (self.encode or self.count or self.measure):
+            raise ValueError(f"{self.ending}: expected encode, count or measure beside each, to count bytes")
+
     def names(self, path: StrPath) -> bool:
         """Return whether the name of a path has the ending of this format."""
         name = Path(path).name
