@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -119,8 +120,12 @@ def some_views(layout: Layout) -> list[int]:
 
 def view_orders(names: Sequence[str]) -> list[tuple[int, ...]]:
     """List the possible orders of a file's views: the order of the cameras, and the order of the names."""
-    views = range(len(names))
-    return [tuple(views), tuple(sorted(views, key=lambda view: natural_key(names[view])))]
+    return [tuple(range(len(names))), _order_names(tuple(names))]
+
+
+@lru_cache(maxsize=4)  # every layout of a file is tried in them
+def _order_names(names: tuple[str, ...]) -> tuple[int, ...]:
+    return tuple(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
 
 
 def every_nth(views: int) -> list[tuple[int, ...]]:

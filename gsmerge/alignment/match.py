@@ -41,6 +41,7 @@ from gsmerge.types import Cameras
 
 # pixels from which no camera shows the rows of a layout: times the limit, and times the distance of the nearest layout
 _SHOWN_LIMITS, _AS_SHOWN = 2.0, 3.0
+_MOST_STEPS = 64  # selections of every n-th camera that are tried, which leaves out some only of hundreds of cameras
 _SHOWN_GAUSSIANS = 200  # Gaussians of a view that it is judged by
 
 GridLayout = tuple[Grid, Layout]  # a layout of the rows in a grid of its size
@@ -145,7 +146,8 @@ def _fit_views(source: RowSource, grid: Grid, layout: Layout) -> list[GridReadin
         labelled = replace(layout, views=tuple(views[parts].tolist()))
         return GridReading(grid, read_views(inputs, labelled, replace(pairs, views=views[pairs.views]), own))
 
-    some = [ids for ids in (*every_nth(len(grid.cameras)), tuple(range(count))) if len(ids) == count]
+    some = [ids for ids in every_nth(len(grid.cameras)) if len(ids) == count]
+    some = [*some[:: max(1, -(-len(some) // _MOST_STEPS))], tuple(range(count))]
     orders = dict.fromkeys(tuple(order[view] for view in ids) for ids in some for order in source.orders(grid))
     candidates = [read_as(order) for order in orders]
     nearest = _nearest_cameras(find_own(next(iter(orders))), count, grid.cameras)

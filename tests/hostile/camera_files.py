@@ -72,6 +72,12 @@ def without_images(change: Callable[[Any], None]) -> Spoil:
     return spoil
 
 
+def many_frames(data: Any) -> None:
+    """Frames that say the same again and again."""
+    frames = data["frames"] if isinstance(data, dict) else data
+    frames[:] = (frames * 9998)[:9998]
+
+
 def _raw_json(name: str) -> dict[str, Case]:
     frame = b'{"frames": [{"transform_matrix": '
     contents = {
@@ -80,6 +86,7 @@ def _raw_json(name: str) -> dict[str, Case]:
     }  # fmt: skip
     cases = {f"{name}: {word}": Case(write(name, data), named=name) for word, data in contents.items()}
     cases[f"{name}: 4 GB of zeros"] = Case(lambda folder: sparse(folder / name, 2**32), named=name)
+    cases[f"{name}: 9,998 frames of the same views"] = Case(edit_json(name, many_frames), EITHER)
     cases[f"{name}: 20,000 frames"] = Case(edit_json(name, multiplied(20_000 // 3)), named=name)
     cases[f"{name}: 300 frames"] = Case(edit_json(name, multiplied(100)), codes=(0, 3))
     return cases

@@ -180,11 +180,50 @@ def _pose_lists() -> dict[str, Case]:
         "a line of 1 MB": lambda _: ["1 " * 2**19], "50,000 lines": lambda x: [x[1]] * 50_000,
         "a zero byte": lambda x: [x[0] + " \0", *x[1:]],
         "4,000,000 lines of one number": lambda x: [x[0], "1\n" * 4_000_000],
+        "15,000,000 blank lines": lambda x: [*x, " \n" * 15_000_000],
+        "15,000,000 comments": lambda x: [*x, "#\n" * 15_000_000],
     }  # fmt: skip
-    cases = {f"pose list with {word}": Case(spoil(change)) for word, change in changes.items()}
+    cases = {f"pose list with {word}": Case(spoil(change), EITHER) for word, change in changes.items()}
     return cases | {"pose list as it is": Case(spoil(lambda x: x), READ)}
 
 
-GROUPS = (_other_json, _binary, _text, _pose_lists)
+def _metashape() -> dict[str, Case]:
+    """XML whose parts a parser copies, or goes through again and again."""
+    pose = "<transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform>"
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    sensor = f'{size}<calibration class="adjusted"><f>38.755</f></calibration>'
+    one = f'<camera sensor_id="0" label="view_000">{pose}</camera>'
+
+    def chunk(sensors: str, cameras: str, more: str = "") -> str:
+        return f"<document><chunk><sensors>{sensors}</sensors><cameras>{cameras}</cameras>{more}</chunk></document>"
+
+    many, attributes = 2000, " ".join(f"a{i}=''" for i in range(1_000_000))
+    usual, address = f'<sensor id="0">{sensor}</sensor>', "u" * 1_000_000
+    contents = {
+        "nested sensors": chunk(
+            "".join(f'<sensor id="{i}">{sensor}' for i in range(many)) + "<a/>" * 150_000 + "</sensor>" * many,
+            "".join(f'<camera sensor_id="{i}">{pose}</camera>' for i in range(many)),
+        ),
+        "a million attributes": chunk(usual, one, f"<x {attributes}/>"),
+        "a namespace of 1 MB": chunk(usual, one, f"<x xmlns:a='{address}'>{'<a:b/>' * 100_000}</x>"),
+        "names in a namespace of 1 MB": chunk(
+            usual, one, f"<x xmlns:a='{address}'>{''.join(f'<a:b{i}/>' for i in range(3000))}</x>"
+        ),
+        "depth": chunk(usual, one, "<a>" * 400_000 + "</a>" * 400_000),
+        "a component named by a quote": chunk(usual, one.replace("label", 'component_id="a\'b" label')),
+        "an entity": "<!DOCTYPE x [<!ENTITY a 'aaaa'>]>" + chunk(usual, one, "&a;"),
+    }
+
+    def spoil(content: str) -> Spoil:
+        def both(folder: Path) -> None:
+            without_transforms(folder)
+            (folder / "cameras.xml").write_text(content)
+
+        return both
+
+    return {f"Metashape with {word}": Case(spoil(content), EITHER) for word, content in contents.items()}
+
+
+GROUPS = (_other_json, _binary, _text, _pose_lists, _metashape)
 CASES = {f"cameras: {name}": case for group in GROUPS for name, case in group().items()}
 CASES["cameras: input_frame_idx.txt with 3,000,000 numbers"] = Case(many_numbers, EITHER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 from collections.abc import Callable, Sequence
@@ -11,6 +12,8 @@ from typing import Any
 from .case import EITHER, READ, Case, Spoil
 
 NAME = "KHR_gaussian_splatting"
+SPZ = f"{NAME}_compression_spz_2"
+PARTS, PART_GAUSSIANS = 40, 600_000  # parts that each keep to what a file may take, and together do not
 DEEP = 100_000  # brackets, or nodes in one another
 
 
@@ -86,6 +89,31 @@ def shared(parsed: dict[str, Any]) -> None:
     parsed["meshes"][0]["primitives"][0]["attributes"] |= dict.fromkeys(names, 0)
 
 
+def many_spz(folder: Path) -> Sequence[object]:
+    """A ``.glb`` of many small ``.spz``, each of which unpacks to 12 MB."""
+    packed = gzip.compress(
+        struct.pack("<4sIIBBBB", b"NGSP", 3, PART_GAUSSIANS, 0, 12, 0, 0) + bytes(PART_GAUSSIANS * 20)
+    )
+    packed += b"\0" * (-len(packed) % 4)
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitives = [
+        {"attributes": {}, "mode": 0, "extensions": {NAME: splats | {"extensions": {SPZ: {"bufferView": part}}}}}
+        for part in range(PARTS)
+    ]
+    size = len(packed)
+    parsed = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "extensionsUsed": [NAME],
+        "nodes": [{"mesh": 0}], "meshes": [{"primitives": primitives}], "buffers": [{"byteLength": PARTS * size}],
+        "bufferViews": [{"buffer": 0, "byteOffset": part * size, "byteLength": size} for part in range(PARTS)],
+    }  # fmt: skip
+    data = json.dumps(parsed).encode()
+    data += b" " * (-len(data) % 4)
+    rest = struct.pack("<I4s", len(data), b"JSON") + data + struct.pack("<I4s", PARTS * size, b"BIN\0") + packed * PARTS
+    path = folder / "scene.glb"
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(rest)) + rest)
+    return [path]
+
+
 def _cases() -> dict[str, Case]:
     contents = {"brackets": b"[" * DEEP, "objects": b'{"a":' * DEEP, "a number": b"1e999"}
     cases = {f"JSON with {name}": Case(text(lambda _, data=data: data)) for name, data in contents.items()}
@@ -97,6 +125,7 @@ def _cases() -> dict[str, Case]:
     return cases | {
         "another length in the header": Case(head(8, "<I", 2**32 - 1)),
         "the same bytes": Case(text(lambda data: data), READ),
+        "forty .spz in one": Case(many_spz),
         "nodes in one another": Case(document(chain)),
         "a node in itself": Case(placed("nodes", 0, "children", value=[0])),
         "copies without end": Case(document(copies)),

@@ -91,6 +91,18 @@ def cut(share: float) -> Spoil:
     return lambda path: path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
 
 
+def with_metadata(metadata: object) -> Spoil:
+    """Another value in the place of the texts by name of a safetensors file."""
+
+    def spoil(path: Path) -> None:
+        data = path.read_bytes()
+        size = int.from_bytes(data[:8], "little")
+        head = json.dumps({**json.loads(data[8 : 8 + size]), "__metadata__": metadata}).encode()
+        path.write_bytes(len(head).to_bytes(8, "little") + head + data[8 + size :])
+
+    return spoil
+
+
 # What is wrong with any file
 UNREADABLE: dict[str, Spoil] = {
     "missing": Path.unlink,
@@ -106,6 +118,10 @@ UNREADABLE: dict[str, Spoil] = {
     "no JSON": with_text("{"),
     "a list": with_text("[]"),
     "deep JSON": with_text("[" * 100_000),
+    **{
+        f"metadata as {json.dumps(value)}": with_metadata(value)
+        for value in ([1, "a"], "text", 7, True, {"gsmerge": 1}, {"gsmerge": ["a"]}, {"gsmerge": {"a": "b"}})
+    },
 }
 # What is wrong with the header of a state
 GSM_HEADERS: dict[str, Spoil] = {

@@ -119,7 +119,10 @@ def one_photo(folder: Path) -> None:
 
     def change(data: dict[str, Any]) -> None:
         frames = data["frames"] * (300 // VIEWS)
-        data["frames"] = [{**frame, "file_path": "p.webp"} for frame in frames]
+        data["frames"] = [  # each in a place of its own
+            {"file_path": "p.webp", "transform_matrix": [[*row[:3], row[3] + 1e-6 * i] for row in pose]}
+            for i, pose in enumerate(frame["transform_matrix"] for frame in frames)
+        ]
         for key in ("w", "h"):
             del data[key]
 
