@@ -46,6 +46,7 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
+        problem = " ".join(problem.split())  # libraries' reasons may have several lines
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 

@@ -13,6 +13,7 @@ from gsmerge.geometry import motion_vectors
 from gsmerge.kernels.matrices import invert, matmul
 
 C2W = invert(scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64))
+MOTIONS = motion_vectors(np.tile(np.eye(4), (VIEWS, 1, 1)), invert(C2W))
 K = np.array([[40.0, 0, WIDTH / 2 + 1], [0, 42, HEIGHT / 2 - 2], [0, 0, 1]])
 SIDE = max(WIDTH, HEIGHT)
 SIZE = {"width": WIDTH, "height": HEIGHT}
@@ -35,7 +36,7 @@ def write_opensfm(folder: Path, **lens: object) -> Path:
     }  # fmt: skip
     shots = {
         f"{i}.png": {"rotation": motion[:3].tolist(), "translation": pose[:3, 3].tolist(), "camera": "v2"}
-        for i, (pose, motion) in enumerate(zip(invert(C2W), motion_vectors(invert(C2W)), strict=True))
+        for i, (pose, motion) in enumerate(zip(invert(C2W), MOTIONS, strict=True))
     }
     parts = [{"cameras": {}, "shots": {}}, {"cameras": {"v2": camera}, "shots": shots}]
     return save_json(folder / "reconstruction.json", parts)

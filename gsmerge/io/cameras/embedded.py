@@ -30,7 +30,8 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     for element in (data[name] for name in present):
         if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
             return None
-    numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
+    with np.errstate(all="ignore"):  # of signalling NaN, which are refused with the cameras
+        numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
     extrinsic, intrinsic = numbers["extrinsic"], numbers["intrinsic"]
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions: focal lengths and size
         numbers["image_size"] = intrinsic[2:]

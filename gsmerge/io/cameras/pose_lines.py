@@ -59,7 +59,8 @@ def read_poses(source: CameraSource) -> StoredCameras:
     place = next((file for file in beside if file.exists()), None)
     Ks = [] if place is None or columns == _RE10K else _read_intrinsics(place)
     if columns == _TUM:
-        names, turns = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
+        with np.errstate(all="ignore"):  # what is not finite is refused with the cameras
+            names, turns = [f"{row[0]:.6f}" for row in rows], quat_to_rotmat(np.array(rows)[:, [7, 4, 5, 6]])
         poses = [np.column_stack([turn, row[1:4]]) for turn, row in zip(turns, rows, strict=True)]
     elif columns == _RE10K:
         names, Ks = [f"{row[0]:.0f}" for row in rows], [make_pinhole(*row[1:5]) for row in rows]

@@ -129,7 +129,7 @@ def _damage(path: Path) -> Iterator[None]:
         raise
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, EOFError) as error:
         problem = f"expected meta.json and textures of .sog version {VERSION}, found others ({error})"
-        raise SceneError(path, " ".join(problem.split()), "export it again") from error
+        raise SceneError(path, problem, "export it again") from error
     except zlib.error as error:
         raise SceneError(path, f"expected a readable .sog file, found a damaged one ({error})") from error
 

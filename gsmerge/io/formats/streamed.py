@@ -131,7 +131,7 @@ def read_index(path: Path) -> StreamedIndex:
         return _check_index(path, document)
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         problem = f"expected the index of a Streamed SOG, found another file ({error})"
-        raise SceneError(path, " ".join(problem.split()), "export it again") from error
+        raise SceneError(path, problem, "export it again") from error
 
 
 def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
