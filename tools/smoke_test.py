@@ -1,6 +1,6 @@
 """Installs a wheel or source archive in a fresh environment and does the README's main job with it.
 
-python tools/smoke_test.py dist/gsmerge-0.3.0-py3-none-manylinux_2_17_x86_64.whl -c constraints.txt
+python tools/smoke_test.py dist/gsmerge-0.4.0-py3-none-manylinux_2_17_x86_64.whl -c constraints.txt
 
 Arguments after the file are passed to pip install.
 """
