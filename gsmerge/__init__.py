@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from gsmerge.types import Scene as Scene
     from gsmerge.types import Views as Views
 
-__version__ = "0.4.0"
+__version__ = "0.5.0.dev0"
 
 _PUBLIC = {
     "compaction.compact": ("compact",),
