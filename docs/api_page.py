@@ -26,7 +26,7 @@ TOPICS = {
     ),
     "Views in batches, results of any size": ("Compactor",),
     "Data": ("Scene", "Gaussians", "Cameras", "Views"),
-    "Errors": ("GsmergeError", "SceneError"),
+    "Errors": ("DoubtWarning", "GsmergeError", "SceneError"),
 }
 ELSEWHERE = {"CompactOptions": "settings.md", "CompactReport": "report.md"}  # pages that describe the fields
 HEAD = """# Python API

@@ -6,6 +6,7 @@ python docs/generate_reference.py --check  # name them, exit code 1 if there are
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,11 +14,13 @@ from typing import Any, get_args
 
 import typer.main
 from api_page import api_page
+from keywords_module import keywords_module
 
 from gsmerge.cli.parameters import METAVARS
 
 REFERENCE = Path(__file__).parent / "reference"
 COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
+KEYWORDS = "../../gsmerge/settings/keywords.py"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # whose prose is written by hand, and whose tables are made
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 KINDS = {int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH"}
@@ -37,7 +40,7 @@ def main() -> int:
     """Write the pages, or name those that are stale."""
     stale = {name: text for name, text in make_pages().items() if not _same(REFERENCE / name, text)}
     for name, text in stale.items():
-        print(f"docs/reference/{name}")
+        print(os.path.normpath(f"docs/reference/{name}"))
         if "--check" not in sys.argv[1:]:
             (REFERENCE / name).write_text(text, encoding="utf-8")
     return 1 if stale and "--check" in sys.argv[1:] else 0
@@ -53,6 +56,7 @@ def make_pages() -> dict[str, str]:
         COMMANDS: _commands_page(),
         SETTINGS: _settings_page(),
         API: f"{NOTICE}\n\n{api_page()}",
+        KEYWORDS: keywords_module(),
         EXPORTERS: _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8")),
         FORMATS: _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8")),
     }

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gsmerge.compaction.report import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
+    from gsmerge.errors import DoubtWarning as DoubtWarning
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
     from gsmerge.io import read_cameras as read_cameras
@@ -54,7 +55,7 @@ _PUBLIC = {
     "compaction.report": ("CompactReport",),
     "compaction.result": ("CompactResult",),
     "compaction.tensors": ("compact_tensors",),
-    "errors": ("GsmergeError", "SceneError"),
+    "errors": ("DoubtWarning", "GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.streamed": ("write_levels",),
     "io.formats.write": ("write_gaussians", "write_ply"),
@@ -84,4 +85,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, "integrations"})

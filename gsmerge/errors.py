@@ -55,6 +55,15 @@ class SceneError(GsmergeError):
         return type(self), (self.path, self.problem, self.remedy)
 
 
+class DoubtWarning(UserWarning):
+    """What makes a result doubtful: it is worse than its input, misses its target, or views contradict each other.
+
+    Example:
+        >>> import warnings
+        >>> warnings.simplefilter("error", gsmerge.DoubtWarning)  # a doubt is an error from now on
+    """
+
+
 class TargetError(GsmergeError):
     """A quality or size target that was asked for could not be met."""
 

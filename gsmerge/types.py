@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsmerge.errors import refuse_without_torch
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 SceneT = TypeVar("SceneT", bound="Scene")
 StrPath = str | os.PathLike[str]
-Array = Any  # a NumPy array, or a torch tensor where a docstring allows one
+Array = NDArray[Any]  # or a torch tensor where a docstring allows one, which type checkers do not see
 
 SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0: rgb = 0.5 + SH_C0 * sh0
 
@@ -56,12 +57,12 @@ def to_float32(values: np.ndarray) -> np.ndarray:
         return values.astype(np.float32)
 
 
-def like(values: np.ndarray, template: Array) -> Array:
+def like(values: np.ndarray, template: Array) -> Any:
     """Convert ``values`` to the type of ``template``: a NumPy array, or a tensor on the same device."""
     return as_tensor(values, template.device) if hasattr(template, "detach") else values
 
 
-def concat_rows(parts: Sequence[Array], axis: int = 0) -> Array:
+def concat_rows(parts: Sequence[Array], axis: int = 0) -> Any:
     """Concatenate arrays, or tensors, along ``axis``."""
     if all(isinstance(part, np.ndarray) for part in parts):
         return np.concatenate(parts, axis)
@@ -137,7 +138,8 @@ class Gaussians:
 
     def to(self, device: torch.device | str) -> Gaussians:
         """Return the same Gaussians as tensors on a device; gradients pass."""
-        return Gaussians(*(as_tensor(getattr(self, f.name), device) for f in fields(self)))
+        tensors: list[Any] = [as_tensor(getattr(self, f.name), device) for f in fields(self)]
+        return Gaussians(*tensors)
 
     def numpy(self) -> Gaussians:
         """Return the same Gaussians as NumPy arrays."""
@@ -194,7 +196,8 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """Return the same cameras as tensors on a device; gradients pass."""
-        return replace(self, viewmats=as_tensor(self.viewmats, device), Ks=as_tensor(self.Ks, device))
+        tensors: dict[str, Any] = {name: as_tensor(getattr(self, name), device) for name in ("viewmats", "Ks")}
+        return replace(self, **tensors)
 
     def numpy(self) -> Cameras:
         """Return the same cameras as NumPy arrays."""

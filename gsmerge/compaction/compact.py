@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from os import PathLike
-from typing import Any
-from weakref import ref
+from typing import TYPE_CHECKING
+from weakref import ReferenceType, ref
+
+import numpy as np
 
 from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import add_target, build_left_out, level_counts, meet, search_count
-from gsmerge.errors import UsageError
+from gsmerge.errors import DoubtWarning, UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
@@ -28,11 +31,20 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians, Scene, StrPath
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import CompactKeywords
+
 MAX_BUILDS, SURPLUS = 3, 1.05  # tries to meet a count after clean-up; more than it by so much at first
 
 
 def compact(
-    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
+    scene: Scene | StrPath,
+    options: CompactOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    **settings: Unpack[CompactKeywords],
 ) -> CompactResult:
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
@@ -45,6 +57,8 @@ def compact(
     Raises:
         SceneError: If a path cannot be read.
         ValueError: If a setting is unknown or out of range.
+
+    Doubts are warned of as :class:`gsmerge.DoubtWarning`, notes go to the logger ``gsmerge``.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget="5%")
@@ -63,10 +77,21 @@ def compact(
 
             blocks, covisibility = cut_views(scene, options, choices.blocks)
             if len(blocks) > 1:
-                return replace(compact_in_blocks(scene, options, choices, blocks, covisibility), scene=given)
+                return _finish(compact_in_blocks(scene, options, choices, blocks, covisibility), scene, given)
         method = choose_method(options, scene)  # ours, that for scenes without cameras, or a baseline
         prepared = method.prepare(scene.numpy(), options.prepare)  # facts: frame, photos, poses, unseen
-        return replace(compact_prepared(prepared, method, options).to(scene.gaussians.device), scene=given)
+        return _finish(compact_prepared(prepared, method, options).to(scene.gaussians.device), scene, given)
+
+
+def _finish(result: CompactResult, scene: Scene, given: StrPath | ReferenceType[Scene]) -> CompactResult:
+    """Return a result with the precision of the scene's means, and warn of what makes it doubtful."""
+    report, agreement = result.report, result.report.choices.get("agreement") or {}
+    doubts = [report.worse, report.unmet, *(text for text in report.notes if text == agreement.get("doubt"))]
+    for text in dict.fromkeys(filter(None, doubts)):
+        warnings.warn(text, DoubtWarning, stacklevel=4)
+    if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
+        result = result.to_single()
+    return replace(result, scene=given, names=scene.names)
 
 
 def compact_prepared(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.placement import add_views, name_photos, named_cameras, other_cameras
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import DoubtWarning, SceneError, UsageError
 from gsmerge.facts.compare_photos import STRAY_PHOTOS
 from gsmerge.io import atomic_outputs, output_format
 from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
@@ -83,7 +84,9 @@ def compact_files(
         if shared is not None and not outputs.overwrite and named_cameras(shared, names) is None:
             raise other_cameras(shared)  # before the work
         read = perf_counter()
-        result = compact(load.scene, settings, progress=progress)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtWarning)  # the report has them
+            result = compact(load.scene, settings, progress=progress)
         if len(result.gaussians) == 0:
             raise nothing_left(files.ply)
         result = _padded(result) if outputs.full_columns else result
@@ -130,7 +133,8 @@ def shows_nothing(scene: Scene) -> bool:
     if covered > COVERED * num_views * float(np.square(high - low).sum()):
         return False
     settings = CompactOptions().with_settings({"effort": "draft", "fit": "none"})
-    with record_part(silent=True):
+    with record_part(silent=True), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DoubtWarning)
         return len(compact(scene, settings).gaussians) == 0
 
 

@@ -6,20 +6,26 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry import IDENTITY, Similarity, normalize, turn_by
-from gsmerge.io.atomic import AddOutput
+from gsmerge.io import output_format
+from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.cameras.viewer_cameras import viewer_cameras
-from gsmerge.io.formats.table import NamedPhotos
+from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
+from gsmerge.io.formats.arrays import RESULT_COMMENT, new_views_comment
+from gsmerge.io.formats.table import FOLDERS, Contents, NamedPhotos
 from gsmerge.io.image_names import match_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
 from gsmerge.types import Cameras, Gaussians
+
+if TYPE_CHECKING:
+    from gsmerge.compaction.result import CompactResult
 
 NUM_FULL = 15  # harmonics above degree 0 up to degree 3
 SAME = 1e-5  # relative difference up to which cameras are the same; pixels by a hundred times as much
@@ -114,3 +120,26 @@ def name_photos(photos: Path | None, names: Sequence[str]) -> NamedPhotos:
         with suppress(SceneError):
             return [(file.relative_to(photos).as_posix(), file) for file in match_images(photos, names)]
     return [(name.removeprefix("./").removeprefix("images/"), None) for name in names]  # as a transforms.json has them
+
+
+def save_result(result: CompactResult, path: Path, *, overwrite: bool) -> Path:
+    """Write a result as :meth:`gsmerge.CompactResult.save`; return the path of its main file."""
+    row = FOLDERS.get(path.name)
+    out = path if row is None else path / row.place / row.ending
+    chosen = output_format(out, levels=True, cameras=True)
+    cameras, levels = result.cameras.numpy(), [result, *result.coarser]
+    names = result.names or tuple(f"view {view}" for view in range(len(cameras)))
+    if not len(cameras) and chosen.cameras == "needed":
+        raise UsageError(f"{out}: expected a scene with cameras, got none")
+    new = result.report.new_views
+    comments = [RESULT_COMMENT, *([] if new is None else [new_views_comment(new)])]
+    contents = Contents(
+        [level.gaussians.numpy() for level in (levels if chosen.levels else levels[:1])], comments, cameras,
+        name_photos(None, names), out.stem,
+    )  # fmt: skip
+    with atomic_outputs(overwrite=overwrite) as add:
+        chosen.write(add, out, add(out), contents)
+        if len(cameras) and not chosen.cameras:
+            add_views(add, viewer_cameras_path(out), cameras, names, overwrite=overwrite)
+    chosen.finish(out)
+    return out

@@ -98,6 +98,10 @@ class CompactReport:
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain JSON types, by the names of its fields."""
+        return asdict(self)
+
     def _repr_html_(self) -> str:
         notes = [("note", text) for text in self.notes]
         return html_table([*self._facts(), *notes])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import ReferenceType
 
@@ -45,6 +46,7 @@ class CompactResult:
         cameras: The given views as the Gaussians were made from them, in the same frame: moved where their poses were
             wrong, see ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Further levels of detail, each with a quarter of the Gaussians of the one before.
+        names: Of the views.
         scene: The path of the scene that was given, or a reference to it that does not keep it in memory.
 
     Example:
@@ -57,10 +59,37 @@ class CompactResult:
     report: CompactReport
     cameras: Cameras
     coarser: tuple[CompactResult, ...] = ()
+    names: tuple[str, ...] = ()
     scene: StrPath | ReferenceType[Scene] | None = field(default=None, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"scene": self.scene if isinstance(self.scene, str | PathLike) else None}
+
+    def save(self, path: StrPath, *, overwrite: bool = False) -> Path:
+        """Write the result with its levels and cameras, as ``-o`` of the command does: all files, or none.
+
+        The name chooses the format: ``.ply``, ``.sog``, ``.spz``, ``.splat``, ``.glb``, ``.usdz``, a page ``.html``,
+        levels that stream ``lod-meta.json``, or a folder ``colmap``. Other formats have ``NAME.cameras.json`` beside.
+
+        Args:
+            path: The file, or a folder named ``colmap``.
+            overwrite: Replace existing files.
+
+        Returns:
+            The path of the main file.
+
+        Raises:
+            UsageError: If the name has another ending, or the format needs cameras and there are none.
+            SceneError: If a file exists or cannot be written.
+
+        Example:
+            >>> result = gsmerge.compact("demo", effort="draft", budget=300)
+            >>> result.save("demo/small.sog", overwrite=True).name
+            'small.sog'
+        """
+        from gsmerge.compaction.placement import save_result
+
+        return save_result(self, Path(path), overwrite=overwrite)
 
     def show(self, scene: Scene | StrPath | None = None) -> Page:
         """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
@@ -86,10 +115,20 @@ class CompactResult:
         report = self.report._repr_html_()
         if len(self.cameras) == 0:
             return report
-        image = render(self.gaussians.numpy(), self.cameras.numpy()[[len(self.cameras) // 2]]).images[0]
         from gsmerge.measure.preview import picture_html, to_picture
 
-        return picture_html(to_picture(image), "the middle view") + report
+        middle = self.cameras.numpy()[[len(self.cameras) // 2]]
+        given = self.scene() if isinstance(self.scene, ReferenceType) else None  # a path is not read again for this
+        drawn = (
+            {"after": self.gaussians} if given is None else {"before": given.file_gaussians, "after": self.gaussians}
+        )
+        return (
+            "".join(
+                picture_html(to_picture(render(each.numpy(), middle).images[0]), f"the middle view {name}")
+                for name, each in drawn.items()
+            )
+            + report
+        )
 
     def to_single(self) -> CompactResult:
         """Return the same result, of arrays, with means as float32 numbers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,6 +38,11 @@ from gsmerge.io.formats.read import clear_invalid
 from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.types import NO_CAMERAS, Array, Cameras, Gaussians, Scene, as_array, grid_ids, to_float32
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import CompactKeywords
 
 ORDERS = ("view-major", "none")
 _TOLERANCE = 1e-3  # by which opacities and images may leave [0, 1]
@@ -74,7 +79,7 @@ def compact_tensors(
     order: str = "view-major",
     check_rotations: bool = True,
     progress: Progress | None = None,
-    **settings: Any,
+    **settings: Unpack[CompactKeywords],
 ) -> CompactResult:
     """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` does a scene.
 

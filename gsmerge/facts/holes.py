@@ -7,7 +7,7 @@ the view's farthest surface: the depth at which the pictures of the nearest othe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import cv2
@@ -53,7 +53,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     """
     bare = scene.valid & (scene.gaussians.opacities.reshape(shown.shape) > BARE) if scene.aligned else ~shown
     bare, free = ~bare, shown & ~scene.valid if scene.aligned else shown
-    cut = [] if everywhere or not scene.aligned else bare
+    cut: Iterable[np.ndarray] = [] if everywhere or not scene.aligned else bare
     if not (free.any() or any(large_parts(view).any() for view in cut if view.any())):
         return scene
     holes, empty, parts = np.zeros_like(free), np.zeros_like(free), dict[int, Gaussians]()

@@ -199,7 +199,8 @@ def evaluate(
 
     Raises:
         UsageError: If the scene has no views, or a result is called "input".
-        GsmergeError: If LPIPS is asked for and its weights are not installed.
+        GsmergeError: If options ask for LPIPS and its weights are not installed; by default it is then left out, with a
+            note.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -209,7 +210,8 @@ def evaluate(
         >>> evaluation.num_views
         {'context': 5}
     """
-    options, cameras = options or EvaluateOptions(), cameras or {}
+    cameras = cameras or {}
+    options, lacking = _without_missing(EvaluateOptions()) if options is None else (options, ())
     if INPUT in results:
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
@@ -245,8 +247,17 @@ def evaluate(
         for name, gaussians in named.items()
     ]
     counts = {name: len(split.scored) for name, split in splits.items()}
-    notes = tuple(_notes(splits, scores, mended=mended))
+    notes = (*lacking, *_notes(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
+
+
+def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
+    """Leave out the LPIPS networks that are not installed; with a note if none is."""
+    from gsmerge.measure.lpips import INSTALL, lpips_available
+
+    nets = tuple(net for net in options.lpips if lpips_available(net))
+    note = f"LPIPS is left out, its weights are not installed: {INSTALL}"
+    return replace(options, lpips=nets), () if nets else (note,)
 
 
 def _name_reference(splits: Mapping[str, _Split]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -92,7 +92,7 @@ class NetworkContext(Corrector):
         sizes, seeds = np.diff(np.append(cuts, len(order))), point_seeds(as_array(pooled.means), self.seed)
         from_means, means = as_array(parts.means), as_array(pooled.means)
 
-        def run(rows: np.ndarray, width: int) -> Array:
+        def run(rows: np.ndarray, width: int) -> Any:
             positions, owners = group_rows(cuts[rows], sizes[rows])
             keys = ((from_means[order[positions]] - means[rows[owners]]) ** 2).sum(1)
             sample, mask = sample_members(keys, sizes[rows], width, seeds[rows])
@@ -115,7 +115,7 @@ class NetworkContext(Corrector):
         count, width = len(features), neighbors.shape[1] + 1
         table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
-        def run(rows: np.ndarray, _: int) -> Array:
+        def run(rows: np.ndarray, _: int) -> Any:
             ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
@@ -181,7 +181,7 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     # the longest axis of each Gaussian, [g,3]: its scales are ascending, so the last column of its rotation
     axes, means = np.stack(rotation_entries(*as_array(base.quats).T)[2::3], 1), as_array(base.means)
 
-    def run(rows: np.ndarray, width: int) -> Array:
+    def run(rows: np.ndarray, width: int) -> Any:
         positions, owners = group_rows(starts[rows], sizes[rows])
         offsets = context.members.means[ids[positions]] - means[rows[owners]]
         keys = (offsets * axes[rows[owners]]).sum(1)
@@ -290,7 +290,7 @@ def _run_head(
     parents, ids, mask = table
     slots, latents = mask.shape[1], group_features.features.latents
 
-    def run(rows: np.ndarray, _: int) -> Array:
+    def run(rows: np.ndarray, _: int) -> Any:
         owners = parents[rows]
         tokens = context.make_tokens(children, ids[rows].reshape(-1), np.repeat(owners, slots), group_features)
         table = tokens.reshape(len(rows), slots, PART)

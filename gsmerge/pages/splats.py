@@ -74,7 +74,8 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
     """Return the ids of the rows that :func:`pack_splats` packs: finite and visible."""
     drawn = gaussians.opacities >= MIN_OPACITY
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh0, gaussians.shN):
-        drawn &= reduce(np.logical_and, np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T, True)
+        finite = np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T
+        drawn &= reduce(np.logical_and, finite, True)  # type: ignore[arg-type]
     return np.flatnonzero(drawn)
 
 

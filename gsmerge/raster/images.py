@@ -88,7 +88,8 @@ def render(
         drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), under, with_depths)
     if not tensors:
         return drawn
-    return Rendering(*(None if part is None else like(part, tensors[0]) for part in vars(drawn).values()))
+    parts: list[Any] = [None if part is None else like(part, tensors[0]) for part in vars(drawn).values()]
+    return Rendering(*parts)
 
 
 def render_in_turn(

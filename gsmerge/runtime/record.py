@@ -6,6 +6,7 @@ It is ambient. A run begins one with :func:`record_run`; whatever works within t
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -104,9 +105,11 @@ def list_some(items: Sequence[str], separator: str = ", ") -> str:
 
 
 def note(text: str) -> None:
-    """Add a sentence for the user to the current record, once."""
+    """Add a sentence for the user to the current record, once, and to the log of the package."""
     notes = current_record().notes
-    notes += [] if text in notes else [text]
+    if text not in notes:
+        notes.append(text)
+        logging.getLogger("gsmerge").info(text)
 
 
 def choose(**choices: Any) -> None:

@@ -195,6 +195,9 @@ def as_scene(scene: Scene | StrPath) -> Scene:
     """Return a scene unchanged, or read it from a path; notes describe unusual content of the file."""
     if isinstance(scene, Scene):
         return scene
+    if not isinstance(scene, str | os.PathLike):
+        remedy = "write Gaussians to a file and give its path; tensors go to compact_tensors"
+        raise TypeError(f"scene: expected a Scene or a path, got {type(scene).__name__}; {remedy}")
     load = load_scene(scene)
     for text in load.notes:
         note(text)

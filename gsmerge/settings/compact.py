@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 from gsmerge.runtime import MOST_THREADS
@@ -150,7 +151,9 @@ class CompactOptions(Settings):
         all_settings = flat_settings(CompactOptions)
         unknown = sorted(settings.keys() - all_settings.keys())
         if unknown:
-            raise ValueError(f"unknown setting {unknown[0]!r}; known: {', '.join(sorted(all_settings))}")
+            near = "".join(f"; perhaps {name}" for name in get_close_matches(unknown[0], all_settings, 1))
+            known = "" if near else f"; known: {', '.join(sorted(all_settings))}"
+            raise ValueError(f"unknown setting {unknown[0]!r}{near or known}")
         return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})
 
 

@@ -6,6 +6,7 @@ package loads neither NumPy nor torch, so that ``--help`` can read it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
@@ -156,7 +157,9 @@ class Setting:
         free = any(kind not in (int, float, bool, NoneType) for kind in self.kinds)  # checked by the class itself
         if free or (self._fits(value) and self._in_range(value)):
             return
-        raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}")
+        is_number = isinstance(value, str) and re.fullmatch(r"-?\d*\.?\d+", value, re.ASCII) is not None
+        hint = f"; perhaps {value} without quotes" if is_number and {int, float} & set(self.kinds) else ""
+        raise ValueError(f"{self.name}: expected {self.expected(value)}, got {value!r}{hint}")
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
@@ -17,6 +17,11 @@ from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import CompactKeywords, DecodeKeywords, StateKeywords
 
 
 def extend_state(
@@ -66,13 +71,13 @@ class Compactor:
         200
     """
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, **settings: Unpack[StateKeywords]) -> None:
         batch_settings(settings)
         self._settings = settings
         self._state: State | None = None
 
     @classmethod
-    def load(cls, path: StrPath, **settings: Any) -> Compactor:
+    def load(cls, path: StrPath, **settings: Unpack[StateKeywords]) -> Compactor:
         """Load a saved state; ``settings`` are for the batches to come.
 
         Raises:
@@ -107,7 +112,7 @@ class Compactor:
         self._state, report = extend_state(self._state, as_scene(scene), self._settings, progress=progress)
         return report
 
-    def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:
+    def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactKeywords]) -> CompactResult:
         """Compact the scene of all batches so far, see :func:`gsmerge.compact`.
 
         Raises:
@@ -117,7 +122,7 @@ class Compactor:
             raise ValueError("expected a state of results, found Feature Gaussians; decode makes Gaussians of them")
         return compact(self.state.scene, progress=progress, **settings)
 
-    def decode(self, **settings: Any) -> Gaussians:
+    def decode(self, **settings: Unpack[DecodeKeywords]) -> Gaussians:
         """Decode Feature Gaussians in the world frame.
 
         Args:

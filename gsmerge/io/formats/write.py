@@ -125,7 +125,10 @@ def write_ply(
 
 
 def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
-    """Raise ValueError for what the readers refuse."""
+    """Raise TypeError for what are no Gaussians, ValueError for what the readers refuse."""
+    if not isinstance(gaussians, Gaussians):
+        remedy = "; pass its .gaussians, or call its save" if hasattr(gaussians, "gaussians") else ""
+        raise TypeError(f"gaussians: expected Gaussians, got {type(gaussians).__name__}{remedy}")
     if len(gaussians) == 0:
         raise ValueError("gaussians: expected at least one, got none")
     length = sum(len(f"comment {comment}\n") for comment in comments)

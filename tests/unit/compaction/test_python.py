@@ -1,0 +1,102 @@
+"""What a user of Python meets: results that save themselves, warnings of doubts, notes in a log, and clear errors."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+
+import gsmerge
+from gsmerge.types import Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4, 32, 24))
+
+
+@pytest.fixture(scope="module")
+def result(scene: Scene) -> gsmerge.CompactResult:
+    return gsmerge.compact(scene, effort="draft", budget=60, levels=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("a.ply", {"a.ply", "a.level1.ply", "a.cameras.json"}),
+        ("a.sog", {"a.sog", "a.level1.sog", "a.cameras.json"}),
+        ("a.html", {"a.html"}),
+        ("colmap", {f"colmap/sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")}),
+    ],
+)
+def test_a_result_saves_itself(name: str, files: set[str], result: gsmerge.CompactResult, tmp_path: Path) -> None:
+    path = result.save(tmp_path / name)
+    assert path.is_file()
+    assert {each.relative_to(tmp_path).as_posix() for each in tmp_path.rglob("*") if each.is_file()} == files
+    with pytest.raises(gsmerge.SceneError, match="exists already"):
+        result.save(tmp_path / name)
+    assert result.save(tmp_path / name, overwrite=True) == path
+
+
+def test_names_of_views_are_saved(result: gsmerge.CompactResult, scene: Scene, tmp_path: Path) -> None:
+    result.save(tmp_path / "a.ply")
+    assert gsmerge.read_cameras(tmp_path / "a.cameras.json").names == scene.names == result.names
+    with pytest.raises(gsmerge.GsmergeError, match="ends in"):
+        result.save(tmp_path / "a.xyz")
+
+
+def test_reports_are_plain_values(result: gsmerge.CompactResult) -> None:
+    assert json.loads(json.dumps(result.report.to_dict()))["num_output"] == 60
+
+
+def test_doubts_are_warned_of(scene: Scene) -> None:
+    with pytest.warns(gsmerge.DoubtWarning, match="worse than the input"):
+        gsmerge.compact(scene, effort="draft", budget=4, fit="none")
+
+
+def test_notes_are_logged(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, "gsmerge"):
+        result = gsmerge.compact(scene, effort="draft", budget="auto")
+    assert set(result.report.notes) <= {record.message for record in caplog.records}
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_means_keep_their_precision(kind: type, scene: Scene) -> None:
+    gaussians = replace(scene.gaussians, means=scene.gaussians.means.astype(kind))
+    result = gsmerge.compact(replace(scene, gaussians=gaussians), effort="draft", budget=20)
+    assert result.gaussians.means.dtype == kind
+
+
+def test_a_notebook_shows_before_and_after(result: gsmerge.CompactResult) -> None:
+    assert result._repr_html_().count("<img") == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "said"),
+    [
+        ({"budgte": 60}, ValueError, "perhaps budget"),
+        ({"nothing": 60}, ValueError, "known: "),
+        ({"k": "2"}, ValueError, "perhaps 2 without quotes"),
+    ],
+)
+def test_wrong_settings_say_what_is_meant(
+    arguments: dict[str, object], error: type[Exception], said: str, scene: Scene
+) -> None:
+    with pytest.raises(error, match=said):
+        gsmerge.compact(scene, **arguments)
+
+
+def test_wrong_kinds_say_what_is_expected(result: gsmerge.CompactResult, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="expected a Scene or a path, got Gaussians"):
+        gsmerge.compact(result.gaussians)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="save"):
+        gsmerge.write_ply(tmp_path / "a.ply", result)  # type: ignore[arg-type]
+
+
+def test_only_public_names_are_listed() -> None:
+    assert set(dir(gsmerge)) == {*gsmerge.__all__, "integrations"}
