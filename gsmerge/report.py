@@ -126,6 +126,5 @@ def seconds_document(seconds: Mapping[str, float]) -> dict[str, Any]:
 
 
 def seconds_line(document: Mapping[str, Any]) -> str:
-    """Return a report's seconds as text: ``2.3 s (read 0.70, ...)``."""
-    stages = ", ".join(f"{name} {value:.2f}" for name, value in document["seconds"].items())
-    return f"{document['total_seconds']:.1f} s ({stages})"
+    """Return a report's seconds as text; those of each stage are in the document."""
+    return f"{document['total_seconds']:.1f} s"

@@ -23,8 +23,8 @@ _NEAR = 0.75  # likeness of two names, as difflib measures it, from which one is
 
 # What other programs call a command, and the number of Gaussians
 OTHER_WORDS = {
-    "compact": ("compress", "merge", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
-    "convert": ("transform", "export", "join", "crop", "translate"),
+    "compact": ("compress", "simplify", "reduce", "decimate", "optimize", "optimise", "run"),
+    "convert": ("transform", "export", "join", "merge", "combine", "crop", "translate"),
     "inspect": ("info", "stats", "describe", "show", "validate", "verify", "lint", "test"),
     "evaluate": ("eval", "measure", "metrics", "score", "report"),
     "render": ("preview", "segment"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import sys
 from collections.abc import Iterator
@@ -28,6 +29,7 @@ MAX_VIEWS = 10_000
 MAX_FILES = 100_000  # below a folder of photos
 MAX_PIXELS = 1 << 26  # of one image
 
+_ADDRESS = re.compile(r"(https?|s3|gs|ftp):/")  # of another machine
 _FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20
 _FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # of 20 microseconds: 5 s, and 2 s for each MB
 _PARTS_PER_STEP = 4000  # parts of a TOML key, squared
@@ -99,6 +101,8 @@ def check_file(path: Path) -> int:
     try:
         status = os.stat(path)
     except (OSError, ValueError) as error:
+        if _ADDRESS.match(str(path)):
+            raise SceneError(path, "addresses are not read", "download the file and give its path") from error
         missing = isinstance(error, FileNotFoundError)
         reason = "no such file" if missing else f"cannot be read ({getattr(error, 'strerror', error)})"
         raise SceneError(path, reason) from error

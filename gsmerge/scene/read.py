@@ -28,6 +28,7 @@ from gsmerge.geometry import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, select_views, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.read import read_depths
+from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.read import FileInfo, GaussianFile, file_notes, kept_comments, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_array, photo_size
@@ -370,6 +371,8 @@ def _combine(
     """Combine Gaussians, cameras and their photos; SceneError if anything is unusable."""
     exporter = find_exporter(hints.exporter)
     default_order = camera_file.order if exporter is None else exporter.order
+    if default_order == "auto" and RESULT_COMMENT in ply.info.comments:
+        default_order = "none"  # its own results have no pixels to look for
     order = default_order if hints.order == "auto" else hints.order
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
@@ -452,7 +455,8 @@ def _make_load(
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None
     if layout is None or frame is None:
         scene = read_rotations(scene, hints.quats)
-        more += [] if camera_file is None or files.is_state else [_unaligned_note(hints)]
+        is_known = files.is_state or RESULT_COMMENT in ply.info.comments  # which have no pixels
+        more += [] if camera_file is None or is_known else [_unaligned_note(hints)]
     else:
         assert camera_file is not None, "pixels are those of cameras"
         scene, note = use_depths(scene, camera_file, layout, frame.scale)

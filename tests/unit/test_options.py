@@ -41,8 +41,10 @@ def test_settings_are_plain_values() -> None:
 
 
 def test_unknown_name_is_refused_with_the_known_ones() -> None:
-    with refuses(ValueError, "", "'kk'", "k", "quality"):
-        CompactOptions().with_settings({"k": 2, "kk": 3})
+    with refuses(ValueError, "", "'xyz'", "k", "quality"):
+        CompactOptions().with_settings({"k": 2, "xyz": 3})
+    with refuses(ValueError, "", "'budgte'", "perhaps budget"):
+        CompactOptions().with_settings({"budgte": 3})
 
 
 @pytest.mark.parametrize("stage", STAGES)
