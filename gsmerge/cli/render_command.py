@@ -11,6 +11,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
+from gsmerge.settings.reading import NONE
 
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
@@ -24,6 +25,19 @@ def parse_size(text: str) -> tuple[int, int]:
     if not all(SIDES[0] <= side <= SIDES[1] for side in size):
         raise typer.BadParameter(f"expected WIDTHxHEIGHT, such as 1920x1080, {SIDES[0]} to {SIDES[1]} pixels each")
     return size
+
+
+def parse_background(text: str) -> float | str:
+    """Parse ``--background``: a grey level, or "none"."""
+    if text.lower() == NONE:
+        return NONE
+    try:
+        level = float(text)
+    except ValueError:
+        level = -1
+    if not 0 <= level <= 1:
+        raise typer.BadParameter("expected a grey level, 0 to 1, or none")
+    return level
 
 
 @opt.command(
@@ -45,7 +59,10 @@ def parse_size(text: str) -> tuple[int, int]:
         opt.option("views", int, "Views at most, at equal intervals.", wording="4 on a panel, else all", min=1),
         opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
                    "yellow, red."),
-        opt.option("background", float, "Grey level behind the scene.", default=0.0, min=0.0, max=1.0),
+        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, pictures in a folder have "
+                   "alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
+        opt.option("channel", ("color", "alpha", "depth"), "What the pictures in a folder show: colour, opacity, or "
+                   "depth in 16 bits, 0 where nothing is; --json has their unit.", wording="color"),
     ),
     "overwrite",
 )  # fmt: skip
@@ -67,7 +84,7 @@ def render(args: opt.Args) -> None:
     else:
         check_folder(args.output, inputs, overwrite=args.overwrite)
     hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
-    arguments = args.given(("views", "path", "frames", "size", "overlay", "background"))
+    arguments = args.given(("views", "path", "frames", "size", "overlay", "background", "channel"))
     drawing = drawings.DRAWINGS[kind](
         drawings.DrawOptions(files, args.scenes, like, args.output, args.opacity, hints, **arguments)
     )
@@ -89,6 +106,10 @@ def _choose_kind(args: opt.Args) -> str:
         raise UsageError(f"{args.output}: expected {expected}")
     if is_clip and args.path is None:
         args.path = "orbit"
+    if (args.background == NONE or args.channel not in (None, "color")) and (
+        is_clip or is_picture or len(args.scenes) > 1
+    ):
+        raise UsageError(f"{args.output}: expected a folder and one scene with --background none or --channel")
     if args.path is not None:
         if is_picture:
             raise UsageError(f"{args.output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")

@@ -6,12 +6,15 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.facts.place_cameras import NO_VIEWS, add_views
 from gsmerge.facts.support import count_views_in_world, tint
 from gsmerge.facts.views import pick_views, subset
+from gsmerge.geometry import camera_depths
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs
 from gsmerge.io.cameras.camera_file import sizes_of
@@ -33,7 +36,7 @@ from gsmerge.measure.clip import (
 )
 from gsmerge.measure.preview import Picture, contact_sheet, outside_pictures, save_picture, to_picture, view_pictures
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.raster import render_in_turn
+from gsmerge.raster import render, render_in_turn
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
@@ -42,7 +45,7 @@ from gsmerge.scene.exporters import AUTO, ReadHints
 from gsmerge.scene.files import SceneFiles, find_scene_files
 from gsmerge.scene.held_out import read_into_frame
 from gsmerge.scene.read import Loaded, SceneViews, move_cameras_to_scene, read_gaussian_file
-from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
 PANEL_VIEWS = 4  # rows of a panel
@@ -50,7 +53,12 @@ SECONDS = {"orbit": 4, "spline": 4, "turntable": 6}  # of a path, at least
 VIEW_FRAMES = 4  # for each view of a spline, at least
 FPS, GIF_FPS = 30.0, 12.5  # frames per second
 GIF_SIDE = 640  # pixels at most of a GIF of which no size is asked for
+OPAQUE = 0.5  # alpha from which a pixel has a depth
 HALF_TURN = 180  # degrees about the middle: of less, a turntable also shows the side that no photo shows
+
+
+Channel = Literal["color", "alpha", "depth"]
+FULL = {"alpha": 255, "depth": 65535}  # what stands for 1, and for the farthest depth
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,13 @@ class DrawOptions:
     frames: int | None = None  # Along the path; None: those of SECONDS, of a spline at least 4 for each view
     size: tuple[int, int] | None = None  # Width and height of a picture; None: those of the cameras
     overlay: str | None = None  # "support": colours by how many views show a Gaussian
-    background: float = 0.0  # Grey level
+    background: float | Literal["none"] = 0.0  # Grey level; none: nothing, so that pictures have alpha
+    channel: Channel = "color"  # What pictures show
+
+    @property
+    def grey(self) -> float:
+        """Return the grey level behind pictures that have no alpha."""
+        return 0.0 if isinstance(self.background, str) else self.background
 
     def choose(self, count: int, most: int | None = None) -> list[int]:
         """Choose ids of ``count`` views: as many as the option ``views``, or else ``most``; None: all."""
@@ -125,18 +139,43 @@ class DrawnScenes:
 
         Of each camera's pictures at least the columns between ``places``, one more than there are scenes, are drawn.
         """
+        if options.background == NONE or options.channel != "color":
+            ((_, gaussians),) = self.scenes
+            return ((picture,) for picture in _draw_layers(gaussians, cameras, options, near))
         how: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
             render_in_turn(
                 gaussians,
                 cameras,
-                options.background,
+                options.grey,
                 columns=None if places is None else [(row[i], row[i + 1]) for row in places],
                 **how,
             )
             for i, (_, gaussians) in enumerate(self.scenes)
         )
         return zip(*drawn, strict=True)
+
+
+def _draw_layers(gaussians: Gaussians, cameras: Cameras, options: DrawOptions, near: float) -> Iterator[Picture]:
+    """Yield the colours of each camera with alpha ``[h,w,4]``, its alpha, or its depth ``[h,w]``."""
+    for view in range(len(cameras)):
+        drawn = render(gaussians, cameras[[view]], near=near, with_depths=options.channel == "depth")
+        alphas = drawn.alphas[0].clip(0, 1)
+        if options.channel == "alpha":
+            yield np.round(FULL["alpha"] * alphas[..., 0]).astype(np.uint8)
+        elif options.channel == "depth":
+            assert drawn.depths is not None
+            depths = np.where(alphas > OPAQUE, drawn.depths[0], 0)[..., 0]
+            yield np.round(FULL["depth"] * (depths / farthest_depth(gaussians, cameras)).clip(0, 1)).astype(np.uint16)
+        else:
+            colors = drawn.images[0] / np.maximum(alphas, 1e-6)
+            yield np.concatenate([to_picture(colors), np.round(FULL["alpha"] * alphas).astype(np.uint8)], 2)
+
+
+def farthest_depth(gaussians: Gaussians, cameras: Cameras) -> float:
+    """Return the depth, world units, beyond which no visible Gaussian lies from any camera."""
+    means = gaussians.means[gaussians.opacities > 0].astype(np.float64)
+    return max(float(camera_depths(means, viewmat[None]).max()) for viewmat in cameras.viewmats)
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
@@ -161,8 +200,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         if shown and options.size:
             shown = [fill_photo(photo, *options.size) for photo in shown]
         plain = options.overlay is None
-        rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.background)
-        outside = outside_pictures(parts, cameras, photos=len(photos) > 0, background=options.background)
+        rows = view_pictures(parts, cameras[ids], shown, ids, scored=plain, background=options.grey)
+        outside = outside_pictures(parts, cameras, photos=len(photos) > 0, background=options.grey)
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(photos) > 0, "notes": group.notes}
@@ -181,7 +220,15 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
             yield contact_sheet([list(zip(names, drawn, strict=True))]) if len(drawn) > 1 else drawn[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
+    facts |= _depth_unit(group, views, options)
     return Drawing([options.output / f"{stems[i]}.png" for i in ids], facts, draw)
+
+
+def _depth_unit(group: DrawnScenes, cameras: Cameras, options: DrawOptions) -> dict[str, float]:
+    """Return the world units of one step of depth pictures, for the report."""
+    if options.channel != "depth":
+        return {}
+    return {"depth_unit": farthest_depth(group.scenes[0][1], cameras) / FULL["depth"]}
 
 
 def prepare_clip(options: DrawOptions) -> Drawing:
@@ -206,6 +253,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
 
     facts = {"views": ids, "notes": group.notes, "scenes": group.counts(), "path": options.path}
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
+    facts |= _depth_unit(group, cameras, options)
     if options.output.suffix.lower() not in SUFFIXES:
         return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
     _check_frames(options.output, cameras.width, cameras.height, len(cameras))

@@ -32,8 +32,12 @@ def to_picture(image: np.ndarray) -> Picture:
 
 
 def save_picture(path: Path, picture: Picture, *settings: int, overwrite: bool = True) -> None:
-    """Write a picture in the format of the file name; ``settings`` go to :func:`cv2.imencode`."""
-    _, data = cv2.imencode(path.suffix, picture[..., ::-1], settings)
+    """Write a picture in the format of the file name; ``settings`` go to :func:`cv2.imencode`.
+
+    It has three channels, four with alpha, or none: ``[h,w]`` of 8 or 16 bits.
+    """
+    stored = picture if picture.ndim == 2 else picture[..., [2, 1, 0, 3][: picture.shape[2]]]
+    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(stored), settings)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 

@@ -208,3 +208,44 @@ def test_a_panel_under_an_overlay_has_no_scores(small_copy: Path, run: Run) -> N
     args = ("render", small_copy, small_copy / "scene.ply", "--overlay", "support", "--views", 1)
     run(*args, "-o", small_copy / "a.png", code=0)
     assert cv2.imread(str(small_copy / "a.png")) is not None
+
+
+def test_pictures_have_alpha_opacity_or_depth(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Over black, colours with alpha are what is drawn over black; depths are those of the library."""
+    scene = gsmerge.read_scene(small_scene)
+    drawn = gsmerge.render(scene.gaussians, scene.cameras, with_depths=True)
+    outputs = {}
+    for name, flags in {
+        "rgba": ("--background", "none"), "alpha": ("--channel", "alpha"), "depth": ("--channel", "depth"),
+        "white": ("--background", "1"),
+    }.items():  # fmt: skip
+        outputs[name] = json.loads(run("render", small_scene, "-o", tmp_path / name, *flags, "--json", code=0).out)
+    assert drawn.depths is not None
+    for view, path in enumerate(sorted((tmp_path / "rgba").iterdir())):
+        rgba, alpha, depth, white = (
+            cv2.imread(str(tmp_path / name / path.name), cv2.IMREAD_UNCHANGED) for name in outputs
+        )
+        assert (rgba.shape[2], alpha.dtype, depth.dtype, depth.ndim) == (4, np.uint8, np.uint16, 2)
+        shares = drawn.alphas[view]
+        assert np.abs(alpha / 255 - shares[..., 0]).max() < 0.003
+        assert (rgba[..., 3] == alpha).all()
+        over = rgba[..., :3] * (rgba[..., 3:] / 255) + 255 - rgba[..., 3:]
+        assert np.abs(over - white).max() < 2.1
+        depths = np.where(shares > 0.5, drawn.depths[view], 0)[..., 0]
+        np.testing.assert_allclose(depth * outputs["depth"]["depth_unit"], depths, atol=outputs["depth"]["depth_unit"])
+        assert (depth > 0).any()
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        (("--background", "none"), "a.png"), (("--channel", "depth"), "a.webm"),
+        (("--background", "nothing"), "folder"), (("--background", "2"), "folder"), (("--background", "nan"), "folder"),
+    ],
+)  # fmt: skip
+def test_only_pictures_in_a_folder_have_alpha(
+    flags: tuple[str, str], name: str, small_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    outcome = run("render", small_scene, *flags, "-o", tmp_path / name, code=2)
+    assert flags[0] in outcome.err
+    assert not (tmp_path / name).exists()
