@@ -15,6 +15,7 @@ import pytest
 from comfyui import Bar, CancelError, Splat, modules
 
 import gsmerge
+from gsmerge.kernels.elementary import arctan2
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 
@@ -60,7 +61,7 @@ def make_cameras(cameras: gsmerge.Cameras) -> list[dict[str, Any]]:
         rotation, eye = FLIP @ pose[:3, :3] @ FLIP, FLIP @ pose[:3, 3]
         w = np.sqrt(max(0, 1 + np.trace(rotation))) / 2
         x, y, z = (rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]) / (4 * w)
-        fov = 2 * np.degrees(np.arctan(min(cameras.width, cameras.height) / 2 / K[0, 0]))
+        fov = 2 * np.degrees(float(arctan2(min(cameras.width, cameras.height) / 2, K[0, 0])))
         places = {"position": eye, "target": eye - rotation[:, 2]}
         camera = {name: dict(zip("xyz", place, strict=True)) for name, place in places.items()}
         out.append({**camera, "quaternion": {"w": w, "x": x, "y": y, "z": z}, "fov": fov, "cameraType": "perspective"})
