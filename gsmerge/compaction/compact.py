@@ -18,7 +18,8 @@ from gsmerge.compaction.methods import Method, choose_method
 from gsmerge.compaction.new_views import try_new_views
 from gsmerge.compaction.result import Candidate, CompactResult, make_result, score
 from gsmerge.compaction.search import add_target, build_left_out, level_counts, meet, search_count
-from gsmerge.errors import DoubtWarning, UsageError
+from gsmerge.errors import DoubtWarning
+from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
@@ -69,6 +70,8 @@ def compact(
     given = scene if isinstance(scene, str | PathLike) else ref(scene)
     with use_threads(options.threads), record_run(progress):
         scene = as_scene(scene)
+        if options.clean.crop is not None:
+            scene = crop_scene(scene.numpy(), options.clean.crop)
         size = measure_size(scene)
         choices = choose_for_scene(size, options)  # what needs no work to decide
         note_engine(size, options, choices.blocks)
@@ -126,45 +129,26 @@ def build_scored(build: Build, prepared: Prepared, plan: Plan, count: int | None
 
 @record_part()
 def clean_last(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up a candidate that was searched for without, and score it again; any other stays as it is.
-
-    UsageError if the crop contains none of the scene.
-    """
+    """Clean up a candidate that was searched for without, and score it again; any other stays as it is."""
     if not plan.cleans_last:
         return candidate
-    _share_inside(prepared, plan)
     adopt(candidate.record)
     gaussians, counts = _clean(candidate.fitted, prepared, plan)
     _note_clean(counts, len(gaussians), None, prepared)
     return score(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
 
 
-def _share_inside(prepared: Prepared, plan: Plan) -> float:
-    """Return the share of the input that the crop keeps; UsageError if it contains none of the scene."""
-    from gsmerge.stages.clean import inside_crop
-
-    crop = plan.clean.crop
-    if crop is None:
-        return 1.0
-    share = float(inside_crop(prepared.frame.leave(prepared.scene.finite_gaussians).means, crop).mean())
-    if share == 0:
-        remedy = "gsmerge inspect says where the scene is"
-        raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
-    return share
-
-
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up so that exactly ``count`` remain, if the scene holds that many.
 
-    More Gaussians are built than requested, and the faintest surplus ones are dropped. UsageError if the crop contains
-    none of the scene.
+    More Gaussians are built than requested, and the faintest surplus ones are dropped.
     """
     options = plan.clean
     if not options.asked:
         return build(prepared, plan, count)
     from gsmerge.stages.clean import faintest_dropped
 
-    share, most = _share_inside(prepared, plan), len(prepared.scene.finite_gaussians)
+    most = len(prepared.scene.finite_gaussians)
 
     def build_more(asked: int | None) -> tuple[int | None, Fitted, dict[str, int], Record]:
         with record_part() as record:
@@ -179,7 +163,7 @@ def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | Non
             return None
         return min(most, math.ceil(SURPLUS * asked * count / max(1, left)))
 
-    first = None if count is None else min(most, math.ceil(SURPLUS * count / share))
+    first = None if count is None else min(most, math.ceil(SURPLUS * count))
     built = meet(build_more, build_more(first), ask_for_more)
     _, fitted, counts, record = max(built, key=lambda each: len(each[1].gaussians))
     gaussians = fitted.gaussians
@@ -203,9 +187,12 @@ def _note_clean(counts: dict[str, int], left: int, count: int | None, prepared: 
     from gsmerge.stages.clean import describe_counts
 
     choose(clean=counts)
-    parts = describe_counts(counts, placed=prepared.reference.placed)
-    note(f"left out by clean-up: {parts}")
-    if counts.get("cropped") or counts.get("sky"):
+    shown = {
+        name: number for name, number in counts.items() if number or name != "cropped"
+    }  # by the fit, over a border
+    if shown:
+        note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")
+    if counts.get("sky"):
         note("PSNR of the input views counts what is left out as errors")
     if count is not None and left < count:
         note(f"budget: {count:,} Gaussians were asked for, {left:,} are left after clean-up")

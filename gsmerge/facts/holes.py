@@ -111,14 +111,19 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 
 
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
-    """Make pictures black and of no account for scores where they are to stay ``empty [v,h,w]``, with a note."""
+    """Make pictures black and of no account for scores where they are to stay ``empty [v,h,w]``.
+
+    A note says so of photos that counted there.
+    """
     if not empty.any() or empty.all():
         return scene
-    views, share = int(empty.any((1, 2)).sum()), 100 * float(empty.mean())
-    note(
-        f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels: they"
-        " stay empty, and photos do not count there; --set extent=photos fills them"
-    )
+    counted = empty if scene.masks is None else empty & scene.masks
+    if counted.any():
+        views, share = int(counted.any((1, 2)).sum()), 100 * float(counted.mean())
+        note(
+            f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels:"
+            " they stay empty, and photos do not count there; --set extent=photos fills them"
+        )
     images = np.where(empty[..., None], np.float32(0), scene.images)
     masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
     if large is not None:

@@ -163,7 +163,7 @@ class CleanOptions(Settings):
     """Settings of clean-up: what to leave out of the result."""
 
     crop: str | None = setting(None, "Keep the Gaussians inside a sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, in the "
-        "scene's world units, or inside the shape that a .json or .toml file describes; a budget is met after it.",
+        "scene's world units, or inside the shape of a .json or .toml file; counts, fit and scores are of these.",
         "Three more numbers of a box turn it about its middle: degrees about x, y and z. The command line alone reads "
         "files.", metavar="SHAPE", common=True, whole="name", in_trial=None)  # fmt: skip
     drop: str | None = setting(None, "Leave out floaters, sky, transparent or unseen Gaussians, with commas between.",
@@ -195,7 +195,7 @@ class CleanOptions(Settings):
     @property
     def hiding(self) -> list[str]:
         """Names of what is asked for that removes things which photos show."""
-        return [name for name, asked in {"crop": self.crop, "drop sky": "sky" in self.drops}.items() if asked]
+        return ["drop sky"] if "sky" in self.drops else []
 
 
 def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:

@@ -6,13 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsmerge.facts.crop import inside_crop
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.facts.support import count_views
-from gsmerge.geometry import turn_by
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
-from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.settings.stages import CleanOptions, parse_crop
+from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
@@ -30,18 +29,6 @@ MAX_SAMPLE_GAUSSIANS = 200_000  # Gaussians that a share is estimated from
 
 ToWorld = Callable[[Gaussians], Gaussians]
 Counts = dict[str, int]
-
-
-def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
-    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
-    shape, parsed = parse_crop(crop)
-    numbers = np.array(parsed)
-    if shape == "sphere":
-        return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
-    if len(numbers) > 6:
-        middle = (numbers[:3] + numbers[3:6]) / 2
-        means = middle + matmul(means - middle, turn_by(numbers[6:]))  # as seen by the box
-    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:6])).all(1))
 
 
 def beyond_scene(means: np.ndarray, samples: np.ndarray | None = None) -> np.ndarray:

@@ -13,10 +13,10 @@ from messages import refuses
 
 from gsmerge.cli.parameters import Args
 from gsmerge.errors import SceneError
+from gsmerge.facts.crop import inside_crop
 from gsmerge.geometry import angles_of, turn_by
 from gsmerge.io.crop_file import read_crop
 from gsmerge.settings.stages import CleanOptions, parse_crop
-from gsmerge.stages.clean import inside_crop
 
 TURN = turn_by(np.array([20.0, -50.0, 110.0]))
 

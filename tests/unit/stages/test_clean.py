@@ -11,10 +11,11 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
+from gsmerge.facts.crop import crop_scene, inside_crop
 from gsmerge.facts.support import count_views
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
-from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters, inside_crop
+from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters
 
 QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60, "poses": "fixed"}
 
@@ -117,18 +118,43 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     result = compact(scene, **QUICK, crop=crop, drop="floaters", budget=150)
     assert len(result.gaussians) == 150
     assert inside_crop(result.gaussians.means, crop).all()
-    assert result.report.choices["clean"]["cropped"] > 0
     assert result.report.num_output == 150
     assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
-def test_a_crop_without_a_budget_keeps_the_rest_as_it_is(scene: Scene) -> None:
+def test_counts_fit_and_scores_are_of_the_inside(scene: Scene) -> None:
+    """The same number of Gaussians shows the inside better than where all was fitted and then cut."""
     crop = sphere_in(scene, 0.5)
-    whole, part = compact(scene, **QUICK), compact(scene, **QUICK, crop=crop)
-    inside = inside_crop(whole.gaussians.means, crop)
-    np.testing.assert_array_equal(part.gaussians.means, whole.gaussians.means[inside])
-    assert part.report.choices["clean"] == {"cropped": int((~inside).sum())}
-    assert "clean" not in whole.report.choices
+    part = compact(scene, **QUICK | {"fit": "full"}, crop=crop)
+    inside = crop_scene(scene, crop)
+    assert part.report.num_input == inside.num_gaussians < scene.num_gaussians
+    assert noted(part.report.notes, "crop", f"{inside.num_gaussians:,} of {scene.num_gaussians:,}")
+    whole = compact(scene, **QUICK | {"fit": "full"}, budget=2 * len(part.gaussians))
+    kept = whole.gaussians[inside_crop(whole.gaussians.means, crop)]
+    assert inside.masks is not None
+    assert inside.images is not None
+    errors = [
+        np.square(render(gaussians, scene.cameras).images - inside.images)[inside.masks].mean()
+        for gaussians in (part.gaussians, kept)
+    ]
+    assert errors[0] < errors[1]
+    assert part.report.psnr_after is not None
+    assert part.report.psnr_after > 20
+
+
+def test_a_crop_leaves_what_shows_it(scene: Scene) -> None:
+    """Pixels count whose own Gaussian is inside, but for borders; without pixels the same photos count."""
+    crop = sphere_in(scene, 0.5)
+    inside = crop_scene(scene, crop)
+    own = inside_crop(scene.gaussians.means, crop).reshape(scene.valid.shape)
+    assert inside.masks is not None
+    assert (inside.masks == own).mean() > 0.9
+    assert (inside.valid == own).all()
+    free = crop_scene(replace(scene, pixel_ids=None), crop)
+    assert len(free.gaussians) == own.sum()
+    np.testing.assert_array_equal(free.masks, inside.masks)
+    assert crop_scene(replace(scene, images=None, masks=None), crop).masks is None
+    assert crop_scene(scene, "sphere:0,0,0,1e6") is scene
 
 
 def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
@@ -145,12 +171,12 @@ def test_levels_and_baselines_are_cropped(scene: Scene) -> None:
 def test_what_cannot_be(scene: Scene) -> None:
     with refuses(UsageError, "crop", "sphere:0,0,1e9,1", "none"):
         compact(scene, **QUICK, crop="sphere:0,0,1e9,1")
-    with refuses(ValueError, "crop", "budget", "quality 30dB"):
-        CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "quality": "30dB"})
+    with refuses(ValueError, "drop sky", "budget", "quality 30dB"):
+        CompactOptions().with_settings({"drop": "sky", "quality": "30dB"})
     few = sphere_in(scene, 0.002)
     result = compact(scene, **QUICK, crop=few, budget=5000)
     assert 0 < len(result.gaussians) < 5000
-    assert noted(result.report.notes, "budget", "5,000")
+    assert noted(result.report.notes, "crop", f"{result.report.num_input} of 5,184")
     assert CompactOptions().with_settings({"crop": "sphere:0,0,0,1", "drop": "floaters"}).whole_only == [
         "crop", "drop floaters",
     ]  # fmt: skip

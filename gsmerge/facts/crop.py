@@ -1,0 +1,76 @@
+"""Scene -> the scene inside a crop: its Gaussians, and the pixels of photos that mostly show them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.errors import UsageError
+from gsmerge.frame import canonicalise
+from gsmerge.geometry import rgb_to_sh0, turn_by
+from gsmerge.kernels.matrices import matmul
+from gsmerge.raster import render_in_turn
+from gsmerge.runtime.record import note
+from gsmerge.runtime.threads import use_threads
+from gsmerge.settings.stages import parse_crop
+from gsmerge.types import Scene
+
+MOSTLY = 0.5  # of what a pixel shows, from which on it shows the inside more than the outside
+
+
+def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
+    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
+    shape, parsed = parse_crop(crop)
+    numbers = np.array(parsed)
+    if shape == "sphere":
+        return np.asarray(np.square(means - numbers[:3]).sum(1) <= numbers[3] ** 2)
+    if len(numbers) > 6:
+        middle = (numbers[:3] + numbers[3:6]) / 2
+        means = middle + matmul(means - middle, turn_by(numbers[6:]))  # as seen by the box
+    return np.asarray(((means >= numbers[:3]) & (means <= numbers[3:6])).all(1))
+
+
+def crop_scene(scene: Scene, crop: str) -> Scene:
+    """Return a scene of the Gaussians inside a crop, whose photos count where they mostly show these.
+
+    Counts, fit and scores are then those of what is left. UsageError if that is nothing.
+    """
+    inside = inside_crop(scene.gaussians.means, crop) & scene.stored_rows
+    count = int(inside.sum())
+    if count == 0:
+        remedy = "gsmerge inspect says where the scene is"
+        raise UsageError(f"crop: expected Gaussians of the scene in {crop}, found none; {remedy}")
+    if count == scene.num_gaussians:
+        return scene
+    note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores are of these")
+    masks = scene.masks
+    if scene.images is not None:
+        shown = show_rows(scene, inside)
+        masks = shown if masks is None else masks & shown
+    if scene.pixel_ids is None:
+        return replace(scene, gaussians=scene.gaussians[inside], masks=masks)
+    rows = scene.gaussians  # every pixel keeps its row
+    gaussians = replace(rows, opacities=np.where(inside, rows.opacities, 0).astype(rows.opacities.dtype))
+    missing = ~inside.reshape(scene.valid.shape)
+    ids = np.where(inside, scene.pixel_ids, -1).astype(scene.pixel_ids.dtype)
+    return replace(scene, gaussians=gaussians, pixel_ids=ids, missing=missing, masks=masks)
+
+
+def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
+    """Return a mask ``[v,h,w]`` of the pixels that show Gaussians of the mask ``rows [n]`` more than others."""
+    canonical, _ = canonicalise(scene)
+    colors = np.ones((len(rows), 1, 3), np.float32)  # what is inside; all
+    colors[~rows, :, 0] = 0
+    gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
+    with use_threads() as threads:
+        return np.stack(
+            list(
+                render_in_turn(
+                    gaussians,
+                    canonical.cameras,
+                    at_once=threads,
+                    convert=lambda image: image[..., 0] > MOSTLY * image[..., 1],
+                )
+            )
+        )
