@@ -118,10 +118,11 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     if not empty.any() or empty.all():
         return scene
     counted = empty if scene.masks is None else empty & scene.masks
-    if counted.any():
-        views, share = int(counted.any((1, 2)).sum()), 100 * float(counted.mean())
+    share = round(100 * float(counted.mean()))
+    if share:
+        views = int(counted.any((1, 2)).sum())
         note(
-            f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share:.0f} % of all pixels:"
+            f"the scene shows nothing in large parts of {views} of {len(empty)} views, {share} % of all pixels:"
             " they stay empty, and photos do not count there; --set extent=photos fills them"
         )
     images = np.where(empty[..., None], np.float32(0), scene.images)

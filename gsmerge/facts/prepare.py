@@ -146,14 +146,17 @@ def prepare(
 
 
 def _photos_before(given: Scene, prepared: Prepared) -> np.ndarray | None:
-    """Return the photos of a given scene if those that results are scored by were changed; else None."""
+    """Return the photos of a given scene if those that results are scored by were changed where they count."""
     photos, scored = prepared.scene.images, prepared.reference.score_views
     if given.images is None or prepared.reference.name != PHOTOS or photos is given.images:
         return None
-    pairs = (
-        (before, photos[view]) for before, view in zip(given.images, prepared.repeated, strict=True) if view in scored
+    counting = np.full(photos.shape[:3], True) if prepared.scene.masks is None else prepared.scene.masks
+    changed = (
+        not np.array_equal(before[counting[view]], photos[view][counting[view]])
+        for before, view in zip(given.images, prepared.repeated, strict=True)
+        if view in scored
     )
-    return given.images if any(not np.array_equal(*pair) for pair in pairs) else None
+    return given.images if any(changed) else None
 
 
 def _without_holes(prepared: Prepared, options: PrepareOptions) -> Prepared:

@@ -116,7 +116,6 @@ def test_what_is_left_out_on_purpose_is_no_loss(smallest_scene: Path) -> None:
     assert report.worse is None
 
 
-
 def test_the_warning_is_red(smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     for name, red in (("FORCE_COLOR", True), ("NO_COLOR", False)):
