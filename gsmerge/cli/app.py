@@ -8,7 +8,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,7 +17,7 @@ import typer
 
 from gsmerge import __version__
 from gsmerge.cli import INTERRUPTED, stop_at_once
-from gsmerge.cli.console import plain_warnings, say
+from gsmerge.cli.console import json_progress, plain_warnings, say
 from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, expand_home, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 DEBUG = "--debug"
+PROGRESS, STYLES = "--progress", ("bar", "json")
 
 # Panel of the help -> commands, each the function of its name in the module of its name; others are plugins
 COMMANDS = {
@@ -156,6 +157,14 @@ def root(
     __: Annotated[
         bool, typer.Option(DEBUG, help="Print tracebacks of errors; also after the name of a command.")
     ] = False,
+    ___: Annotated[
+        str,
+        typer.Option(
+            PROGRESS,
+            metavar="|".join(STYLES),
+            help="json: a line for each step on stderr, with the seconds left; also after the name of a command.",
+        ),
+    ] = STYLES[0],
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
     if context.invoked_subcommand is None:
@@ -214,10 +223,21 @@ def _check_working_directory() -> None:
         raise SceneError(os.curdir, reason, "change it") from error
 
 
+def _take_progress(words: list[str]) -> tuple[list[str], str]:
+    """Take the option of progress out of the words, wherever it stands; return the others and its value."""
+    end = words.index("--") if "--" in words else len(words)
+    for i, word in enumerate(words[:end]):
+        if word.startswith(f"{PROGRESS}="):
+            return words[:i] + words[i + 1 :], word.partition("=")[2]
+        if word == PROGRESS:
+            return words[:i] + words[i + 2 :], "".join(words[i + 1 : i + 2])
+    return words, STYLES[0]
+
+
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
-    words = [expand_home(word) for word in arguments if word != DEBUG]
+    words, style = _take_progress([expand_home(word) for word in arguments if word != DEBUG])
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
@@ -234,7 +254,9 @@ def run(args: Sequence[str] | None = None) -> int:
         return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
 
     try:
-        with plain_warnings(), _orderly_stop(signals):
+        with plain_warnings(), _orderly_stop(signals), json_progress() if style == "json" else nullcontext():
+            if style not in STYLES:
+                raise UsageError(f"{PROGRESS}: expected {' or '.join(STYLES)}, got {style!r}")
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             command = make_command(_command_of(words))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
+from contextvars import ContextVar
 from typing import Any
 
 Progress = Callable[[str, int, int], None]
@@ -17,6 +19,7 @@ SHORT = 5  # seconds: what is left is shown from so many on
 NARROW = 60  # columns below which bars are short and say less
 OPENING = "start ..."  # on a terminal until a command has its first line or bar
 
+_as_json: ContextVar[bool] = ContextVar("as_json", default=False)  # whether progress is lines of JSON
 _opening: list[str] = []  # what stands on the terminal's last line, to be erased
 
 
@@ -134,11 +137,46 @@ def _bar(console: Any) -> Any:
 
 
 @contextmanager
+def json_progress() -> Iterator[None]:
+    """Print progress in the block as lines of JSON on stderr, whatever else is quiet."""
+    token = _as_json.set(True)
+    try:
+        yield
+    finally:
+        _as_json.reset(token)
+
+
+def _print_event(event: Mapping[str, Any]) -> None:
+    _erase_opening()
+    with suppress(OSError):
+        print(json.dumps(event), file=sys.stderr, flush=True)
+
+
+def _print_stages() -> Progress:
+    """Return a progress that prints each event with the seconds since the first one, and those left."""
+    from gsmerge.runtime.time_left import TimeLeft
+
+    times = TimeLeft()
+
+    def move(text: str, done: int, total: int) -> None:
+        stage, _, detail = one_line(text).partition(": ")
+        left = times.move(text, done, total)
+        share = None if left is None else round(times.seconds / max(times.seconds + left, 1e-9), 3)
+        seconds = {"seconds": round(times.seconds, 2), "seconds_left": None if left is None else round(left, 1)}
+        _print_event({"stage": stage, "detail": detail, "done": done, "total": total, "share": share, **seconds})
+
+    return move
+
+
+@contextmanager
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar per stage on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
 
     Yields ``(stage, done, total) -> None``; a stage is done when the next one begins.
     """
+    if _as_json.get():
+        yield _print_stages()
+        return
     console = _terminal(quiet=quiet)
     if console is None:
         yield lambda stage, done, total: None
@@ -208,6 +246,11 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[Callable[[str, int, s
     Without a terminal it prints a line for each run. Yields ``(text, done, failure) -> None``; ``failure`` is empty
     after a run that succeeded.
     """
+    if _as_json.get():
+        yield lambda text, done, failure: _print_event(
+            {"scene": text, "done": done, "total": total, "error": failure or None}
+        )
+        return
     console = _terminal(quiet=quiet)
     if console is None:
 

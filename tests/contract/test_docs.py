@@ -42,6 +42,7 @@ OTHER_OPTIONS = {
     "--help",
     "--help-all",
     "--debug",
+    "--progress",
     "--install-completion",
     "--only",
     "--no-deps",

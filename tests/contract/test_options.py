@@ -98,7 +98,16 @@ def test_settings_without_an_option_say_how_to_give_them(
 
 
 def test_the_package_names_only_options_that_exist(root: Path) -> None:
-    others = {"--help", "--version", "--debug", "--no-deps", "--force-reinstall", "--extra-index-url", "--head"}
+    others = {
+        "--help",
+        "--version",
+        "--debug",
+        "--progress",
+        "--no-deps",
+        "--force-reinstall",
+        "--extra-index-url",
+        "--head",
+    }
     others |= {"--lod-chunk-count"}  # of splat-transform
     known = others | {flag for name in COMMANDS for flag in flags_of(name)}
     files = sorted((root / "gsmerge").rglob("*.py"))

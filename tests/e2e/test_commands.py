@@ -205,3 +205,33 @@ def test_shell_completion(
         main([])
     assert end.value.code == 0
     assert capsys.readouterr().out.split() == [offered]
+
+
+@pytest.mark.parametrize("words", [("--progress", "json", "compact"), ("compact", "--progress=json")])
+def test_progress_is_lines_of_json(words: tuple[str, ...], small_scene: Path, tmp_path: Path, run: Run) -> None:
+    """Wherever the option stands, and whatever is quiet; notes are no JSON."""
+    call = (*words, small_scene, "-o", tmp_path / "a.ply", "--effort", "draft")
+    outcome = run(*call, "--quiet", code=0)
+    events = [json.loads(line) for line in outcome.err.splitlines()]
+    assert [event["stage"] for event in events][-1] == "done"
+    assert all(list(event) == list(events[0]) for event in events)
+    assert any(event["stage"] == "fit" and event["seconds_left"] is not None for event in events)
+    assert events[-1]["share"] == 1
+    seconds = [event["seconds"] for event in events]
+    assert seconds == sorted(seconds)
+
+
+def test_progress_of_a_batch_names_scenes(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "bad.ply").write_bytes(b"ply")
+    outcome = run("batch", small_scene, tmp_path / "bad.ply", "-o", tmp_path / "out", "--effort", "draft", "--progress",
+                  "json", code=5)  # fmt: skip
+    lines = [line for line in outcome.err.splitlines() if line.startswith("{")]
+    done = [json.loads(line) for line in lines]
+    assert [event["done"] for event in done] == [1, 2]
+    assert [event["total"] for event in done] == [2, 2]
+    assert sum(event["error"] is None for event in done) == 1
+
+
+@pytest.mark.parametrize("words", [("--progress", "jsno", "inspect", "x"), ("inspect", "x", "--progress")])
+def test_progress_has_two_styles(words: tuple[str, ...], run: Run) -> None:
+    assert "expected bar or json" in run(*words, code=2).err
