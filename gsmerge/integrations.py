@@ -7,13 +7,14 @@ None of the libraries is imported. Each function returns keyword arguments, so t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry import rotmat_to_quat
+from gsmerge.geometry import normalize, rotmat_to_quat
+from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.matrices import eigh, invert
 from gsmerge.types import Array, as_array, like
 
@@ -136,6 +137,62 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
     if images is None:
         return arguments | {"shape": (len(c2w), *cameras.image_shape)}
     return arguments | {"images": _as_floats(as_array(_one("images", images, 4)).transpose(0, 2, 3, 1))}
+
+
+def worldmirror(predictions: Mapping[str, Any], images: Array) -> dict[str, Any]:
+    """Convert the predictions of WorldMirror: Gaussians of voxels, which have no pixels, and cameras.
+
+    Args:
+        predictions: ``splats`` with ``means``, ``scales``, ``quats`` wxyz, ``opacities`` and ``sh``, of each scene of a
+            batch of one; ``camera_poses [1,V,4,4]`` camera to world, ``camera_intrs [1,V,3,3]`` in pixels.
+        images: ``[1,V,3,H,W]`` as the model got them, in [0, 1].
+
+    Raises:
+        SceneError: If an entry is missing, or it holds several scenes.
+    """
+    splats: Any = _item("predictions", predictions, "splats")
+    shapes = {"means": (-1, 3), "scales": (-1, 3), "quats": (-1, 4), "opacities": (-1,), "sh": (-1, 1, 3)}
+    columns = {name: _first(name, _item("splats", splats, name)).reshape(shape) for name, shape in shapes.items()}
+    c2w = as_array(_one("camera_poses", _item("predictions", predictions, "camera_poses"), 3)).astype(np.float64)
+    Ks = as_array(_one("camera_intrs", _item("predictions", predictions, "camera_intrs"), 3)).astype(np.float64)
+    photos = as_array(_one("images", images, 4)).transpose(0, 2, 3, 1)
+    columns["sh0"] = columns.pop("sh")
+    return {**columns, "images": _as_floats(photos), "viewmats": invert(c2w), "Ks": Ks, "order": "none"}
+
+
+def gsplat(splats: Mapping[str, Array], dataset: Iterable[Mapping[str, Array]]) -> dict[str, Any]:
+    """Convert what gsplat's ``simple_trainer.py`` trains, and the views that it trains on, in the trainer's own frame.
+
+    Args:
+        splats: ``means``, ``quats`` wxyz of any length, ``scales`` as logarithms, ``opacities`` as logits, ``sh0``,
+            ``shN``: the trainer's ``splats``, or those of one of its checkpoints.
+        dataset: For each view ``camtoworld [4,4]``, ``K [3,3]`` in pixels, ``image [H,W,3]`` in [0, 255]: the trainer's
+            ``trainset``.
+
+    Raises:
+        SceneError: If an entry is missing, as ``sh0`` is where colours depend on the photo, or photos differ in size.
+    """
+    columns = {name: as_array(_item("splats", splats, name)) for name in ("means", "quats", "scales", "opacities")}
+    columns |= {name: as_array(_item("splats", splats, name)) for name in ("sh0", "shN")}
+    columns["quats"] = normalize(columns["quats"].astype(np.float64)).astype(np.float32)
+    columns["scales"], columns["opacities"] = exp(columns["scales"]), 1 / (1 + exp(-columns["opacities"]))
+    names = ("camtoworld", "K", "image")
+    views = [[as_array(_item("dataset", view, name)) for name in names] for view in dataset]
+    if sizes := sorted({image.shape[:2] for _, _, image in views})[1:]:
+        raise SceneError("dataset", f"expected photos of one size, found {len(sizes) + 1} sizes", "pass those of one")
+    c2w, Ks, photos = (np.stack(columns) for columns in zip(*views, strict=True))
+    return {
+        **{name: like(column, splats["means"]) for name, column in columns.items()},
+        "images": (photos / np.float32(_BYTES)).astype(np.float32), "Ks": Ks.astype(np.float64),
+        "viewmats": invert(c2w.astype(np.float64)), "order": "none",
+    }  # fmt: skip
+
+
+def _first(name: str, values: Any) -> Any:
+    """Return the only one of a list, or of the first axis."""
+    if len(values) != 1:
+        raise SceneError(name, f"expected a batch of one scene, found {len(values)}", "pass one scene")
+    return values[0]
 
 
 def _field(owner: str, value: Any, name: str) -> Any:

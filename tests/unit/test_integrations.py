@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.geometry import covariances, multiply_quats, rgb_to_sh0, rotmat_to_quat, sh0_to_rgb
+from gsmerge.kernels.elementary import log
 from gsmerge.types import as_array
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
@@ -187,3 +189,54 @@ def test_ffgs_without_photos_or_cameras(scene: Scene) -> None:
     assert "viewmats" not in integrations.ffgs(ffgs_output(scene, 0, None))
     with refuses(SceneError, "output", "gaussians"):
         integrations.ffgs(SimpleNamespace(gaussians=None, cameras=None))
+
+
+def test_worldmirror(scene: Scene) -> None:
+    """Voxels: fewer Gaussians than pixels; columns are lists of one scene, or have its axis."""
+    fewer = replace_gaussians(scene, scene.gaussians[::2])
+    g = fewer.gaussians
+    columns = {"means": g.means, "scales": g.scales, "quats": g.quats, "opacities": g.opacities, "sh": g.sh0}
+    splats: dict[str, Any] = {name: batch(column) for name, column in columns.items()}
+    splats["means"] = [splats["means"][0]]
+    predictions: dict[str, Any] = {"splats": splats, "camera_poses": batch(np.linalg.inv(scene.cameras.viewmats))}
+    predictions["camera_intrs"] = batch(scene.cameras.Ks)
+    images = batch(photos_of(scene).transpose(0, 3, 1, 2))
+    given = integrations.worldmirror(predictions, images)
+    assert_holds(given | {"shN": torch.zeros(len(g), 0, 3)}, fewer)
+    assert given["order"] == "none"
+    with refuses(SceneError, "predictions", "splats"):
+        integrations.worldmirror({}, images)
+    with refuses(SceneError, "means", 2):
+        integrations.worldmirror(predictions | {"splats": splats | {"means": [0, 0]}}, images)
+
+
+def trainer_of(scene: Scene) -> tuple[dict[str, torch.nn.Parameter], list[dict[str, torch.Tensor]]]:
+    """What gsplat's trainer optimises, and the views of its data set."""
+    g = scene.gaussians
+    columns = {
+        "means": g.means, "quats": 3 * g.quats, "scales": log(g.scales), "sh0": g.sh0, "shN": g.shN,
+        "opacities": log(g.opacities / (1 - g.opacities)),
+    }  # fmt: skip
+    views = [
+        {"camtoworld": torch.tensor(c2w).float(), "K": torch.tensor(K).float(), "image": torch.tensor(255 * image)}
+        for c2w, K, image in zip(np.linalg.inv(scene.cameras.viewmats), scene.cameras.Ks, scene.images, strict=True)
+    ]
+    return {name: torch.nn.Parameter(torch.tensor(column)) for name, column in columns.items()}, views
+
+
+def test_gsplat(scene: Scene) -> None:
+    """Parameters before their activations, with gradients."""
+    splats, views = trainer_of(replace_opaque(scene))
+    given = integrations.gsplat(splats, views)
+    assert_holds(given, replace_opaque(scene))
+    assert given["order"] == "none"
+    with refuses(SceneError, "splats", "sh0"):
+        integrations.gsplat({name: splats[name] for name in ("means", "quats", "scales", "opacities")}, views)
+    with refuses(SceneError, "dataset", "one size", 2):
+        integrations.gsplat(splats, [*views, views[0] | {"image": views[0]["image"][1:]}])
+
+
+def replace_opaque(scene: Scene) -> Any:
+    """A stand-in for a scene whose opacities have logits."""
+    gaussians = replace(scene.gaussians, opacities=scene.gaussians.opacities.clip(0.01, 0.99))
+    return replace_gaussians(scene, gaussians)
