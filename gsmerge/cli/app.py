@@ -103,8 +103,13 @@ def make_app(only: str | None = None) -> typer.Typer:
 
 @lru_cache
 def make_command(only: str | None = None) -> Any:
-    """Make the command that parses and calls: of all commands, or of ``only`` one."""
-    return typer.main.get_command(make_app(only))
+    """Make the command that parses and calls: of all commands, or of ``only`` one.
+
+    The option of Typer that writes into the shell's own files, unasked, is left out; the one that prints stays.
+    """
+    command = typer.main.get_command(make_app(only))
+    command.params = [param for param in command.params if param.name != "install_completion"]
+    return command
 
 
 def _lab_root(context: typer.Context) -> None:

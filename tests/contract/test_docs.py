@@ -43,7 +43,6 @@ OTHER_OPTIONS = {
     "--help-all",
     "--debug",
     "--progress",
-    "--install-completion",
     "--only",
     "--no-deps",
     "--force-reinstall",

@@ -192,3 +192,9 @@ def test_a_tilde_is_the_home_folder_wherever_a_path_begins(
         assert document["output"]["path"] == str(smallest_copy.parent / "x.ply")
     assert expand_home("masks=~/m") == f"masks={smallest_copy.parent}/m"
     assert expand_home("./~/a=b~c") == "./~/a=b~c"
+
+
+def test_nothing_is_written_into_a_shells_files(run: Run) -> None:
+    """Completion is printed; whoever wants it puts it where it belongs."""
+    assert "--install-completion" in run("--install-completion", code=2).err
+    assert "--show-completion" in run("--help", code=0).out
