@@ -228,21 +228,37 @@ def _check_working_directory() -> None:
         raise SceneError(os.curdir, reason, "change it") from error
 
 
-def _take_progress(words: list[str]) -> tuple[list[str], str]:
-    """Take the option of progress out of the words, wherever it stands; return the others and its value."""
+def _take_progress(words: list[str]) -> tuple[list[str], list[str]]:
+    """Take the options of progress out of the words, wherever they stand; return the others and the values."""
     end = words.index("--") if "--" in words else len(words)
-    for i, word in enumerate(words[:end]):
-        if word.startswith(f"{PROGRESS}="):
-            return words[:i] + words[i + 1 :], word.partition("=")[2]
-        if word == PROGRESS:
-            return words[:i] + words[i + 2 :], "".join(words[i + 1 : i + 2])
-    return words, STYLES[0]
+    others, values, i = [], [], 0
+    while i < end:
+        name, equals, value = words[i].partition("=")
+        if name != PROGRESS:
+            others.append(words[i])
+        elif equals:
+            values.append(value)
+        else:
+            i += 1
+            values.append("".join(words[i : min(i + 1, end)]))
+        i += 1
+    return [*others, *words[end:]], values
+
+
+def _choose_style(values: Sequence[str]) -> str:
+    """Return how progress is shown; UsageError for several values or an unknown one."""
+    if len(values) > 1:
+        raise UsageError(f"{PROGRESS}: expected once, got it {len(values)} times")
+    style = values[0] if values else STYLES[0]
+    if style not in STYLES:
+        raise UsageError(f"{PROGRESS}: expected {' or '.join(STYLES)}, got {style!r}")
+    return style
 
 
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application; every error becomes one line on stderr and an exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
-    words, style = _take_progress([expand_home(word) for word in arguments if word != DEBUG])
+    words, styles = _take_progress([expand_home(word) for word in arguments if word != DEBUG])
 
     def fail(message: str, code: int) -> int:
         cause = getattr(sys.exc_info()[1], "__cause__", None)
@@ -259,9 +275,8 @@ def run(args: Sequence[str] | None = None) -> int:
         return fail(f"ended by {signals[0].name}", 128 + signals[0]) if signals else fail("interrupted", INTERRUPTED)
 
     try:
+        style = _choose_style(styles)
         with plain_warnings(), _orderly_stop(signals), json_progress() if style == "json" else nullcontext():
-            if style not in STYLES:
-                raise UsageError(f"{PROGRESS}: expected {' or '.join(STYLES)}, got {style!r}")
             _check_working_directory()
             words = [LOOK, *words] if words and _is_scene(words[0]) else words
             command = make_command(_command_of(words))

@@ -13,6 +13,9 @@ from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm"})
+OTHER_PICTURES = frozenset({".heic", ".heif", ".avif", ".gif", ".jp2", ".jxl", ".exr", ".dng", ".raw", ".cr2", ".nef"})
+FILMS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v"})
+_CUT = "cut it into the frames that the model saw: ffmpeg -i FILM photos/%05d.jpg"
 _MAX_PARTS = 16  # of a path, its name and the folders above, by which files are found
 _NAME_FOLDER = "name the folder of the photos with --images, or with --target-images those of held-out views"
 _HIDDEN = ".@"  # with which names of hidden folders begin: .thumb, @eaDir
@@ -113,6 +116,23 @@ def list_images(folder: Path) -> list[Path]:
     """List all images below a folder in natural order ("2" before "10"); SceneError for too many files."""
     images = [f for f in walk_files(folder) if f.suffix.lower() in IMAGE_SUFFIXES and not f.name.startswith(".")]
     return sorted(images, key=lambda f: natural_key(f.relative_to(folder).as_posix()))
+
+
+def check_photo_folder(path: Path) -> None:
+    """Raise SceneError if a path is a film, or a folder without a photo that is read."""
+    if path.suffix.lower() in FILMS and path.is_file():
+        raise SceneError(path, "expected a folder of photos, found a film", _CUT)
+    if not path.is_dir() or list_images(path):
+        return
+    found = Counter(file.suffix.lower() for file in walk_files(path))
+    films, pictures = (sum(found[ending] for ending in endings) for endings in (FILMS, OTHER_PICTURES))
+    expected = f"expected photos, {', '.join(sorted(IMAGE_SUFFIXES))}"
+    if pictures:
+        endings = " and ".join(sorted(ending for ending in found if ending in OTHER_PICTURES))
+        raise SceneError(
+            path, f"{expected}, found {pictures} {endings}", "convert them to .jpg or .png, with their names"
+        )
+    raise SceneError(path, f"{expected}, found {'a film' if films else 'none'}", _CUT if films else _NAME_FOLDER)
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:

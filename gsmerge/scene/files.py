@@ -36,7 +36,7 @@ from gsmerge.io.formats.table import (
     is_frame,
     may_hold_gaussians,
 )
-from gsmerge.io.image_names import list_images
+from gsmerge.io.image_names import check_photo_folder, list_images
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.extend import SUFFIX
 from gsmerge.settings.reading import NONE
@@ -164,8 +164,7 @@ def find_scene_files(
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
     named = frozenset(name for name, value in given.items() if value is not None)
     camera_path, image_path, mask_path = map(named_path, given.values())
-    if mask_path is not None and not mask_path.is_dir():
-        raise SceneError(mask_path, "expected a folder of masks, found a file")
+    _check_pictures(image_path, mask_path)
     if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
         check_file(path)
         own = path if cameras is None and _HOLDS_VIEWS(path) else None
@@ -212,6 +211,14 @@ def find_scene_files(
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
     return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies, named=named)
+
+
+def _check_pictures(image_path: Path | None, mask_path: Path | None) -> None:
+    """Raise SceneError for a named place of photos without any, or masks that are no folder."""
+    if mask_path is not None and not mask_path.is_dir():
+        raise SceneError(mask_path, "expected a folder of masks, found a file")
+    if image_path is not None:
+        check_photo_folder(image_path)
 
 
 def _list_between(folder: Path, top: Path) -> list[Path]:

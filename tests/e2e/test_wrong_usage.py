@@ -198,3 +198,30 @@ def test_nothing_is_written_into_a_shells_files(run: Run) -> None:
     """Completion is printed; whoever wants it puts it where it belongs."""
     assert "--install-completion" in run("--install-completion", code=2).err
     assert "--show-completion" in run("--help", code=0).out
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ((), "found none"), (("a.HEIC", "b.heic"), "found 2 .heic; convert them"),
+        (("a.avif", "b.gif"), "found 2 .avif and .gif"), (("a.mp4",), "found a film"), (("notes.txt",), "found none"),
+    ],
+)  # fmt: skip
+def test_a_named_folder_without_photos_is_refused(
+    names: tuple[str, ...], said: str, smallest_scene: Path, tmp_path: Path, run: Run
+) -> None:
+    """What a user names is used, or one line says why it is not."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_bytes(b"\0")
+    outcome = run("compact", smallest_scene, "--images", folder, "-o", tmp_path / "a.ply", code=3)
+    assert said in outcome.err
+    assert outcome.err.count("\n") == 1
+    assert not (tmp_path / "a.ply").exists()
+
+
+def test_a_film_is_no_folder_of_photos(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+    (tmp_path / "a.mov").write_bytes(b"\0")
+    outcome = run("compact", smallest_scene, "--images", tmp_path / "a.mov", "-o", tmp_path / "a.ply", code=3)
+    assert "found a film; cut it into the frames" in outcome.err
