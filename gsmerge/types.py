@@ -259,6 +259,10 @@ class Views:
         return Views(self.cameras[ids], self.images[ids], tuple(self.names[i] for i in ids))
 
 
+PROTECTED = np.float32(4)  # pixels that one counts as where a picture of --protect is white
+PER_PIXEL = ("images", "missing", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
+
+
 @dataclass(frozen=True)
 class Scene:
     """Gaussians, and the views that they were made from or that see them.
@@ -275,6 +279,7 @@ class Scene:
         missing: ``[v,h,w]`` bool, True where the file has no row for the pixel; None: nowhere.
         large_photos: The photos with more pixels than the views, or None.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. A view without a photo has none such.
+        importance: ``[v,h,w]`` float32, how many pixels a photo's pixel counts as in a fit; None: one everywhere.
 
     Raises:
         ValueError: If the sizes do not fit together.
@@ -293,6 +298,7 @@ class Scene:
     missing: np.ndarray | None = None
     large_photos: LargePhotos | None = None
     masks: np.ndarray | None = None
+    importance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
@@ -300,9 +306,9 @@ class Scene:
             if len(self.gaussians) != v * h * w:
                 raise ValueError(f"expected {v} x {h} x {w} = {v * h * w} Gaussians, got {len(self.gaussians)}")
             _expect("pixel_ids", self.pixel_ids, (v * h * w,))
-        for name, shape in (("missing", (v, h, w)), ("masks", (v, h, w)), ("images", (v, h, w, 3))):
+        for name in PER_PIXEL:
             if getattr(self, name) is not None:
-                _expect(name, getattr(self, name), shape)
+                _expect(name, getattr(self, name), (v, h, w, 3) if name == "images" else (v, h, w))
         for what, values in (("view names", self.names), ("large photos", getattr(self.large_photos, "ids", None))):
             if values is not None and len(values) != v:
                 raise ValueError(f"expected {v} {what}, got {len(values)}")
@@ -318,7 +324,7 @@ class Scene:
 
     def numpy(self) -> Scene:
         """Return the same scene with NumPy arrays in place of tensors."""
-        names = [name for name in ("images", "pixel_ids", "missing", "masks") if getattr(self, name) is not None]
+        names = [name for name in ("pixel_ids", *PER_PIXEL) if getattr(self, name) is not None]
         arrays: dict[str, Any] = {name: as_array(getattr(self, name)) for name in names}
         return replace(self, gaussians=self.gaussians.numpy(), cameras=self.cameras.numpy(), **arrays)
 
@@ -344,6 +350,14 @@ class Scene:
         if self.images is None or self.masks is None:
             return [] if self.images is None else list(range(len(self)))
         return [view for view, mask in enumerate(self.masks) if mask.any()]
+
+    @property
+    def protected(self) -> np.ndarray | None:
+        """Mask ``[v,h,w]`` of the pixels that count as at least half as many as protected ones; None if none do."""
+        if self.images is None or self.importance is None:
+            return None
+        mask = self.importance >= PROTECTED / 2
+        return mask if mask.any() else None
 
     @property
     def num_missing(self) -> int:

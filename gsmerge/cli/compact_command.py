@@ -51,7 +51,7 @@ PARAMETERS = (
     opt.argument("scenes", list[Path], "SCENE...", "A .ply with one Gaussian per pixel and view, "
                  "or the folder it is in; several of one place, as SHARP writes them, are joined. Or a .gsm of gsmerge "
                  "extend."),
-    f"{opt.READING} masks budget quality levels k effort fit",
+    f"{opt.READING} masks protect budget quality levels k effort fit",
     opt.settings_option(CompactOptions, FileOptions, Engine),
     "crop drop",
     opt.output(f"{opt.COMPACT_SCENE} .html: a page to send, with a viewer. lod-meta.json: levels that stream; "

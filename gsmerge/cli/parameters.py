@@ -135,7 +135,7 @@ class Args(SimpleNamespace):
         """
         from gsmerge.scene.files import find_scene_files
 
-        places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks")}}
+        places = {"cameras": self.cameras, **{name: vars(self).get(name) for name in ("images", "masks", "protect")}}
         first, *others = (find_scene_files(path, **places) for path in (scene, *more))
         return replace(first, more=tuple(others))
 
@@ -376,6 +376,8 @@ _TABLE = (
                parser=named_or_none),
         option("masks", Path, "Folder of images named as the photos, dark where a photo does not count. Default: masks "
                "beside the photos, and where these are transparent; none: without.", parser=named_or_none),
+        option("protect", Path, "Folder of images named as the photos, white where a text or face has to stay sharp: "
+               "it counts four times."),
         option("hint", list[str], "How to read the file, where it is recognised wrongly: "
                f"{join_words(flat_settings(FileHints))}, such as order=none; may be repeated.", metavar="NAME=VALUE"),
         option("targets", Path, "Cameras of held-out photos, in any camera file; views that the scene was made from "

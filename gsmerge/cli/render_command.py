@@ -15,6 +15,7 @@ from gsmerge.settings.reading import NONE
 
 MAX_SIDE = 1 << 20  # pixels: pictures have the cameras' own size
 PICTURES, CLIPS = (".png", ".jpg", ".jpeg", ".webp"), (".mp4", ".webm", ".gif")
+ALPHA_CLIP = ".webm"  # the one kind of clip that has alpha
 SIDES = (16, 16384)  # pixels of a picture
 
 
@@ -59,8 +60,8 @@ def parse_background(text: str) -> float | str:
         opt.option("views", int, "Views at most, at equal intervals.", wording="4 on a panel, else all", min=1),
         opt.option("overlay", ("support",), "Colour what one view of the scene alone shows, and what none does: "
                    "yellow, red."),
-        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, pictures in a folder have "
-                   "alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
+        opt.option("background", str, "Grey level behind the scene, 0 to 1; none: nothing, a .webm or pictures in a "
+                   "folder have alpha.", wording="0", metavar="LEVEL|none", parser=parse_background),
         opt.option("channel", ("color", "alpha", "depth"), "What the pictures in a folder show: colour, opacity, or "
                    "depth in 16 bits, 0 where nothing is; --json has their unit.", wording="color"),
     ),
@@ -106,10 +107,11 @@ def _choose_kind(args: opt.Args) -> str:
         raise UsageError(f"{args.output}: expected {expected}")
     if is_clip and args.path is None:
         args.path = "orbit"
-    if (args.background == NONE or args.channel not in (None, "color")) and (
-        is_clip or is_picture or len(args.scenes) > 1
-    ):
-        raise UsageError(f"{args.output}: expected a folder and one scene with --background none or --channel")
+    in_folder = not (is_clip or is_picture) and len(args.scenes) == 1
+    if args.channel not in (None, "color") and not in_folder:
+        raise UsageError(f"{args.output}: expected a folder and one scene with --channel")
+    if args.background == NONE and not in_folder and (suffix != ALPHA_CLIP or len(args.scenes) > 1):
+        raise UsageError(f"{args.output}: expected a folder or a {ALPHA_CLIP}, and one scene, with --background none")
     if args.path is not None:
         if is_picture:
             raise UsageError(f"{args.output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")

@@ -22,7 +22,7 @@ from gsmerge.compaction.partition import (
     partition_views,
 )
 from gsmerge.compaction.report import CompactReport, Covered, PhotoFiles
-from gsmerge.compaction.result import CompactResult, measure_besides, measure_input, measure_on_files, measure_result
+from gsmerge.compaction.result import Besides, CompactResult, InputScores, measure_besides, measure_result, score_input
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.facts.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.facts.views import in_float64, subset
@@ -32,7 +32,7 @@ from gsmerge.pipeline import start
 from gsmerge.plan import WHOLE_GAUSSIANS, Plan, SceneChoices, make_plan
 from gsmerge.raster import contributions, make_splats, tile_view
 from gsmerge.raster.metrics import describe_loss
-from gsmerge.raster.photos import Photos, PhotoScore, blank_photos
+from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import Splats
 from gsmerge.runtime.estimate import memory_bytes
 from gsmerge.runtime.memory import free_pages, make_array, peak_memory
@@ -48,7 +48,7 @@ from gsmerge.types import Decoded, Gaussians, PicturedScene, Scene, SceneT
 
 T = TypeVar("T")
 # of a result on a block: PSNR (dB), over the pixels that the input covers, and on files of photos that were changed
-Scores = tuple[float | None, Covered | None, PhotoFiles | None]
+Scores = tuple[float | None, Besides]
 FOREIGN = 0.1  # share of a Gaussian's weights in other blocks' views from which on it is at a seam
 SEAM_SHARE = 0.1  # of a view's weights that such Gaussians have from which on it is fitted to
 SEAM_STEPS = 100  # at least
@@ -119,7 +119,7 @@ def compact_in_blocks(
             "views": len(part.block.own), "shared_views": len(part.block.shared), "num_start": len(part.gaussians),
             "psnr_input_views": psnr, "fit": chosen.get("fit"),
         }
-        for part, (_, chosen), (psnr, *_) in zip(parts, fitted, scores, strict=True)
+        for part, (_, chosen), (psnr, _) in zip(parts, fitted, scores, strict=True)
     ]  # fmt: skip
     choose(blocks=facts)
     return CompactResult(result, join_reports(scene, result, parts, scores, options), scene.cameras).to(device)
@@ -143,8 +143,7 @@ class BlockStart:
     count: int  # Gaussians that it is to have in the end
     prepared: Prepared  # its views, without the Gaussians of their pixels
     plan: Plan
-    before: PhotoScore | None  # of the input on the scored views
-    on_files: float | None  # the same on the files of photos that were changed, dB
+    before: InputScores
 
 
 def start_part(
@@ -155,9 +154,9 @@ def start_part(
     plan = make_plan(prepared, options)
     decoded = start(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
-    scores = measure_input(prepared, plan), measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
+    before = score_input(prepared, plan)
     count, prepared = round(keep.sum() / max(1, len(keep)) * decoded.count), without_gaussians(prepared)
-    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, *scores)
+    return BlockStart(block, decoded.gaussians[keep], count, prepared, plan, before)
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
@@ -210,13 +209,10 @@ def fit_part(part: BlockStart, everything: tuple[Gaussians, np.ndarray], growth:
 
 
 def score_part(part: BlockStart, gaussians: Gaussians, _: int) -> Scores:
-    """Measure the PSNR (dB) of the whole result on a block's scored photos.
-
-    Also on the pixels that the input covers, and on photos as their files have them.
-    """
+    """Measure the PSNR (dB) of the whole result on a block's scored photos, and what :class:`Besides` lists."""
     measured = measure_result(gaussians, part.prepared, part.plan)
     psnr = None if measured is None else measured.psnr
-    return psnr, *measure_besides(part.before, part.on_files, gaussians, part.prepared, part.plan)
+    return psnr, measure_besides(part.before, gaussians, part.prepared, part.plan)
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, parts: Sequence[BlockStart], seed: int) -> Gaussians:
@@ -353,12 +349,11 @@ def join_reports(
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=sizes))
 
-    scored = sum(
-        len(part.plan.scored_views) for part, (psnr, *_) in zip(parts, scores, strict=True) if psnr is not None
-    )
-    before = mean([None if part.before is None else part.before.psnr for part in parts])
-    after = mean([psnr for psnr, *_ in scores])
-    covered, photo_files = _join_besides(parts, scores, sizes)
+    scored = sum(len(part.plan.scored_views) for part, (psnr, _) in zip(parts, scores, strict=True) if psnr is not None)
+    before = mean([None if part.before.photos is None else part.before.photos.psnr for part in parts])
+    after = mean([psnr for psnr, _ in scores])
+    besides = _join_besides(parts, scores, sizes)
+    covered = besides.covered
     reference = None if before is None else parts[0].prepared.reference.name
     compared = (covered.before, covered.after) if covered else (before, after)
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
@@ -366,34 +361,41 @@ def join_reports(
     notes = list(dict.fromkeys(run.notes))
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
-        psnr_after=after, covered=covered, choices=run.choices | {"scored_views": scored},
+        psnr_after=after, choices=run.choices | {"scored_views": scored},
         notes=notes if worse is None else [*notes, worse], options=options.to_dict(),
-        peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
-        photo_files=photo_files,
+        peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference, **vars(besides),
     )  # fmt: skip
 
 
-def _join_besides(
-    parts: Sequence[BlockStart], scores: Sequence[Scores], sizes: Sequence[int]
-) -> tuple[Covered | None, PhotoFiles | None]:
+def _join_besides(parts: Sequence[BlockStart], scores: Sequence[Scores], sizes: Sequence[int]) -> Besides:
     """Average over blocks the scores of covered pixels, and on files of photos; a block without has its others.
 
-    None in place of those that no block has, or that some block lacks altogether.
+    None in place of those that no block has, or that some block lacks altogether. Scores of protected pixels are
+    averaged over those blocks that have some, by how many.
     """
     whole = [
-        (part.before.psnr, psnr)
-        for part, (psnr, *_) in zip(parts, scores, strict=True)
-        if part.before is not None and psnr is not None
+        (part.before.photos.psnr, psnr)
+        for part, (psnr, _) in zip(parts, scores, strict=True)
+        if part.before.photos is not None and psnr is not None
     ]
     if len(whole) < len(sizes):
-        return None, None
+        return Besides()
 
-    def mean(rows: Sequence[tuple[float, ...]]) -> list[float]:
-        return np.average(rows, axis=0, weights=sizes).tolist()
+    def mean(rows: Sequence[tuple[float, ...]], weights: Sequence[float] = sizes) -> list[float]:
+        return np.average(rows, axis=0, weights=weights).tolist()
 
-    covered = [each or Covered(1.0, *pair) for (_, each, _), pair in zip(scores, whole, strict=True)]
-    files = [each or PhotoFiles(*pair) for (*_, each), pair in zip(scores, whole, strict=True)]
-    return (
-        Covered(*mean([astuple(each) for each in covered])) if any(each for _, each, _ in scores) else None,
-        PhotoFiles(*mean([astuple(each) for each in files])) if any(each for *_, each in scores) else None,
+    each = [besides for _, besides in scores]
+    covered = [one.covered or Covered(1.0, *pair) for one, pair in zip(each, whole, strict=True)]
+    files = [one.photo_files or PhotoFiles(*pair) for one, pair in zip(each, whole, strict=True)]
+    shares = [
+        size * (0.0 if one.protected is None else one.protected.share) for one, size in zip(each, sizes, strict=True)
+    ]
+    protected = None
+    if sum(shares) > 0:
+        pairs = [(one.protected.before, one.protected.after) if one.protected else (0.0, 0.0) for one in each]
+        protected = Covered(sum(shares) / sum(sizes), *mean(pairs, shares))
+    return Besides(
+        Covered(*mean([astuple(one) for one in covered])) if any(one.covered for one in each) else None,
+        PhotoFiles(*mean([astuple(one) for one in files])) if any(one.photo_files for one in each) else None,
+        protected,
     )

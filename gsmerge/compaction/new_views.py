@@ -127,12 +127,14 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     cut = slice(None), slice(0, height * step), slice(0, width * step)
     images = shrink_pictures(scene.images[cut], width, height)
     middle = slice(None), slice(step // 2, height * step, step), slice(step // 2, width * step, step)
-    masks, missing, empty = (
-        None if mask is None else mask[middle] for mask in (scene.masks, scene.missing, scene.empty)
+    masks, missing, empty, importance = (
+        None if values is None else values[middle]
+        for values in (scene.masks, scene.missing, scene.empty, scene.importance)
     )
     small = replace(
         scene, cameras=replace(cameras, Ks=Ks, width=width, height=height), images=images, masks=masks,
-        empty=empty, gaussians=scene.gaussians[:0], pixel_ids=None, missing=None, large_photos=None,
+        empty=empty, importance=importance, gaussians=scene.gaussians[:0],
+        pixel_ids=None, missing=None, large_photos=None,
     )  # fmt: skip
     if not scene.aligned:
         return replace(small, gaussians=scene.gaussians)

@@ -72,6 +72,7 @@ class CompactReport:
         covered: PSNR over the pixels that the input covers, where it lacks more than 2 % of them; None where it does
             not.
         photo_files: PSNR on the photos as their files have them, where the run changed some; None where it did not.
+        protected: PSNR over the pixels that ``protect`` names, and their share of those scored; None without.
 
     Example:
         >>> report = gsmerge.compact("demo", effort="draft", budget=300).report
@@ -94,6 +95,7 @@ class CompactReport:
     psnr_reference: str | None = None
     new_views: NewViews | None = None
     photo_files: PhotoFiles | None = None
+    protected: Covered | None = None
 
     def __repr__(self) -> str:
         return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
@@ -116,6 +118,8 @@ class CompactReport:
             facts += [("PSNR of its own views", f"{self.psnr_before:.2f} -> {self.psnr_after:.2f} dB")]
         if files := self.photo_files:
             facts += [("on photos as they are", f"{files.before:.2f} -> {files.after:.2f} dB")]
+        if protected := self.protected:
+            facts += [("where they are protected", f"{protected.before:.2f} -> {protected.after:.2f} dB")]
         if judged := self.choices.get("fidelity"):
             facts += [("PSNR", f"{judged['psnr']:.1f} dB {_judged_by(judged)}")]
         return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
@@ -151,6 +155,7 @@ def report_document(
         ``psnr_reference``: what ``psnr_input_views`` are measured against: "photos", or what stands in for them.
         ``psnr_covered``: ``share``, ``before``, ``after`` over the pixels that the input covers, where it lacks some.
         ``psnr_photo_files``: ``before``, ``after`` on the photos as their files have them, where the run changed some.
+        ``psnr_protected``: ``share``, ``before``, ``after`` over the pixels that ``protect`` names.
         ``worse``: that the result, or the first level that does, shows the photos worse than the input, or that the
         result is below 30 dB from the input where there are no photos; or null.
     """
@@ -171,6 +176,7 @@ def report_document(
                 "psnr_input_views": level.psnr_after,
                 "psnr_covered": level.covered and asdict(level.covered),
                 "psnr_photo_files": level.photo_files and asdict(level.photo_files),
+                "psnr_protected": level.protected and asdict(level.protected),
                 "seconds": round(sum(level.seconds.values()), 4),
                 "choices": level.choices,
                 "notes": level.notes,
@@ -188,6 +194,7 @@ def report_document(
         "psnr_reference": numbers["psnr_reference"],
         "psnr_covered": numbers["covered"],
         "psnr_photo_files": numbers["photo_files"],
+        "psnr_protected": numbers["protected"],
         "peak_memory_bytes": numbers["peak_memory_bytes"],
         "notes": [*notes, *numbers["notes"]],
         "unmet": numbers["unmet"],
@@ -225,6 +232,9 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         rows += [
             ("", f"{files['before']:.2f} dB", f"{files['after']:.2f} dB", "on its photos as their files have them")
         ]
+    if protected := document.get("psnr_protected"):
+        share = f"on the {100 * protected['share']:.1f} % that are protected"
+        rows += [("", f"{protected['before']:.2f} dB", f"{protected['after']:.2f} dB", share)]
     judged = document["choices"].get("fidelity")
     if judged:
         rows += [("PSNR", "", f"{judged['psnr']:.1f} dB", _judged_by(judged))]
@@ -288,6 +298,8 @@ def summary_line(document: Mapping[str, Any]) -> str:
         quality += f", {covered['before']:.2f} -> {covered['after']:.2f} dB {share}"
     if files := document.get("psnr_photo_files"):
         quality += f", {files['before']:.2f} -> {files['after']:.2f} dB on the photos as their files have them"
+    if protected := document.get("psnr_protected"):
+        quality += f", {protected['before']:.2f} -> {protected['after']:.2f} dB where they are protected"
     return (
         f"{after['path']}: {before['num_gaussians']:,} -> {after['num_gaussians']:,} Gaussians"
         f" ({100 * document['ratio']:.2f} %), {human_bytes(before['bytes'])} -> {human_bytes(after['bytes'])}"

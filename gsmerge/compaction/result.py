@@ -276,16 +276,55 @@ def measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> fl
     return _score_photos("score", gaussians, views, prepared, plan, None).psnr
 
 
-def measure_besides(
-    before: PhotoScore | None, on_files: float | None, gaussians: Gaussians, prepared: Prepared, plan: Plan
-) -> tuple[Covered | None, PhotoFiles | None]:
-    """Score a result over the pixels that the input covers, and on photos as their files have them.
+def measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore | None:
+    """Score Gaussians of the world over the pixels that are protected; None where none of the scored views' are."""
+    if not prepared.reference.of_views or prepared.input_scene.importance is None:
+        return None
+    shown = prepared.result_views()
+    masks = None if shown.protected is None else shown.protected[list(plan.scored_views)]
+    if masks is None or not masks.any():
+        return None
+    return _score_photos("score", gaussians, shown, prepared, plan, list(masks))
 
-    ``before`` and ``on_files`` are the input's scores; None in place of each that says nothing more.
+
+@dataclass(frozen=True)
+class InputScores:
+    """Scores of an input, which a result is compared with; None in place of each that cannot be measured."""
+
+    photos: PhotoScore | None  # on the scored views
+    on_files: float | None  # on the files of photos that were changed, dB
+    protected: PhotoScore | None  # over protected pixels
+
+
+def score_input(prepared: Prepared, plan: Plan) -> InputScores:
+    """Score the input's own Gaussians, unless the plan has that."""
+    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
+    return InputScores(
+        photos, measure_on_files(gaussians, prepared, plan), measure_protected(gaussians, prepared, plan)
+    )
+
+
+@dataclass(frozen=True)
+class Besides:
+    """PSNR of a result on parts of the pixels, or on other photos; None in place of each that says nothing more."""
+
+    covered: Covered | None = None
+    photo_files: PhotoFiles | None = None
+    protected: Covered | None = None
+
+
+def measure_besides(before: InputScores, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Besides:
+    """Score a result over pixels that the input covers or that are protected, and on photos as their files have them.
+
+    The scores of the input come ``before``.
     """
-    covered = measure_covered(before, gaussians, prepared, plan)
-    after = None if on_files is None else measure_on_files(_written(gaussians, plan), prepared, plan)
-    return covered, None if on_files is None or after is None else PhotoFiles(on_files, after)
+    covered, written = measure_covered(before.photos, gaussians, prepared, plan), _written(gaussians, plan)
+    after = None if before.on_files is None else measure_on_files(written, prepared, plan)
+    files = None if before.on_files is None or after is None else PhotoFiles(before.on_files, after)
+    within = None if before.protected is None else measure_protected(written, prepared, plan)
+    if before.protected is None or within is None:
+        return Besides(covered, files)
+    return Besides(covered, files, Covered(within.share, before.protected.covered_psnr, within.covered_psnr))
 
 
 def make_result(
@@ -303,13 +342,10 @@ def make_result(
     current record, followed by those of the candidates.
     """
     run, seconds = current_record(), search["seconds"]
-    input_score = measure_input(prepared, plan) if plan.before is None else plan.before
-    before = None if input_score is None else input_score.psnr
-    on_files = measure_on_files(prepared.input_scene.file_gaussians, prepared, plan)
+    input_scores = score_input(prepared, plan)
+    before = None if input_scores.photos is None else input_scores.photos.psnr
     measured = [
-        measure_besides(
-            input_score, on_files, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan
-        )
+        measure_besides(input_scores, candidate.gaussians, _move_views(prepared, candidate.fitted.cameras), plan)
         for candidate in (best, *levels)
     ]
     names = {**run.seconds, **seconds}
@@ -338,22 +374,22 @@ def _report(
     prepared: Prepared,
     plan: Plan,
     before: float | None,
-    besides: tuple[Covered | None, PhotoFiles | None],
+    besides: Besides,
     seconds: Mapping[str, float],
     level: int,
 ) -> CompactReport:
     """Report on one level of detail, given the PSNR of the input ``before``; 0 is the result itself."""
-    reference, record, (covered, photo_files) = prepared.reference, candidate.record, besides
+    reference, record, covered = prepared.reference, candidate.record, besides.covered
     rendered = reference.name == RENDERS
     shown = None if rendered else candidate.psnr
     made = CompactReport(
         prepared.input_scene.num_gaussians, len(candidate.gaussians), dict(seconds), before, shown, record.choices,
-        record.notes, plan.settings, peak_memory(), covered=covered,
-        psnr_reference=None if before is None else reference.name, photo_files=photo_files,
+        record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
+        **vars(besides),
     )  # fmt: skip
     if prepared.doubt is not None:
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
-        made = replace(made, psnr_before=None, psnr_after=None, covered=None, photo_files=None, choices=choices)
+        made = replace(made, psnr_before=None, psnr_after=None, **vars(Besides()), choices=choices)
         return replace(made, notes=[*made.notes, prepared.doubt], worse=prepared.doubt)
     worse = None
     if rendered and level == 0 and not plan.clean.hiding:  # coarser levels are meant to differ

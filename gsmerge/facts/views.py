@@ -8,11 +8,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.types import Cameras, Scene, SceneT, grid_ids
+from gsmerge.types import PER_PIXEL, Cameras, Scene, SceneT, grid_ids
 
 MAX_SCORED_VIEWS = 24  # views by which whole scenes are judged where something depends on it
 REPORT_VIEWS = 4  # views that input and result are scored on for the report alone
-BY_VIEW = ("cameras", "images", "missing", "large_photos", "masks", "empty")  # fields of scenes with a part for a view
+BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of scenes with a part for each view
 
 
 def even_views(num_views: int, count: int) -> list[int]:
@@ -71,8 +71,8 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
 
 
 def _equal_views(scene: Scene, first: int, second: int) -> bool:
-    """Return whether two views of one camera have the same photo, mask and Gaussians."""
-    for pictures in (scene.images, scene.masks):
+    """Return whether two views of one camera have the same photo, mask, importance and Gaussians."""
+    for pictures in (scene.images, scene.masks, scene.importance):
         if pictures is not None and not np.array_equal(pictures[first], pictures[second]):
             return False
     if not scene.aligned:

@@ -65,12 +65,15 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> FitState:
 
 
 def error_masses(state: FitState, half: Photos) -> np.ndarray:
-    """Sum ``[n]`` blending weight times absolute pixel error of each Gaussian over all half-size photos."""
+    """Sum ``[n]`` blending weight times absolute pixel error, as it counts, of each Gaussian over half-size photos."""
 
     def one_view(view: int) -> np.ndarray:
         tiled = tile_view(state.splats, **half.camera(view))
         image, _ = composite(tiled, state.view_colors())
-        return splat_adjoint(tiled, np.abs(image - half.image(view)).mean(-1, keepdims=True))[:, 0]
+        errors = np.abs(image - half.image(view)).mean(-1, keepdims=True)
+        if half.importance is not None:
+            errors *= half.importance[view][..., None]
+        return splat_adjoint(tiled, errors)[:, 0]
 
     masses = np.zeros(len(state.x))
     for of_view in in_turn(one_view, range(len(half))):

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.raster.metrics import decibels
-from gsmerge.raster.photos import EPS2D, Photos, pixel_weights, scene_photos
+from gsmerge.raster.photos import EPS2D, Photos, scene_photos, with_pixel_values
 from gsmerge.runtime.record import choose, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.fit import FitOptions
@@ -93,8 +93,8 @@ def large_photos(scene: Scene, scale: float) -> Photos:
         return np.asarray(cv2.resize(large.read(photo), (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
     Ks = large.Ks * np.array([[width / large.width], [height / large.height], [1.0]])
-    weights = pixel_weights(scene.masks, width, height)
-    return Photos(np.stack(parallel_map(read, large.ids)), cameras.viewmats.astype(np.float64), Ks, EPS2D, weights)
+    pictures = np.stack(parallel_map(read, large.ids))
+    return with_pixel_values(Photos(pictures, cameras.viewmats.astype(np.float64), Ks, EPS2D), scene)
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:

@@ -74,8 +74,8 @@ class FitRun:
     # [h,w] float32 of each photo at half size: 0 on held-out patches, if the fit is judged by them, `HIDDEN`
     # on pixels that neither steps nor scores use, 1 elsewhere
     weights: list[np.ndarray]
-    # The same as a step uses them, at every size: 0 on hidden pixels; at full size 1 on held-out
-    # patches, too, and larger photos count everywhere
+    # The same as a step uses them, at every size, times the importance of the pixels: 0 on hidden pixels; at full
+    # size not 0 on held-out patches, and larger photos count everywhere
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps, the first ones, on half-size photos
@@ -113,14 +113,14 @@ def prepare_fit(job: FitJob) -> FitRun:
     long = options.steps >= max(LONG_STEPS, LONG_LOOKS * len(photos[0]))
     default = DROPOUT if few else LONG_DROPOUT if long else 0.0
     dropout = default if options.dropout is None else options.dropout
-    everywhere, *larger = (_weights_of(level) for level in (photos[0], *photos[2:]))
+    everywhere, *larger = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
     weights = trained = _weights_of(photos[1])
     if options.judged:
         weights = reduced(training_weights(photos[0], options.holdout, job.seed), photos[1])
         trained = [np.where(weight == HIDDEN, np.float32(0), weight) for weight in weights]
         if len(photos[0]) == 1:  # no other photo shows what is held out: the fit is judged by all that it sees
             weights = [np.where(weight == 1, np.float32(0), weight) for weight in weights]
-    return FitRun(job, weights, (everywhere, trained, *larger), dropout, options.half_res_part)
+    return FitRun(job, weights, (everywhere, _weigh(trained, photos[1]), *larger), dropout, options.half_res_part)
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:
@@ -128,6 +128,13 @@ def _weights_of(photos: Photos) -> list[np.ndarray]:
     if photos.weights is None:
         return [np.ones((photos.height, photos.width), np.float32)] * len(photos)
     return list(photos.weights)
+
+
+def _weigh(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
+    """Multiply the weights ``[h,w]`` of each photo by the importance of its pixels."""
+    if photos.importance is None:
+        return weights
+    return [weight * importance for weight, importance in zip(weights, photos.importance, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,16 +99,16 @@ def _lookup(root: Path, by_ending: dict[str, list[Path]], name: str, option: str
     return matches[0] if matches else None
 
 
-def match_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
+def match_masks(folder: Path, names: Sequence[str], option: str = "--masks") -> list[Path | None]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without.
 
-    SceneError if the folder has no mask of any view, or two of one view.
+    SceneError, which names the ``option``, if the folder has no mask of any view, or two of one view.
     """
     by_ending = _by_ending(folder, list_images(folder))
-    masks = [_lookup(folder, by_ending, name, "--masks") for name in names]
+    masks = [_lookup(folder, by_ending, name, option) for name in names]
     if not any(masks):
         problem = f"expected masks named as the photos, such as {PurePath(names[0]).stem}.png, found none of them"
-        raise SceneError(folder, problem, "rename them, or name another folder with --masks")
+        raise SceneError(folder, problem, f"rename them, or name another folder with {option}")
     return masks
 
 

@@ -220,12 +220,11 @@ def same_shape(size: Size, other: Size) -> bool:
     return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
-def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
-    """Decode a mask to ``[h,w]`` bool: True, the photo counts, where it is brighter than half of its maximum.
+def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
+    """Decode the brightness ``[h,w]`` uint8 of a mask, of which 255 is its maximum.
 
     The memory limit is that of its bytes and of its ``photo`` together, since masks compress to almost nothing.
     """
-
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
@@ -244,7 +243,14 @@ def decode_mask(path: Path, photo: Path | None = None) -> np.ndarray:
 
     grey = _decode_channel(path, brightness)
     assert grey is not None
-    return np.asarray(grey > grey.max(initial=0) / 2)
+    most = float(grey.max(initial=0))
+    if grey.dtype == np.uint8 and most in (0, 255):
+        return grey
+    levels = np.zeros(grey.shape, np.uint8)
+    for top in range(0, len(grey) if most > 0 else 0, _BAND):
+        rows = slice(top, top + _BAND)
+        levels[rows] = np.round(np.clip(grey[rows] * (255 / most), 0, 255))
+    return levels
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:

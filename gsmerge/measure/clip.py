@@ -28,7 +28,17 @@ from gsmerge.types import StrPath
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
 GIF = ".gif"
 SUFFIXES = (*ENCODERS, GIF)
-H264 = "H.264"  # of .mp4 where the program ffmpeg is at hand: nearly every program plays it
+# How the program ffmpeg encodes frames with so many channels, and the encoder that it needs: nearly every program plays
+# H.264, and browsers and editors read the alpha of VP9
+BY_FFMPEG = {
+    3: ("H.264", "libx264", "mp4", (
+        "-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709",  # as players expect of large frames
+        "-preset", "veryfast", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart",
+    )),
+    4: ("VP9 with alpha", "libvpx-vp9", "webm", (
+        "-crf", "24", "-b:v", "0", "-pix_fmt", "yuva420p", "-deadline", "realtime", "-cpu-used", "6",
+    )),
+}  # fmt: skip
 MAX_VIDEO_PIXELS = 1 << 23  # of a frame, a little more than 3840 x 2160: encoders take 150 bytes for each
 MAX_GIF_PIXELS = 1 << 27  # of all frames: 400 MB of memory, and files that nobody sends
 GIF_SAMPLE = 1 << 20  # pixels that the palette of a GIF is made of
@@ -36,6 +46,7 @@ OPENCV = "opencv-contrib-python-headless"
 FOLDER = "name a folder instead, for one picture a frame"
 SWIPE_SECONDS = 6  # in which the line goes to both sides and back
 SWAY = 0.9  # of the way to the neighbouring lines, or the border
+BLUE_FIRST = [2, 1, 0, 3]
 LINE = 480  # by which the width of a frame is divided for that of the line
 
 
@@ -107,17 +118,18 @@ def draw_swipe(pictures: Sequence[Picture], places: Sequence[int], captions: Seq
 
 
 class FfmpegWriter:
-    """Write frames as H.264 with the program ffmpeg, by the calls of :class:`cv2.VideoWriter`."""
+    """Write frames of three or four channels with the program ffmpeg, by the calls of :class:`cv2.VideoWriter`."""
 
-    def __init__(self, program: str, path: Path, size: tuple[int, int], fps: float) -> None:
-        frames = ("-f", "rawvideo", "-pix_fmt", "bgr24", "-s", "{}x{}".format(*size), "-r", str(fps), "-i", "-")
-        colors = ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709")  # as players expect of large frames
-        encoding = ("-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4")
-        command = (program, "-v", "quiet", "-y", *frames, *colors, *encoding, str(path))
+    def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
+        height, width, channels = shape
+        order = {3: "bgr24", 4: "bgra"}[channels]
+        frames = ("-f", "rawvideo", "-pix_fmt", order, "-s", f"{width}x{height}", "-r", str(fps), "-i", "-")
+        _, encoder, container, encoding = BY_FFMPEG[channels]
+        command = (program, "-v", "quiet", "-y", *frames, "-c:v", encoder, *encoding, "-f", container, str(path))
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
 
     def write(self, frame: np.ndarray) -> None:
-        """Add a frame ``[h,w,3]`` in the order blue, green, red."""
+        """Add a frame ``[h,w,c]`` in the order blue, green, red, alpha."""
         assert self.process.stdin is not None
         with suppress(BrokenPipeError):  # it has ended: the frames that are missing are counted later
             self.process.stdin.write(np.ascontiguousarray(frame).tobytes())
@@ -128,13 +140,13 @@ class FfmpegWriter:
             self.process.communicate()
 
 
-def find_ffmpeg() -> str | None:
-    """Find a program ffmpeg that encodes H.264 on the PATH; None if there is none."""
+def find_ffmpeg(encoder: str) -> str | None:
+    """Find a program ffmpeg that has an encoder on the PATH; None if there is none."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
             listed = subprocess.run((program, "-hide_banner", "-encoders"), capture_output=True, check=False).stdout
-            return program if b" libx264 " in listed else None
+            return program if f" {encoder} ".encode() in listed else None
     return None
 
 
@@ -142,10 +154,11 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
     """Write pictures ``[h,w,3]`` of one size as a video or a GIF, and return the name of its encoding.
 
     A ``.mp4`` is H.264 if :func:`find_ffmpeg` finds a program for it; otherwise the first encoding that OpenCV has is
-    used. All frames of a GIF share a palette, and are in memory together.
+    used. A ``.webm`` of pictures with alpha ``[h,w,4]`` needs that program. All frames of a GIF share a palette, and
+    are in memory together.
 
     Of a video one frame is in memory at a time. Odd sides get one more row or column, a copy of the last, since
-    encodings require even sides. SceneError if OpenCV has no encoder for the ending of the name, or the file cannot be
+    encodings require even sides. SceneError if there is no encoder for the ending of the name, or the file cannot be
     written completely.
     """
     path = Path(path)
@@ -159,7 +172,7 @@ def write_clip(path: StrPath, frames: Iterable[Picture], fps: float, *, overwrit
         written: list[Future[None]] = []
 
         def encode(frame: Picture) -> None:
-            writer.write(frame[..., ::-1])
+            writer.write(frame[..., BLUE_FIRST[: frame.shape[2]]])
 
         try:
             with ThreadPoolExecutor(1) as encoder:  # which takes one thread, while the next frame is drawn
@@ -192,9 +205,13 @@ def _to_even(picture: Picture) -> Picture:
 
 def _open_writer(path: Path, temporary: Path, first: Picture, fps: float) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
     """Open a file with the first available encoder; also return the name of its encoding."""
-    height, width = first.shape[:2]
-    if path.suffix.lower() == ".mp4" and (program := find_ffmpeg()):
-        return FfmpegWriter(program, temporary, (width, height), fps), H264
+    height, width, channels = first.shape
+    name, encoder, container, _ = BY_FFMPEG[channels]
+    if path.suffix.lower() == f".{container}" and (program := find_ffmpeg(encoder)):
+        return FfmpegWriter(program, temporary, first.shape, fps), name
+    if channels > 3:
+        problem = f"pictures with alpha need the program ffmpeg with {encoder} on the PATH, and none was found"
+        raise SceneError(path, problem, FOLDER)
     encoders = ENCODERS[path.suffix.lower()]
     for code, name in encoders:
         with _silent_stderr():

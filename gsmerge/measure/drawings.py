@@ -23,9 +23,9 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.io.photo_files import NO_IMAGES
 from gsmerge.measure.camera_path import parse_path, sample_path, turned_degrees, viewing_depth
 from gsmerge.measure.clip import (
+    BY_FFMPEG,
     FOLDER,
     GIF,
-    H264,
     MAX_GIF_PIXELS,
     MAX_VIDEO_PIXELS,
     SUFFIXES,
@@ -388,7 +388,7 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         line += f", {document['frames'] / document['fps']:.1f} s" if "fps" in document else ""
         if "encoding" not in document:
             return line
-        less_played = document["encoding"] != H264 and document["pictures"][0].lower().endswith(".mp4")
+        less_played = document["encoding"] != BY_FFMPEG[3][0] and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play: with ffmpeg on the PATH it would be H.264" if less_played else ""
         return f"{line}, {document['encoding']}{hint}"
     count = len(document["pictures"])

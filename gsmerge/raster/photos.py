@@ -61,6 +61,7 @@ class Photos:
     eps2d: float
     weights: np.ndarray | None = None  # [v,h,w] float32 of the pixels, in [0, 1]; None: all 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background; None: 0
+    importance: np.ndarray | None = None  # [v,h,w] float32, how many pixels each counts as in a fit; None: all one
 
     def __len__(self) -> int:
         return len(self.images)
@@ -70,9 +71,9 @@ class Photos:
         ids = list(views)
         if ids == list(range(len(self))):
             return self
-        weights = None if self.weights is None else self.weights[ids]
-        empty = None if self.empty is None else self.empty[ids]
-        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, weights, empty)
+        of_pixels = (self.weights, self.empty, self.importance)
+        some = (None if values is None else values[ids] for values in of_pixels)
+        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, *some)
 
     @property
     def height(self) -> int:
@@ -119,7 +120,14 @@ def scene_photos(scene: Scene, level: float = 1) -> Photos:
     if scene.images is None:
         raise ValueError("expected a scene with images")
     photos = photos_of(scene.images, scene.cameras, level)
-    return replace(photos, weights=pixel_weights(scene.masks, photos.width, photos.height))
+    return with_pixel_values(photos, scene)
+
+
+def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
+    """Return photos of a scene, of any size, with the weights and the importance of their pixels."""
+    size = photos.width, photos.height
+    important = None if scene.importance is None else shrink_pictures(scene.importance, *size)
+    return replace(photos, weights=pixel_weights(scene.masks, *size), importance=important)
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:

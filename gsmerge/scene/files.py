@@ -56,7 +56,7 @@ IMAGE_PLACES = (
     "keyframes/images",
 )  # fmt: skip
 MASK_PLACES = ("masks",)
-_PICTURES = ("images", "masks")  # of the files of a scene
+_PICTURES = ("images", "masks", "protect")  # of the files of a scene
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
@@ -85,10 +85,11 @@ class SceneFiles:
     cameras: Path | None
     images: Path | None
     masks: Path | None = None  # a folder
+    protect: Path | None = None  # a folder; never searched
     more: tuple[SceneFiles, ...] = ()  # other scenes of the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files whose rows the scene has, ``ply`` first; empty for one
     num_copies: int = 0  # other files of the same bytes in the folder
-    named: frozenset[str] = frozenset()  # those of cameras, images and masks that were not searched
+    named: frozenset[str] = frozenset()  # those of cameras and pictures that were not searched
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -141,6 +142,7 @@ def find_scene_files(
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     masks: StrPath | None = None,
+    protect: StrPath | None = None,
     within: StrPath | None = None,
 ) -> SceneFiles:
     """Find a scene's files from its path; files that the caller names, or "none", are not searched.
@@ -162,14 +164,15 @@ def find_scene_files(
             scene if they are numbered views or parts, see ``docs/reference/formats.md``.
     """
     path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
-    named = frozenset(name for name, value in given.items() if value is not None)
+    named = frozenset(name for name, value in {**given, "protect": protect}.items() if value is not None)
     camera_path, image_path, mask_path = map(named_path, given.values())
-    _check_pictures(image_path, mask_path)
+    protect = None if protect is None else Path(protect)
+    _check_pictures(image_path, masks=mask_path, protect=protect)
     if path.suffix.lower() == SUFFIX and not os.path.isdir(path):
         check_file(path)
         own = path if cameras is None and _HOLDS_VIEWS(path) else None
         photos = image_path or (own if images is None else None)
-        return SceneFiles(path, camera_path or own, photos, mask_path, named=named)
+        return SceneFiles(path, camera_path or own, photos, mask_path, protect, named=named)
     plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
     ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
     if ply == path and is_frame(path):
@@ -179,15 +182,7 @@ def find_scene_files(
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
             _CHECK_SCENE_FILE(part)
-    base = path if ply != path else ply.parent
-    folder = Path(os.path.realpath(ply.parent))
-    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
-    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
-        above = [folder.parent.parent]
-    target = Path(os.path.realpath(ply)).parent  # of a link
-    top = within or (path if path.is_dir() else None)
-    above += [] if top is None else _list_between(folder, Path(os.path.realpath(top)))
-    roots = list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
+    roots = _search_roots(path, ply, within)
     if cameras is None:
         places = (find(root) for find in (find_cameras, find_other_cameras, find_unread) for root in roots)
         own = ply.parent.parent / POSES if is_frame(ply) else ply  # by which depth maps are placed
@@ -203,20 +198,37 @@ def find_scene_files(
     if image_path is None and images is None:
         folders = [root / place for root in roots for place in IMAGE_PLACES]
         # of several scenes each may have a folder of its own
-        of_scene = [place / name for place in folders for name in (ply.stem, folder.name)]
+        names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
+        of_scene = [place / name for place in folders for name in names]
         image_path = next((f for f in of_scene + folders if f.is_dir() and list_images(f)), None)
     if masks is None:
         beside = [] if image_path is None else [image_path.parent]
         candidates = (root / place for root in (*beside, *roots) for place in MASK_PLACES)
         mask_path = next((f for f in candidates if f.is_dir() and list_images(f)), None)
     parts = tuple(plys) if len(plys) > 1 else ()
-    return SceneFiles(ply, camera_path, image_path, mask_path, parts=parts, num_copies=num_copies, named=named)
+    pictures = image_path, mask_path, protect
+    return SceneFiles(ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named)
 
 
-def _check_pictures(image_path: Path | None, mask_path: Path | None) -> None:
-    """Raise SceneError for a named place of photos without any, or masks that are no folder."""
-    if mask_path is not None and not mask_path.is_dir():
-        raise SceneError(mask_path, "expected a folder of masks, found a file")
+def _search_roots(path: Path, ply: Path, within: StrPath | None) -> list[Path]:
+    """List the folders that are searched for what belongs to a file; see :func:`find_scene_files`."""
+    base = path if ply != path else ply.parent
+    folder = Path(os.path.realpath(ply.parent))
+    above = [folder.parent] * (folder.name in ("gs_ply", "ply", SCENES_PLACE, FRAMES))
+    if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
+        above = [folder.parent.parent]
+    target = Path(os.path.realpath(ply)).parent  # of a link
+    top = within or (path if path.is_dir() else None)
+    above += [] if top is None else _list_between(folder, Path(os.path.realpath(top)))
+    return list(dict.fromkeys((Path(os.path.realpath(base)), folder, target, *above)))
+
+
+def _check_pictures(image_path: Path | None, **folders: Path | None) -> None:
+    """Raise SceneError for a named place of photos without any, or ``folders`` that are none, by option."""
+    for option, path in folders.items():
+        if path is not None and not path.is_dir():
+            what = "a file" if path.exists() else "no such folder"
+            raise SceneError(path, f"expected a folder of pictures for --{option}, found {what}")
     if image_path is not None:
         check_photo_folder(image_path)
 

@@ -44,6 +44,7 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.files import SceneFiles, find_scene_files
+from gsmerge.scene.masks import NO_MASKS, Masks, check_masks
 from gsmerge.scene.photos import (
     SEEN_PLACE,
     UNNAMED,
@@ -63,14 +64,7 @@ from gsmerge.scene.photos import (
     without_photo,
 )
 from gsmerge.scene.rows import color_from_photos, set_rotations, sort_rows, use_depths
-from gsmerge.scene.views import (
-    check_masks,
-    cut_bars,
-    find_larger_and_masks,
-    limit_photo_size,
-    limit_view_size,
-    read_scene_cameras,
-)
+from gsmerge.scene.views import cut_bars, find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, Cameras, LargePhotos, Scene, StrPath
 
@@ -156,6 +150,7 @@ def read_scene(
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     masks: StrPath | None = None,
+    protect: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Scene:
@@ -169,7 +164,9 @@ def read_scene(
         cameras: Camera file or folder, or "none"; None looks next to the ``.ply``, and warns if they do not fit.
         images: Folder of images, an ``.npz`` that holds them, or "none"; None: likewise.
         masks: Folder of images named as the photos, dark where a photo does not count, or "none"; None: ``masks``
-            beside the photos, and where these are transparent.
+            beside the photos, and where these are transparent. Lighter greys are weights in a fit.
+        protect: Folder of images named as the photos, white where a text or a face has to stay sharp; see
+            :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
         **hints: ``exporter``, ``quats``, ``order``, ``scene_scale``, ``max_side``, see
             :class:`gsmerge.settings.reading.ReadHints`.
@@ -186,7 +183,9 @@ def read_scene(
         >>> len(scene), scene.num_gaussians
         (5, 7680)
     """
-    load = load_scene(path, *more, cameras=cameras, images=images, masks=masks, opacity=opacity, **hints)
+    load = load_scene(
+        path, *more, cameras=cameras, images=images, masks=masks, protect=protect, opacity=opacity, **hints
+    )
     if load.left_out is not None:
         warnings.warn(load.left_out, stacklevel=2)
     return load.scene
@@ -211,12 +210,13 @@ def load_scene(
     cameras: StrPath | None = None,
     images: StrPath | None = None,
     masks: StrPath | None = None,
+    protect: StrPath | None = None,
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Loaded:
     """Read a scene as :func:`read_scene` does, and return it with all facts about its files."""
     read_hints = make_hints(hints)
-    named = {"cameras": cameras, "images": images, "masks": masks}
+    named = {"cameras": cameras, "images": images, "masks": masks, "protect": protect}
     first, *others = (find_scene_files(scene_path, **named) for scene_path in (path, *more))
     return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
@@ -394,7 +394,7 @@ def _combine(
         result = replace(result, cameras=cameras, images=images)
         notes += smaller
     size = photo_size(limited)
-    if files.masks is not None and not (size and pictures is whole):
+    if (files.masks or files.protect) is not None and not (size and pictures is whole):
         notes.append(f"masks are not used: {'the photos have bars' if size else 'there are no photos'}")
     if pictures is not whole:  # files with bars are not read again
         return _make_load(ply, files, hints, result, notes, absent=photos.absent)
@@ -430,7 +430,7 @@ def _make_load(
     result: AlignmentResult,
     notes: Sequence[str],
     large: LargePhotos | None = None,
-    masks: np.ndarray | None = None,
+    masks: Masks = NO_MASKS,
     absent: Sequence[int] = (),
 ) -> Loaded:
     """Make the scene of rows, their pixels and the views, with notes on how it was read.
@@ -445,11 +445,11 @@ def _make_load(
         cameras, images = cameras[views], images[views] if len(images) else images
     gaussians = color_from_photos(gaussians, images, files)
     large = None if large is None else large[views]
-    masks = None if masks is None else masks[views]
-    masks, described = check_masks(masks, files)
+    masks, described = check_masks(masks[views], files)
     more += described
     photos = images if len(images) else None
-    scene = Scene(gaussians, cameras, photos, pixel_ids, tuple(names[view] for view in views), missing, large, masks)
+    names = tuple(names[view] for view in views)
+    scene = Scene(gaussians, cameras, photos, pixel_ids, names, missing, large, masks.counts, masks.importance)
     frame = None if result.recovery is None else result.recovery.best.frame
     source = "" if camera_file is None else camera_file.source
     exporters, alignment = choose_exporters(hints.exporter, ply.info, layout, frame, source), None

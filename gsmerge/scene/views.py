@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 
-from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, sizes_of, to_cameras, undistort_photos
 from gsmerge.io.cameras.read import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read import GaussianFile
-from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import (
     PhotoArrays,
     PhotoTransform,
     Size,
     change_photos,
-    decode_alpha,
-    decode_mask,
     decode_views,
-    image_size,
     keep_photos,
     photo_size,
     resize_to,
     same_shape,
 )
 from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import count_bars, turn_picture
-from gsmerge.runtime.threads import parallel_map
+from gsmerge.kernels.pictures import count_bars
 from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.masks import NO_MASKS, Masks, read_masks
 from gsmerge.scene.photos import ScenePhotos, stored_photos
 from gsmerge.types import Cameras, LargePhotos
 
@@ -39,8 +31,6 @@ _MAX_BYTES = 2 << 30  # of all photos as floats, before it is known whether the 
 _FLOAT_PIXEL = 12  # bytes
 _BAR_SPREAD = 8  # of 255, range of a bar's colours
 _ROUNDING = 1e-6  # pixels
-_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
-_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
@@ -76,17 +66,16 @@ def find_larger_and_masks(
     size: Size | None,
     transform: PhotoTransform | None,
     cameras: Cameras,
-) -> tuple[LargePhotos | None, np.ndarray | None, list[str]]:
+) -> tuple[LargePhotos | None, Masks, list[str]]:
     """Find the photos at full file size, if that is larger than the scene's, and masks of the pixels that count.
 
     Files are read again when a photo is asked for; photos inside other files stay in memory. ``size`` is that of the
     undistorted photos, and ``transform`` how they were fitted to the rows; ``cameras`` are the scene's, in the order of
-    the camera file. Masks ``[c,h,w]`` bool come from files and from transparency; None if all pixels count. Also
-    returns notes.
+    the camera file. Masks come from files and from transparency. Also returns notes.
     """
     stored = photos.file_size or photo_size(photos.pictures)
     if stored is None or size is None:
-        return None, None, []
+        return None, NO_MASKS, []
     paths = photos.paths
     window = _file_window(stored, size, transform, cameras)
     lenses = camera_file.lenses if paths else ()
@@ -106,77 +95,7 @@ def find_larger_and_masks(
     if window.is_larger:
         width, height = (part.stop - part.start for part in (window.columns, window.rows))
         large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
-    names = [path.as_posix() for path in paths if path is not None] if paths else list(camera_file.names)
-    named, notes = _match_masks(files, names)
-    if paths:
-        of_path = dict(zip((path for path in paths if path is not None), named, strict=True))
-        named = [None if path is None else of_path[path] for path in paths]
-    turns = photos.turns or (0,) * len(named)
-
-    def read_parts(view: int) -> list[np.ndarray]:
-        """Read the mask, as stored or upright, and the photo's transparency, which is as stored."""
-        mask, photo = named[view], paths[view] if paths else None
-        alpha = None if photo is None else decode_alpha(photo)
-        parts = [] if alpha is None else [turn_picture(alpha, turns[view])]
-        if mask is not None:
-            whole = decode_mask(mask, photo)
-            as_stored = photo is not None and turns[view] % 2 and same_shape(image_size(photo), whole.shape[1::-1])
-            parts.append(turn_picture(whole, turns[view]) if as_stored else whole)
-        return parts
-
-    return large, _read_masks(read_parts, len(named), stored, cameras, cut), notes
-
-
-def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
-    """Find the masks of photos, with a note; in a folder that the user did not name, only by matching names."""
-    if files.masks is None:
-        return [None] * len(names), []
-    try:
-        return match_masks(files.masks, names), []
-    except SceneError as error:
-        if "masks" in files.named:
-            raise
-        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
-
-
-def _read_masks(
-    read_parts: Callable[[int], list[np.ndarray]],
-    count: int,
-    size: Size,
-    cameras: Cameras,
-    cut: Callable[[int, np.ndarray], np.ndarray],
-) -> np.ndarray | None:
-    """Read the masks of photos of an upright ``size``; ``cut`` crops a mask to the view."""
-    shape = cameras.height, cameras.width
-
-    def read(view: int) -> np.ndarray | None:
-        mask = np.full(shape, True)
-        for part in read_parts(view):
-            whole = cv2.resize(part.astype(np.uint8) * 255, size, interpolation=cv2.INTER_NEAREST)
-            seen = cut(view, whole[..., None].repeat(3, -1))[..., 0]
-            mask &= cv2.resize(seen, shape[::-1], interpolation=cv2.INTER_AREA) > _MASK_LEVEL
-        return None if mask.all() else mask
-
-    masks = parallel_map(read, range(count))
-    if all(mask is None for mask in masks):
-        return None
-    return np.stack([np.full(shape, True) if mask is None else mask for mask in masks])
-
-
-def check_masks(masks: np.ndarray | None, files: SceneFiles) -> tuple[np.ndarray | None, list[str]]:
-    """Note the share of the photos that masks leave out; SceneError if masks from files leave out nearly all."""
-    if masks is None:
-        return None, []
-    share = float(1 - masks.mean())
-    if share < _MAX_MASKED:
-        count = int((~masks.all((1, 2))).sum())
-        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(masks)}, {count} have one"]
-    if files.masks is None:
-        return None, ["the photos are transparent nearly everywhere, which is not taken for masks"]
-    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
-    if "masks" not in files.named:
-        return None, [f"masks are not used: {files.masks}: {problem}; name them with --masks"]
-    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
+    return large, *read_masks(files, camera_file.names, photos, stored, cut, cameras)
 
 
 @dataclass(frozen=True)

@@ -55,11 +55,13 @@ class SuperpixelChoices:
 def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
     """Cut every view into superpixels, by the options or so that they give exactly ``count`` Gaussians.
 
-    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many; a finer tree is
-    built if the scene's own is too coarse. Adaptive superpixels change the number of Gaussians; if it exceeds the
-    budget, the tree is cut at the largest allowed count instead.
+    For an exact count the region tree is cut, which gives a plain wall few superpixels and a fern many; so it is if
+    some pixels count more than others. A finer tree is built if the scene's own is too coarse. Adaptive superpixels
+    change the number of Gaussians; if it exceeds the budget, the tree is cut at the largest allowed count instead.
     """
     limits, options, views = choices.limits, choices.options, len(scene)
+    if count is None and scene.importance is not None and not options.adapts:
+        count = limits.default
     if count is None:
         pictures, each = scene.images, max(1, int(limits.per_view * choices.start_share))
         if not options.adapts:
@@ -79,11 +81,16 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 
 @stage("segment")
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
-    """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians."""
-    pictures = scene.images
-    leaves = min(max(limits.per_view, -(-count // len(scene))), scene.pixels_per_view)
+    """Build the tree of all coarser segmentations of a scene, fine enough for ``count`` Gaussians.
+
+    A pixel that counts as several has the squared colour errors of so many.
+    """
+    pictures, important = scene.images, scene.importance
+    leaves = max(limits.per_view, -(-count // len(scene)))
+    stretched = pictures if important is None else pictures * np.sqrt(important)[..., None]
+    leaves = leaves if important is None else int(leaves * important.max())
     depths, valid = (pixel_depths(scene), scene.valid) if scene.aligned else seen_depths(scene)
-    return region_tree(pictures, depths, segment(pictures, options, leaves), valid)
+    return region_tree(stretched, depths, segment(pictures, options, min(leaves, scene.pixels_per_view)), valid)
 
 
 def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:

@@ -273,6 +273,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "cameras",
         "images",
         "masks",
+        "protect",
         "hint",
         "set",
         "output",

@@ -39,7 +39,7 @@ from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.cameras.npz_files import read_depths
 from gsmerge.io.cameras.read import read_sharp_camera
 from gsmerge.io.crop_file import read_crop
-from gsmerge.io.photo_files import decode_alpha, decode_mask
+from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.networks.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
@@ -150,7 +150,7 @@ def check_photo(path: Path) -> None:
 
 def check_mask(path: Path) -> None:
     """Read a mask, and the transparency of a photo."""
-    decode_mask(path)
+    decode_levels(path)
     decode_alpha(path)
 
 

@@ -120,18 +120,21 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         images=photos,
         pixel_ids=grid_ids(np.concatenate([scene.valid for scene in scenes])) if aligned else None,
         names=tuple(name for scene in scenes for name in scene.names),
-        missing=_concat_flags(scenes, [scene.missing for scene in scenes], usual=False),
+        missing=_concat_pixels(scenes, [scene.missing for scene in scenes], usual=False),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=None if photos is None else _concat_flags(scenes, [scene.masks for scene in scenes], usual=True),
+        masks=None if photos is None else _concat_pixels(scenes, [scene.masks for scene in scenes], usual=True),
+        importance=_concat_pixels(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
     )
 
 
-def _concat_flags(scenes: Sequence[Scene], flags: Sequence[np.ndarray | None], *, usual: bool) -> np.ndarray | None:
-    """Concatenate flags ``[v,h,w]`` of pixels; a scene without any has the ``usual``. None if all are."""
-    if all(each is None for each in flags):
+def _concat_pixels(
+    scenes: Sequence[Scene], values: Sequence[np.ndarray | None], *, usual: bool | np.float32
+) -> np.ndarray | None:
+    """Concatenate values ``[v,h,w]`` of pixels; a scene without any has the ``usual``. None if all are."""
+    if all(each is None for each in values):
         return None
     shapes = ((len(scene), scene.cameras.height, scene.cameras.width) for scene in scenes)
-    filled = [np.full(shape, usual) if each is None else each for shape, each in zip(shapes, flags, strict=True)]
+    filled = [np.full(shape, usual) if each is None else each for shape, each in zip(shapes, values, strict=True)]
     return np.concatenate(filled)
 
 

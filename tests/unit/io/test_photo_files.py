@@ -296,7 +296,7 @@ def test_running_out_of_memory_is_said_as_such(tmp_path: Path, monkeypatch: pyte
             decode_image(path, (30, 20))
     monkeypatch.setattr(photos.Image, "open", fail)
     with pytest.raises(MemoryError):
-        photos.decode_mask(path)
+        photos.decode_levels(path)
 
 
 KINDS = {  # what Pillow writes of one colour, with much, little and no memory beside the pixels
@@ -320,7 +320,7 @@ def read(path):
     counted = []
     photos.ReadBudget.check_memory = lambda budget, num_bytes, what: counted.append(num_bytes)
     if sys.argv[2] == "mask":
-        photos.decode_mask(path), photos.decode_alpha(path)
+        photos.decode_levels(path), photos.decode_alpha(path)
     else:
         photos.decode_image(path, photos.image_size(path))
     return max(counted)

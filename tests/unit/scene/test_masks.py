@@ -13,7 +13,8 @@ from messages import refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
-from gsmerge.io.photo_files import decode_alpha, decode_mask
+from gsmerge.facts.views import subset
+from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.scene.read import load_scene, read_scene
 
 
@@ -55,7 +56,7 @@ def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path
     assert np.array_equal(scene.masks, np.stack([half(tiny)] * 3))
     with pytest.raises(SceneError, match="no such"):
         read_scene(tiny_folder, masks=tmp_path / "missing")
-    with refuses(SceneError, "scene.ply", "masks", "file"):
+    with refuses(SceneError, "scene.ply", "--masks", "file"):
         read_scene(tiny_folder, masks=tiny_folder / "scene.ply")
     shutil.copytree(tmp_path / "other" / "a b", tmp_path / "wrong")
     for number, path in enumerate(sorted((tmp_path / "wrong").iterdir())):
@@ -83,7 +84,7 @@ def test_opaque_photos_have_no_masks(tiny_folder: Path, tiny: Tiny) -> None:
 def test_a_mask_that_is_no_image(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"\0no image")
     with pytest.raises(SceneError, match="decoded"):
-        decode_mask(tmp_path / "a.png")
+        decode_levels(tmp_path / "a.png")
 
 
 def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
@@ -97,10 +98,10 @@ def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
 def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
     levels = np.array([[0, 256, 65535, 40000]], np.uint16)
     write(tmp_path / "deep.png", levels)
-    assert decode_mask(tmp_path / "deep.png").tolist() == [[False, False, True, True]]
+    assert decode_levels(tmp_path / "deep.png").tolist() == [[0, 1, 255, 156]]
     clear = np.dstack([np.full((1, 4, 3), 255, np.uint8), np.array([[0, 0, 255, 255]], np.uint8)])
     write(tmp_path / "clear.png", clear)
-    assert decode_mask(tmp_path / "clear.png").tolist() == [[False, False, True, True]]
+    assert decode_levels(tmp_path / "clear.png").tolist() == [[0, 0, 255, 255]]
 
 
 def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path, tiny: Tiny) -> None:
@@ -121,7 +122,7 @@ def test_bright_pixels_count_by_their_opacity(tmp_path: Path) -> None:
     levels = np.random.default_rng(0).integers(0, 256, (600, 3, 2), np.uint8)
     write(tmp_path / "a.png", np.dstack([levels[..., 0]] * 3 + [levels[..., 1]]))
     products = levels[..., 0].astype(int) * levels[..., 1]
-    assert np.array_equal(decode_mask(tmp_path / "a.png"), products > products.max() / 2)
+    assert np.array_equal(decode_levels(tmp_path / "a.png"), np.round(products * (255 / products.max())))
 
 
 def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
@@ -129,5 +130,45 @@ def test_a_mask_may_take_what_its_photo_allows(tmp_path: Path) -> None:
     write(mask, np.full((6000, 6000), 255, np.uint8))
     photo.write_bytes(bytes(1_000_000))
     with refuses(SceneError, mask, "6000 x 6000", "108 MB"):
-        decode_mask(mask)
-    assert decode_mask(mask, photo).all()
+        decode_levels(mask)
+    assert (decode_levels(mask, photo) == 255).all()
+
+
+def test_the_grey_of_a_mask_is_a_weight(tiny_folder: Path, tiny: Tiny) -> None:
+    """Where it counts at all; black and white pixels have the weights that they have without greys."""
+    mask = half(tiny).astype(np.uint8) * 255
+    mask[:, 0] = 204
+    write(tiny_folder / "masks" / tiny.names[1], mask)
+    scene = read_scene(tiny_folder)
+    assert np.array_equal(scene.masks[1], half(tiny))
+    assert np.allclose(scene.importance[1][:, 0], 0.8)
+    assert (scene.importance[1][:, 1 : tiny.width // 2] == 1).all()
+    assert (scene.importance[[0, 2]] == 1).all()
+    assert scene.protected is None
+
+
+def test_what_has_to_stay_sharp_counts_four_times(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    levels = half(tiny).astype(np.uint8) * 255
+    levels[:, 0] = 51
+    write(tmp_path / "signs" / tiny.names[1], levels)
+    load = load_scene(tiny_folder, protect=tmp_path / "signs")
+    scene = load.scene
+    assert scene.masks is None
+    assert np.allclose(scene.importance[1][:, 0], 1.6)
+    assert (scene.importance[1][half(tiny) & (levels == 255)] == 4).all()
+    assert (scene.importance[1][~half(tiny)] == 1).all()
+    assert np.array_equal(scene.protected[1], levels == 255)
+    assert (scene.importance[[0, 2]] == 1).all()
+    (note,) = (note for note in load.notes if note.startswith("protect: "))
+    assert note.endswith("of 1 photo of 3")
+    assert subset(scene, [1, 2]).importance.shape[0] == 2
+
+
+def test_pictures_to_protect_that_do_not_fit(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    with refuses(SceneError, "missing", "no such"):
+        read_scene(tiny_folder, protect=tmp_path / "missing")
+    with refuses(SceneError, "scene.ply", "--protect", "file"):
+        read_scene(tiny_folder, protect=tiny_folder / "scene.ply")
+    write(tmp_path / "wrong" / "sign.png", np.zeros((2, 2), np.uint8))
+    with refuses(SceneError, "wrong", "2.png", "--protect"):
+        read_scene(tiny_folder, protect=tmp_path / "wrong")

@@ -1,0 +1,159 @@
+"""Masks of photos: which pixels count, and how many each counts as; from files, and from transparency."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.io.image_names import match_masks
+from gsmerge.io.photo_files import Size, decode_alpha, decode_levels, image_size, same_shape
+from gsmerge.kernels.pictures import turn_picture
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.scene.files import SceneFiles
+from gsmerge.scene.photos import ScenePhotos
+from gsmerge.types import PROTECTED, Cameras
+
+_MAX_MASKED = 0.98  # share of the pixels of photos that masks may leave out
+_WHITE = np.uint8(255)
+_MASK_LEVEL = 191  # of 255: a pixel of a view counts if three quarters of its pixels in the file do
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """What masks say of the pixels of v views."""
+
+    counts: np.ndarray | None = None  # [v,h,w] bool, whether a pixel counts; None: all do
+    importance: np.ndarray | None = None  # [v,h,w] float32, how many it counts as in a fit; None: all one
+
+    def __getitem__(self, views: Sequence[int]) -> Masks:
+        """Return the masks of some views."""
+        return Masks(*(None if values is None else values[views] for values in (self.counts, self.importance)))
+
+
+NO_MASKS = Masks()
+
+
+@dataclass(frozen=True, eq=False)
+class MaskFiles:
+    """The masks of v photos, and how a picture of a photo becomes one of its view."""
+
+    photos: tuple[Path | None, ...]  # files of the photos; empty where these are inside another file
+    turns: Sequence[int]  # quarter turns of each photo's file to its upright picture
+    masks: Sequence[Path | None]  # dark where a photo does not count
+    protecting: Sequence[Path | None]  # white where a photo counts more
+    stored: Size  # of upright photos
+    cut: Callable[[int, np.ndarray], np.ndarray]  # of a view and a picture of that size: what the view shows of it
+    cameras: Cameras
+
+    def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Read whether the pixels of a view count, and how many each counts as; None: all do, as one."""
+        photo, counts, importance = self.photos[view] if self.photos else None, None, None
+        alpha = None if photo is None else decode_alpha(photo)
+        if alpha is not None:
+            counts = self._reduce(turn_picture(alpha, self.turns[view]) * _WHITE, view) > _MASK_LEVEL
+        if (mask := self.masks[view]) is not None:
+            levels = self._read_levels(mask, view)
+            is_light = levels > _WHITE // 2
+            light = self._reduce(is_light * _WHITE, view)
+            counts = (light > _MASK_LEVEL) if counts is None else counts & (light > _MASK_LEVEL)
+            if (levels[is_light] < _WHITE).any():  # of what counts, the mean
+                importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
+        if (mask := self.protecting[view]) is not None:
+            share = self._reduce(self._read_levels(mask, view), view) / np.float32(_WHITE)
+            importance = (1 if importance is None else importance) * (1 + (PROTECTED - 1) * share)
+        return counts, importance
+
+    def _read_levels(self, mask: Path, view: int) -> np.ndarray:
+        """Read the brightness of a mask, which is as the photo's file or upright, and turn it upright."""
+        photo = self.photos[view] if self.photos else None
+        whole, turns = decode_levels(mask, photo), self.turns[view]
+        as_stored = photo is not None and turns % 2 and same_shape(image_size(photo), whole.shape[1::-1])
+        return turn_picture(whole, turns) if as_stored else whole
+
+    def _reduce(self, levels: np.ndarray, view: int) -> np.ndarray:
+        """Average the brightness of a mask over each pixel of the view."""
+        whole = cv2.resize(levels, self.stored, interpolation=cv2.INTER_NEAREST)
+        seen = self.cut(view, whole[..., None].repeat(3, -1))[..., 0]
+        size = self.cameras.width, self.cameras.height
+        return np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_AREA))
+
+
+def read_masks(
+    files: SceneFiles,
+    names: Sequence[str],
+    photos: ScenePhotos,
+    stored: Size,
+    cut: Callable[[int, np.ndarray], np.ndarray],
+    cameras: Cameras,
+) -> tuple[Masks, list[str]]:
+    """Read the masks of photos of an upright size ``stored``, with notes; ``cut`` crops a picture of it to the view.
+
+    ``names`` are those of the views whose photos are inside another file.
+    """
+    paths = photos.paths
+    if paths:
+        names = [path.as_posix() for path in paths if path is not None]
+    masks, notes = _match_masks(files, names)
+    protecting = [None] * len(names) if files.protect is None else match_masks(files.protect, names, "--protect")
+    if paths:
+        places = {path: i for i, path in enumerate(path for path in paths if path is not None)}
+        masks, protecting = (
+            [None if path is None else of[places[path]] for path in paths] for of in (masks, protecting)
+        )
+    turns = photos.turns or (0,) * len(masks)
+    of_files = MaskFiles(tuple(paths), turns, masks, protecting, stored, cut, cameras)
+    counts, importance = zip(*parallel_map(of_files.read, range(len(masks))), strict=True)
+    shape = cameras.height, cameras.width
+    read = Masks(_stack(counts, True, shape), _stack(importance, np.float32(1), shape))
+    if files.protect is not None:
+        notes.append(_describe_protected(read.importance, protecting))
+    return read, notes
+
+
+def _stack(values: Sequence[np.ndarray | None], usual: bool | np.float32, shape: tuple[int, int]) -> np.ndarray | None:
+    """Stack the values ``[h,w]`` of views, a view without any having the ``usual``; None if all have."""
+    if all(of is None or (of == usual).all() for of in values):
+        return None
+    return np.stack([np.full(shape, usual) if of is None else of for of in values])
+
+
+def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | None]) -> str:
+    """Describe how many photos have a picture of what is to be protected, and how much that is."""
+    count = sum(mask is not None for mask in masks)
+    share = 0.0 if importance is None else float((importance >= PROTECTED / 2).mean())
+    photos = f"{count} photo{'' if count == 1 else 's'} of {len(masks)}"
+    return f"protect: {100 * share:.1f} % of the photos' pixels count {PROTECTED:g} times, of {photos}"
+
+
+def _match_masks(files: SceneFiles, names: Sequence[str]) -> tuple[Sequence[Path | None], list[str]]:
+    """Find the masks of photos, with a note; in a folder that the user did not name, only by matching names."""
+    if files.masks is None:
+        return [None] * len(names), []
+    try:
+        return match_masks(files.masks, names), []
+    except SceneError as error:
+        if "masks" in files.named:
+            raise
+        return [None] * len(names), [f"masks are not used: {error.path}: {error.problem}"]
+
+
+def check_masks(masks: Masks, files: SceneFiles) -> tuple[Masks, list[str]]:
+    """Note the share of the photos that masks leave out; SceneError if masks from files leave out nearly all."""
+    counts = masks.counts
+    if counts is None:
+        return masks, []
+    share = float(1 - counts.mean())
+    if share < _MAX_MASKED:
+        count = int((~counts.all((1, 2))).sum())
+        return masks, [f"masks leave out {100 * share:.0f} % of the photos; of {len(counts)}, {count} have one"]
+    if files.masks is None:
+        return NO_MASKS, ["the photos are transparent nearly everywhere, which is not taken for masks"]
+    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % dark"
+    if "masks" not in files.named:
+        return NO_MASKS, [f"masks are not used: {files.masks}: {problem}; name them with --masks"]
+    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")

@@ -1,0 +1,52 @@
+"""Names of scenes, files and photos that are programs: in a real browser pages show them and run none."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser import CHROMIUM, Browser, browser, needs_browser
+
+from e2e.conftest import Run
+
+pytestmark = needs_browser()
+NAMES = [
+    "<img src=x onerror=ran=1>",
+    "\"><svg onload=ran=1>';ran=1;'`${ran=1}`",
+    "--></script><script>ran=1<!--",  # a folder and a file in it
+    "x\ny\u202egnp.exe",
+]
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(CHROMIUM, tmp_path_factory.mktemp("names") / "profile") as opened:
+        yield opened
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_name_is_no_program(name: str, smallest_scene: Path, tmp_path: Path, run: Run, tab: Browser) -> None:
+    """Of a folder, its file, its photos and a result."""
+    scene = Path(shutil.copytree(smallest_scene, tmp_path / name))
+    (scene / "scene.ply").rename(scene / f"{Path(name).name}.ply")
+    cameras = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
+    for frame in cameras["frames"]:
+        photo = Path(frame["file_path"]).with_name(f"{Path(name).name}{Path(frame['file_path']).name}")
+        (scene / frame["file_path"]).rename(scene / photo)
+        frame["file_path"] = photo.as_posix()
+    (scene / "transforms.json").write_text(json.dumps(cameras), encoding="utf-8")
+    small = scene / f"{Path(name).name}.small.ply"
+    run("compact", scene, "-o", small, "--effort", "draft", code=0)
+    pages = {"send": ("compact", scene), "view": ("view", scene, small, "--no-open")}
+    for kind, words in pages.items():
+        page = tmp_path / f"{kind}.html"
+        run(*words, "-o", page, *(("--effort", "draft") if words[0] == "compact" else ()), code=0)
+        tab.events.clear()
+        tab.open(page)
+        tab.wait("document.readyState === 'complete'")
+        assert tab.run("typeof ran") == "undefined"
+        assert [text for text in tab.complaints() if "WebGL" not in text and "GL Driver" not in text] == []
+        assert [url for url in tab.requests() if not url.startswith(("file:", "data:", "blob:", "about:"))] == []

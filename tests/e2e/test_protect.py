@@ -1,0 +1,39 @@
+"""What has to stay sharp: ``--protect`` spends Gaussians and steps where its pictures are white."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import gsmerge
+from e2e.conftest import Run
+from gsmerge.raster.metrics import psnr
+
+SIGN = slice(20, 34), slice(30, 52)  # of 64 x 96 pixels: 5 %
+
+
+def test_a_protected_part_of_the_photos_is_shown_better(run: Run, made_scene: Path, tmp_path: Path) -> None:
+    scene, after = gsmerge.read_scene(made_scene), []
+    picture = np.zeros((scene.cameras.height, scene.cameras.width), np.uint8)
+    picture[SIGN] = 255
+    for name in scene.names:
+        path = (tmp_path / "signs" / name).with_suffix(".png")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), picture)
+    for words in ([], ["--protect", tmp_path / "signs"]):
+        out = tmp_path / "small.ply"
+        done = run("compact", made_scene, "-o", out, "--budget", "2%", "--json", "--overwrite", *words)
+        drawn = gsmerge.render(gsmerge.read_gaussians(out).gaussians, scene.cameras).images
+        errors = [psnr(drawn[view].clip(0, 1)[SIGN], scene.images[view][SIGN]) for view in range(len(scene))]
+        after.append((np.mean(errors), json.loads(done.out)))
+    (plain, without), (better, report) = after
+    assert without["psnr_protected"] is None
+    assert report["output"]["num_gaussians"] == without["output"]["num_gaussians"]
+    assert better > plain + 1
+    protected = report["psnr_protected"]
+    assert 0.03 < protected["share"] < 0.07
+    assert protected["after"] > protected["before"]
+    assert any(note.startswith("protect: ") for note in report["notes"])
