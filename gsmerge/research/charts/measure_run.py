@@ -22,6 +22,8 @@ import numpy as np
 from gsmerge import __version__
 from gsmerge.batch.records import DONE, FAILED, RECORDS
 from gsmerge.compaction.compact import compact
+from gsmerge.compaction.left_out import LEAST_VIEWS
+from gsmerge.compaction.left_out import choose_views as leave_out_views
 from gsmerge.facts.views import even_views, midpoint_views, pick_views, subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
@@ -39,7 +41,7 @@ from gsmerge.scene.read import load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 
-RECORD_VERSION = 1  # of what a run records; another version is run again
+RECORD_VERSION = 2  # of what a run records; another version is run again
 SCORING = ("score", "input")  # stages of a run that only measure
 MEASURES = ("psnr", "ssim", "lpips_vgg", "lpips_alex")
 SCORES = tuple(map("".join, product(MEASURES, ("_context", "_target"), ("", "_visible"))))
@@ -231,8 +233,25 @@ def _load(
 ) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
     """Read a scene with its held-out views, once for several runs in a row; ``sha256`` is that of the files."""
     load = load_files(files)
-    held_out = None if targets is None else read_held_out(load, targets, target_images)
-    return load.scene, held_out, tuple(load.notes)
+    if targets is not None:
+        return load.scene, read_held_out(load, targets, target_images), tuple(load.notes)
+    scene, held_out = hold_out(load.scene)
+    if held_out is None:
+        return scene, None, tuple(load.notes)
+    names = ", ".join(held_out.names)
+    return scene, held_out, (*load.notes, f"without --targets, no run sees these photos, which judge all: {names}")
+
+
+def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
+    """Take some photos out of a scene to judge its results by; of fewer than four none."""
+    photos = scene.photo_views
+    if len(photos) < LEAST_VIEWS or scene.images is None:
+        return scene, None
+    ids, _ = leave_out_views(photos)
+    rest = [view for view in range(len(scene)) if view not in ids]
+    names = tuple(scene.names[view] for view in ids)
+    held_out = HeldOutViews(scene.cameras[ids], scene.images[ids], names, tuple(ids), tuple(rest))
+    return subset(scene, rest), held_out
 
 
 def choose_views(scene: Scene, held_out: HeldOutViews | None, count: int | None) -> tuple[Scene, Views | None]:

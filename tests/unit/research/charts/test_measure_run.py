@@ -13,9 +13,11 @@ import pytest
 import scenes
 from experiments import make_record
 
+import gsmerge
 from gsmerge.batch.records import DONE, FAILED, RECORDS, record
+from gsmerge.facts.views import subset
 from gsmerge.io.jsonl import append_line
-from gsmerge.research.charts.measure_run import RunRecord, keep_pictures, read_runs
+from gsmerge.research.charts.measure_run import RunRecord, choose_views, hold_out, keep_pictures, read_runs
 
 
 def line(run: RunRecord, **changes: Any) -> dict[str, Any]:
@@ -77,6 +79,21 @@ def test_records_of_other_kinds_or_versions_are_passed_over(run: object, tmp_pat
     records, notes = read_runs(tmp_path)
     assert records == [FOX]
     assert "1 record(s)" in notes[0]
+
+
+def test_without_targets_some_photos_judge_all_runs(made_scene: Path) -> None:
+    """Of fewer than four photos none can be spared."""
+    scene = gsmerge.read_scene(made_scene)
+    rest, held_out = hold_out(scene)
+    assert held_out is not None
+    assert (len(rest), held_out.names) == (4, (scene.names[1],))
+    assert np.array_equal(held_out.images[0], scene.images[1])
+    assert scene.names[1] not in rest.names
+    part, targets = choose_views(rest, held_out, 2)
+    assert targets is not None
+    assert (len(part), targets.names) == (2, held_out.names)
+    few = subset(scene, [0, 2, 4])
+    assert hold_out(few) == (few, None)
 
 
 def test_scores_have_names() -> None:
